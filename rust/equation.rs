@@ -306,9 +306,9 @@ impl Structure {
                 }
             } else {
                 let lowest = if is_input(term.signal) { MIN_INPUT_ORDER } else { 0.0 };
-                let beyond = self.order + MAX_EXCESS;
-                if !(term.order >= lowest && term.order < beyond - ORDER_GRAIN) {
-                    let allowed = format!("[{lowest}, {beyond})");
+                let limit_order = self.order + MAX_EXCESS;
+                if !(term.order >= lowest && term.order < limit_order - ORDER_GRAIN) {
+                    let allowed = format!("[{lowest}, {limit_order})");
                     return Err(range(name, term.order, allowed, "an order must stay below alpha + 1"));
                 }
             }
@@ -560,20 +560,20 @@ pub fn check_regular(equations: &[Equation]) -> Result<()> {
     };
     let entries: Vec<Vec<Leading>> = (0..n).map(|i| (0..n).map(|j| entry(i, j)).collect()).collect();
     // Rows are processed in order, so the set of used columns is the only state.
-    let mut taken: Vec<Leading> = vec![None; 1 << n];
-    taken[0] = Some((0.0, 1.0, 1.0));
+    let mut leading: Vec<Leading> = vec![None; 1 << n];
+    leading[0] = Some((0.0, 1.0, 1.0));
     for columns in 0..(1usize << n) {
-        let Some((order, value, size)) = taken[columns] else { continue };
+        let Some((order, value, size)) = leading[columns] else { continue };
         let row = columns.count_ones() as usize;
         for j in (0..n).filter(|j| columns & (1 << j) == 0) {
             let Some((o, v, s)) = entries[row][j] else { continue };
             let later = (columns >> j).count_ones();
             let sign = if later % 2 == 0 { 1.0 } else { -1.0 };
             let next = columns | (1 << j);
-            taken[next] = add_leading_term(taken[next], order + o, sign * value * v, size * s);
+            leading[next] = add_leading_term(leading[next], order + o, sign * value * v, size * s);
         }
     }
-    match taken[(1 << n) - 1] {
+    match leading[(1 << n) - 1] {
         Some((_, value, size)) if value.abs() > 1e-12 * size => Ok(()),
         _ => Err(Error::Structure {
             what:

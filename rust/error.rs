@@ -223,11 +223,11 @@ pub fn check_finite(name: &str, values: &[f64]) -> Result<()> {
 ///
 /// # Errors
 /// [`Error::Length`] with both lengths.
-pub fn check_length(name: &str, expected: usize, found: usize) -> Result<()> {
-    if expected == found {
+pub fn check_length(name: &str, expected: usize, actual: usize) -> Result<()> {
+    if expected == actual {
         Ok(())
     } else {
-        Err(Error::Length { name: name.to_owned(), expected, found })
+        Err(Error::Length { name: name.to_owned(), expected, found: actual })
     }
 }
 

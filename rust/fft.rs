@@ -92,8 +92,8 @@ impl Plans {
     /// The caller drops the evicted plans outside the lock.
     fn keep(&mut self, plan: Plan) -> (Plan, Vec<Plan>) {
         let len = plan.len;
-        if let Some(there) = self.find(len) {
-            return (there, vec![plan]);
+        if let Some(stored) = self.find(len) {
+            return (stored, vec![plan]);
         }
         let mut forgotten = Vec::new();
         if len > MAX_PERMANENT_PLAN_POINTS {
@@ -113,13 +113,13 @@ impl Plans {
             .filter(|&(_, len)| len > MAX_PERMANENT_PLAN_POINTS)
             .collect();
         long.sort_unstable();
-        let mut held: usize = long.iter().map(|&(_, len)| len).sum();
+        let mut stored_points: usize = long.iter().map(|&(_, len)| len).sum();
         let mut forgotten = Vec::new();
         for (last, len) in long {
-            if held <= points || self.asked - last <= IN_USE {
+            if stored_points <= points || self.asked - last <= IN_USE {
                 break;
             }
-            held -= len;
+            stored_points -= len;
             forgotten.extend(self.made.remove(&len).map(|(plan, _)| plan));
         }
         forgotten
@@ -146,10 +146,10 @@ pub fn plan(len: usize) -> Plan {
         Some(plan) => (plan, true),
         None => {
             // Plans are computed outside the lock. If two threads compute the same one, the later one is dropped.
-            let made = Plan::new(len);
-            match SHARED_PLANS.with(|plans| plans.keep(made.clone())) {
+            let new_plan = Plan::new(len);
+            match SHARED_PLANS.with(|plans| plans.keep(new_plan.clone())) {
                 Some((plan, _forgotten)) => (plan, true),
-                None => (made, false),
+                None => (new_plan, false),
             }
         }
     };
@@ -202,8 +202,8 @@ impl Plan {
         self.check(time.len(), spectrum.len());
         let scratch = workspace.at_least(self.forward.get_scratch_len());
         // The transform can only fail on lengths, which were checked.
-        let done = self.forward.process_with_scratch(time, spectrum, scratch);
-        assert!(done.is_ok(), "the forward transform refused its own lengths");
+        let outcome = self.forward.process_with_scratch(time, spectrum, scratch);
+        assert!(outcome.is_ok(), "the forward transform refused its own lengths");
     }
 
     fn check(&self, points: usize, bins: usize) {
@@ -231,8 +231,8 @@ impl Plan {
             last.im = 0.0;
         }
         let scratch = workspace.at_least(self.inverse.get_scratch_len());
-        let done = self.inverse.process_with_scratch(spectrum, time, scratch);
-        assert!(done.is_ok(), "the inverse transform refused its own lengths");
+        let outcome = self.inverse.process_with_scratch(spectrum, time, scratch);
+        assert!(outcome.is_ok(), "the inverse transform refused its own lengths");
         #[allow(clippy::cast_precision_loss)]
         let scale = 1.0 / self.len as f64;
         for value in time {
@@ -288,8 +288,8 @@ mod tests {
     fn of_two_plans_of_a_length_the_first_is_kept() {
         let mut plans = Plans::new();
         let (first, _) = plans.keep(Plan::new(64));
-        let (kept, dropped) = plans.keep(Plan::new(64));
-        assert!(Arc::ptr_eq(&first.forward, &kept.forward) && dropped.len() == 1);
+        let (first_plan, dropped) = plans.keep(Plan::new(64));
+        assert!(Arc::ptr_eq(&first.forward, &first_plan.forward) && dropped.len() == 1);
     }
 
     #[test]

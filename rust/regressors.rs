@@ -110,13 +110,14 @@ impl Record {
     #[must_use]
     pub fn clean_record(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
-        let (held, moving, answers) = (self.filter_transients.clone(), Vec::new(), self.impulse_responses.clone());
+        let (transients, moving, answers) =
+            (self.filter_transients.clone(), Vec::new(), self.impulse_responses.clone());
         Self {
             step: self.step,
             signals,
             filter: self.filter.clone(),
             clean: None,
-            filter_transients: held,
+            filter_transients: transients,
             deviations: moving,
             impulse_responses: answers,
         }
@@ -149,8 +150,8 @@ impl Record {
         let m = self.m();
         check_length("filter", m, filter.len())?;
         let filtered = |series: &Vec<f64>| series::multiply(filter, series, m);
-        let known = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
-        let mut through = Self::from_rows(self.step, self.signals.iter().map(filtered).collect(), Some(known))?;
+        let derivative = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
+        let mut through = Self::from_rows(self.step, self.signals.iter().map(filtered).collect(), Some(derivative))?;
         through.filter_transients.clone_from(&self.filter_transients);
         through.deviations = self.deviations.iter().map(|moving| moving.as_ref().map(filtered)).collect();
         Ok(through)
@@ -158,7 +159,7 @@ impl Record {
 
     /// Record with nonzero initial conditions.
     ///
-    /// `held` marks signals whose sensor filter may have an initial transient. `levels` are the initial levels of the
+    /// `transients` marks signals whose sensor filter may have an initial transient. `levels` are the initial levels of the
     /// signals. `answers` are pulse means of the filter's responses to an impulse and to its derivatives, as far as
     /// they are known.
     ///
@@ -177,8 +178,8 @@ impl Record {
     /// assert_eq!(record.deviation_signal(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn with_initial_state(mut self, held: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
-        check_length("signals whose sensor held something", self.len(), held.len())?;
+    pub fn with_initial_state(mut self, transients: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
+        check_length("signals whose sensor held something", self.len(), transients.len())?;
         check_length("levels of signals", self.len(), levels.len())?;
         check_finite("level of a signal", levels)?;
         for answer in &answers {
@@ -190,7 +191,7 @@ impl Record {
             (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
         };
         self.deviations = self.signals.iter().zip(levels).map(above).collect();
-        (self.filter_transients, self.impulse_responses) = (held, answers);
+        (self.filter_transients, self.impulse_responses) = (transients, answers);
         Ok(self)
     }
 
@@ -498,11 +499,11 @@ impl Bank {
             let mut kernel = None;
             match *key {
                 Key::Integral { signal, order } => {
-                    let made =
+                    let bank =
                         orders.entry(order).or_insert_with(|| OrderColumns { order, columns: vec![], kernel: None });
-                    made.columns.push((signal, column));
+                    bank.columns.push((signal, column));
                     if signal == output {
-                        (kernel, made.kernel) = rest.next().unzip();
+                        (kernel, bank.kernel) = rest.next().unzip();
                     }
                 }
                 Key::Initial { exponent } => initial.push((exponent, column)),
@@ -510,13 +511,13 @@ impl Bank {
             own.push(kernel);
         }
         let integrated: BTreeSet<usize> =
-            orders.values().filter(|made| made.order != 0).flat_map(|made| &made.columns).map(|(s, _)| *s).collect();
+            orders.values().filter(|bank| bank.order != 0).flat_map(|bank| &bank.columns).map(|(s, _)| *s).collect();
         let signals = integrated.into_iter().collect();
         let spectrum = |(): &mut (), signal: usize| (signal, Kernel::new(record.signal(signal)));
         let spectra: BTreeMap<usize, Kernel> = parallel::map(signals, || (), spectrum).into_iter().collect();
-        parallel::map(orders.into_values().collect(), Buffers::default, |buffers, made| {
+        parallel::map(orders.into_values().collect(), Buffers::default, |buffers, bank| {
             if !stop.is_set() {
-                made.write(record, &spectra, buffers);
+                bank.write(record, &spectra, buffers);
             }
         });
         stop.check()?;

@@ -204,8 +204,8 @@ pub fn respond_with_initial(
     let units: Vec<(usize, usize, f64)> = (exponents.iter().enumerate())
         .flat_map(|(i, list)| list.iter().enumerate().map(move |(e, &exponent)| (i, e, exponent)))
         .collect();
-    let asked: Vec<(usize, f64)> = units.iter().map(|&(i, _, exponent)| (i, exponent)).collect();
-    let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.unit_responses(&asked)?))
+    let terms: Vec<(usize, f64)> = units.iter().map(|&(i, _, exponent)| (i, exponent)).collect();
+    let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.unit_responses(&terms)?))
         .map(|(&(i, e, _), outputs)| (i, e, through(outputs)))
         .filter(|(_, _, response)| finite(response))
         .collect();

@@ -212,10 +212,10 @@ impl Realization {
     /// Reinsch, 1969).
     fn balance(&mut self) {
         let n = self.states;
-        let mut moved = true;
+        let mut has_changed = true;
         // Each sweep reduces the norm, and a reducible matrix stops when its coupling is negligible.
         for _ in 0..MAX_STATES {
-            if !std::mem::take(&mut moved) {
+            if !std::mem::take(&mut has_changed) {
                 break;
             }
             for i in 0..n {
@@ -236,7 +236,7 @@ impl Realization {
                 self.read.iter_mut().skip(i).step_by(n).for_each(|v| *v *= factor);
                 self.drives.iter_mut().for_each(|(b, _)| b[i] /= factor);
                 self.start[i] /= factor;
-                moved = true;
+                has_changed = true;
             }
         }
     }
@@ -326,9 +326,9 @@ impl Transition {
 
 /// e^M of a row-major n × n matrix; None if it overflows.
 pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
-    let mut found = Transition::new(matrix, n, 1.0)?.growth;
-    found.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
-    Some(found)
+    let mut growth = Transition::new(matrix, n, 1.0)?.growth;
+    growth.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
+    Some(growth)
 }
 
 /// Gains of an input on the states after one interval: of its value at the interval and of the next one.
@@ -435,15 +435,15 @@ impl Recursion<'_> {
 impl Channel<'_> {
     /// Read the values that act in the rows from `begin` on; the last sample holds beyond the record.
     fn read(&self, begin: usize, values: &mut [f64]) {
-        let held = self.samples.last().copied().unwrap_or(0.0);
+        let last_value = self.samples.last().copied().unwrap_or(0.0);
         let early = (0..values.len()).take_while(|row| delayed_row(begin + row, self.lag).is_none()).count();
         let (early, rest) = values.split_at_mut(early);
         early.fill(self.before);
         let first = delayed_row(begin + early.len(), self.lag).unwrap_or(usize::MAX);
-        let known = self.samples.get(first..).unwrap_or_default();
-        let (own, beyond) = rest.split_at_mut(known.len().min(rest.len()));
-        own.copy_from_slice(&known[..own.len()]);
-        beyond.fill(held);
+        let samples = self.samples.get(first..).unwrap_or_default();
+        let (own, rest_of_block) = rest.split_at_mut(samples.len().min(rest.len()));
+        own.copy_from_slice(&samples[..own.len()]);
+        rest_of_block.fill(last_value);
     }
 }
 
@@ -506,9 +506,9 @@ mod tests {
             for slow in [1.0, 1e-3, 1e-6] {
                 let root = f64::sqrt(fast * slow);
                 let matrix = [-(fast + slow), root, -root, 0.0];
-                let found = Transition::new(&matrix, 2, 1.0).map(|t| [t.growth[3], t.first[3], t.second[3]]);
+                let entries = Transition::new(&matrix, 2, 1.0).map(|t| [t.growth[3], t.first[3], t.second[3]]);
                 let exact = two_poles(fast, slow);
-                let worst = found
+                let worst = entries
                     .map_or(f64::NAN, |f| f.iter().zip(exact).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f64::max));
                 // The second function loses six digits of the reference by cancellation at 1e-6.
                 assert!(worst < 1e-9, "{fast:e}, {slow:e}: {worst:e}");
@@ -520,9 +520,9 @@ mod tests {
     fn a_nilpotent_chain_has_powers_over_factorials() {
         let mut chain = vec![0.0; 16];
         (0..3).for_each(|i| chain[5 * i + 1] = 1.0);
-        let found = Transition::new(&chain, 4, 0.5).map(|t| [t.growth[3], t.first[3], t.second[3]]);
+        let entries = Transition::new(&chain, 4, 0.5).map(|t| [t.growth[3], t.first[3], t.second[3]]);
         let exact = [6.0, 24.0, 120.0].map(|factorial| 0.125 / factorial);
-        assert!(found.is_some_and(|f| f.iter().zip(exact).all(|(a, b)| (a / b - 1.0).abs() < 1e-14)), "{found:?}");
+        assert!(entries.is_some_and(|f| f.iter().zip(exact).all(|(a, b)| (a / b - 1.0).abs() < 1e-14)), "{entries:?}");
     }
 
     #[test]

@@ -45,8 +45,8 @@ impl Regression {
         if records.is_empty() {
             return Err(Error::Length { name: "records".into(), expected: 1, found: 0 });
         }
-        let known: Vec<f64> = fixed.iter().flatten().copied().collect();
-        check_finite("fixed coefficients", &known)?;
+        let fixed_values: Vec<f64> = fixed.iter().flatten().copied().collect();
+        check_finite("fixed coefficients", &fixed_values)?;
         records.iter().try_for_each(|record| structure.check(record.len(), |_| true))?;
         initial.check()?;
         let exponents = structure.initial_exponents(initial);
@@ -152,33 +152,33 @@ pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec
         return Ok((Vec::new(), Vec::new()));
     }
     let scales: Vec<f64> = columns.iter().map(|c| norm(c)).collect();
-    let mut kept: Vec<usize> = (0..k).collect();
-    if let Some(&zero) = kept.iter().find(|&&i| i < needed && !(scales[i] > 0.0 && scales[i].is_finite())) {
+    let mut independent: Vec<usize> = (0..k).collect();
+    if let Some(&zero) = independent.iter().find(|&&i| i < needed && !(scales[i] > 0.0 && scales[i].is_finite())) {
         return Err(Error::Singular { index: zero, count: k });
     }
-    kept.retain(|&i| scales[i] > 0.0 && scales[i].is_finite());
+    independent.retain(|&i| scales[i] > 0.0 && scales[i].is_finite());
     let target_scale = norm(target).max(f64::MIN_POSITIVE);
     loop {
         let mut scaled: Vec<Vec<f64>> =
-            kept.iter().map(|&i| columns[i].iter().map(|v| v / scales[i]).collect()).collect();
+            independent.iter().map(|&i| columns[i].iter().map(|v| v / scales[i]).collect()).collect();
         scaled.push(target.iter().map(|v| v / target_scale).collect());
         let r = dense::triangular_factor(&scaled);
         let stride = scaled.len();
-        let dependent = (0..kept.len()).find(|&i| r[i * stride + i].abs() <= RANK_TOLERANCE);
+        let dependent = (0..independent.len()).find(|&i| r[i * stride + i].abs() <= RANK_TOLERANCE);
         if let Some(position) = dependent {
-            if kept[position] < needed {
-                return Err(Error::Singular { index: kept[position], count: k });
+            if independent[position] < needed {
+                return Err(Error::Singular { index: independent[position], count: k });
             }
-            kept.remove(position);
+            independent.remove(position);
             continue;
         }
-        let rhs: Vec<f64> = (0..kept.len()).map(|i| r[i * stride + kept.len()]).collect();
+        let rhs: Vec<f64> = (0..independent.len()).map(|i| r[i * stride + independent.len()]).collect();
         let solution = back_substitute(&r, stride, &rhs);
         let mut x = vec![0.0; k];
-        for (&i, value) in kept.iter().zip(solution) {
+        for (&i, value) in independent.iter().zip(solution) {
             x[i] = value * target_scale / scales[i];
         }
-        let dropped = (0..k).filter(|i| !kept.contains(i)).collect();
+        let dropped = (0..k).filter(|i| !independent.contains(i)).collect();
         return Ok((x, dropped));
     }
 }

@@ -127,16 +127,16 @@ fn fit_point(
             response.times(series, &mut out, &mut buffers);
             out
         };
-        let mut left = part.target.clone();
+        let mut residual = part.target.clone();
         let mut free = columns.iter_mut();
-        for (series, known) in part.terms.iter().zip(fixed) {
+        for (series, coefficient) in part.terms.iter().zip(fixed) {
             let answer = through(series);
-            match known {
-                Some(c) => left.iter_mut().zip(&answer).for_each(|(t, v)| *t -= c * v),
+            match coefficient {
+                Some(c) => residual.iter_mut().zip(&answer).for_each(|(t, v)| *t -= c * v),
                 None => free.next().into_iter().for_each(|column| column.extend(&answer)),
             }
         }
-        target.extend(left);
+        target.extend(residual);
         starts.push(part.initial.iter().map(&mut through).collect::<Vec<_>>());
     }
     let finite = |v: &[f64]| v.iter().all(|x| x.is_finite());
@@ -157,21 +157,22 @@ fn solve_with_initial_terms(
 ) -> Option<(Vec<f64>, f64)> {
     let lengths: Vec<usize> = starts.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
     let free = columns.len();
-    let (mut less, mut left) = (columns.clone(), target.clone());
+    let (mut less, mut residual) = (columns.clone(), target.clone());
     let mut from = 0;
     for (own, &m) in starts.iter().zip(&lengths) {
         let mut basis = Vec::new();
         own.iter().for_each(|column| extend_orthonormal(&mut basis, column.clone(), RANK_TOLERANCE));
-        for series in less.iter_mut().chain(std::iter::once(&mut left)) {
+        for series in less.iter_mut().chain(std::iter::once(&mut residual)) {
             let rows = &mut series[from..from + m];
             project_out(&basis, rows);
             project_out(&basis, rows);
         }
         from += m;
     }
-    let told = less.iter().zip(&columns).all(|(less, whole)| norm(less) > MIN_REMAINING_NORM_RATIO * norm(whole));
+    let is_determined =
+        less.iter().zip(&columns).all(|(less, whole)| norm(less) > MIN_REMAINING_NORM_RATIO * norm(whole));
     let (columns, target) =
-        if told { (less, left) } else { (append_initial_terms(columns, &starts, &lengths), target) };
+        if is_determined { (less, residual) } else { (append_initial_terms(columns, &starts, &lengths), target) };
     let (x, _) = solve(&columns, &target, free).ok()?;
     let mut missed = target;
     for (column, c) in columns.iter().zip(&x) {

@@ -212,8 +212,8 @@ impl Streaming {
         for (structure, fixed) in equations {
             structure.check(inputs.len(), |s| inputs[s])?;
             check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
-            let known: Vec<f64> = fixed.iter().flatten().copied().collect();
-            check_finite("fixed coefficients", &known)?;
+            let fixed_values: Vec<f64> = fixed.iter().flatten().copied().collect();
+            check_finite("fixed coefficients", &fixed_values)?;
             // A stream integrates only. The whole equation is integrated by the excess order of an improper term.
             let orders: Vec<f64> = (0..structure.terms.len()).map(|k| structure.integration(k)).collect();
             let excess = orders.iter().fold(0.0, |most: f64, order| most.max(-order));

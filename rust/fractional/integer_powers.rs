@@ -92,16 +92,16 @@ impl<T> Table<T> {
         if let Some(values) = own().or_else(|| self.shared.with(|values| enough(values)).flatten()) {
             return values;
         }
-        let made = Arc::new((self.make)(m.next_power_of_two()));
+        let table = Arc::new((self.make)(m.next_power_of_two()));
         // The caller drops the replaced table outside the lock.
-        let kept = self.shared.with(|values| {
-            let longer = values.as_ref().is_none_or(|values| values.len() < made.len());
-            longer.then(|| values.replace(Arc::clone(&made)))
+        let cached = self.shared.with(|values| {
+            let longer = values.as_ref().is_none_or(|values| values.len() < table.len());
+            longer.then(|| values.replace(Arc::clone(&table)))
         });
-        if kept.is_none() {
-            self.own.set(Some(Arc::clone(&made)));
+        if cached.is_none() {
+            self.own.set(Some(Arc::clone(&table)));
         }
-        made
+        table
     }
 }
 

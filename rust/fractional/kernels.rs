@@ -107,7 +107,7 @@ impl SecondDifferences {
     pub(crate) fn new(eta: f64) -> Self {
         let (mut coefficients, mut slopes) = ([0.0; TERMS_NEAR], [0.0; TERMS_NEAR]);
         let (mut c, mut dc) = (1.0, 0.0);
-        for (k, (kept, slope)) in coefficients.iter_mut().zip(&mut slopes).enumerate() {
+        for (k, (coefficient, slope)) in coefficients.iter_mut().zip(&mut slopes).enumerate() {
             for j in [2 * k, 2 * k + 1] {
                 // η + 1 − j, but exactly η at j = 1: for small η the rounding of η + 1 would be the whole error.
                 let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
@@ -115,7 +115,7 @@ impl SecondDifferences {
                 dc = (dc * factor + c) / divisor;
                 c = c * factor / divisor;
             }
-            (*kept, *slope) = (c, dc);
+            (*coefficient, *slope) = (c, dc);
         }
         Self { eta, coefficients, slopes }
     }
@@ -479,10 +479,10 @@ pub fn kernel_and_slope(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
         return kernel_with_derivative(eta, m, step);
     }
     let (integral, slope) = kernel_with_derivative(-eta, m, step);
-    let made = reciprocal(&integral);
+    let kernel = reciprocal(&integral);
     // d/dη of 1/F(−η) is F′(−η)/F(−η)².
-    let square = multiply(&made, &made, m);
-    (made, multiply(&square, &slope, m))
+    let square = multiply(&kernel, &kernel, m);
+    (kernel, multiply(&square, &slope, m))
 }
 
 /// First coefficient of [`kernel`]: effect of a pulse on its own mean.

@@ -125,20 +125,20 @@ impl Table {
 /// Tables of a level of rows with all levels of columns, in the order of the columns.
 fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
     // ahead[m + d] is the sum of the responses from d on over half a width.
-    let mut ahead = vec![0.0; 2 * m];
-    ahead[m..].copy_from_slice(response);
+    let mut padded = vec![0.0; 2 * m];
+    padded[m..].copy_from_slice(response);
     let levels = m.trailing_zeros() as usize;
     let mut tables = Vec::with_capacity(levels + 1);
     for level in (1..=levels).rev() {
         let columns = Wavelet::of(level, m);
         let half = columns.width / 2;
-        tables.push(table(rows, &columns, m, |e| (ahead[e] - ahead[e + half]) * columns.scale));
+        tables.push(table(rows, &columns, m, |e| (padded[e] - padded[e + half]) * columns.scale));
         for e in 0..2 * m - half {
-            ahead[e] += ahead[e + half];
+            padded[e] += padded[e + half];
         }
     }
     let constant = Wavelet::of(0, m);
-    tables.push(table(rows, &constant, m, |e| ahead[e] * constant.scale));
+    tables.push(table(rows, &constant, m, |e| padded[e] * constant.scale));
     tables.reverse();
     tables
 }

@@ -75,10 +75,10 @@ impl StarredTransform {
                     [1.0, -1.0].map(|sign| (weight, logarithm(omega + sign * n as f64 * period)))
                 });
             // d/dω of the integral from the edge to infinity is the function at the edge.
-            let beyond = LEGENDRE_RULE.iter().flat_map(|&(point, weight)| {
+            let tail = LEGENDRE_RULE.iter().flat_map(|&(point, weight)| {
                 [1.0, -1.0].map(|sign| (-sign * weight * omega / period, logarithm(point * omega + sign * edge)))
             });
-            direct.chain(beyond).collect()
+            direct.chain(tail).collect()
         };
         Self {
             step,
@@ -153,11 +153,11 @@ impl StarredTransform {
             let first = self.panels[p];
             for (j, value) in (first..).zip(&mut spectrum[first..self.panels[p + 1]]) {
                 let x = j as f64 * share - (2 * p + 1) as f64;
-                let (mut above, mut here) = (Bin::default(), Bin::default());
+                let (mut above, mut current) = (Bin::default(), Bin::default());
                 for c in c[1..].iter().rev() {
-                    (above, here) = (here, here * (2.0 * x) - above + c);
+                    (above, current) = (current, current * (2.0 * x) - above + c);
                 }
-                *value += here * x - above + c[0];
+                *value += current * x - above + c[0];
             }
         }
     }
@@ -188,14 +188,14 @@ mod tests {
     /// Step response of a function of s, without feedthrough.
     fn step_response(rows: usize, step: f64, function: impl Fn(Bin) -> Bin) -> Vec<f64> {
         let transform = StarredTransform::new(rows, step);
-        let found = transform.spectra(&[0.0], |logarithm, values| {
+        let spectra = transform.spectra(&[0.0], |logarithm, values| {
             values[0] = function(logarithm) * integration(logarithm, 1.0);
         });
-        found.into_iter().map(|spectrum| transform.samples(spectrum)).next().unwrap_or_default()
+        spectra.into_iter().map(|spectrum| transform.samples(spectrum)).next().unwrap_or_default()
     }
 
-    fn distance(found: &[f64], exact: impl Fn(f64) -> f64, step: f64) -> f64 {
-        found.iter().enumerate().map(|(k, v)| (v - exact(k as f64 * step)).abs()).fold(0.0, f64::max)
+    fn distance(actual: &[f64], exact: impl Fn(f64) -> f64, step: f64) -> f64 {
+        actual.iter().enumerate().map(|(k, v)| (v - exact(k as f64 * step)).abs()).fold(0.0, f64::max)
     }
 
     #[test]

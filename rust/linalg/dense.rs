@@ -50,7 +50,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     let rows = pieces(m);
     let pairs = (0..tiles.len()).flat_map(|b| (0..=b).map(move |a| (a, b)));
     let tasks: Vec<_> = pairs.flat_map(|pair| rows.iter().map(move |&piece| (pair, piece))).collect();
-    let made = parallel::map(
+    let tiles_of_products = parallel::map(
         tasks,
         || (),
         |(), ((a, b), (from, len))| {
@@ -63,7 +63,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
         },
     );
     let mut out = vec![0.0; (k + 1) * (k + 1)];
-    for (left, right, product) in made {
+    for (left, right, product) in tiles_of_products {
         for (j, column) in product.col_iter().enumerate() {
             for (i, value) in column.iter().enumerate().filter(|(i, _)| left + i <= right + j) {
                 out[(left + i) * (k + 1) + right + j] += value;
@@ -135,10 +135,10 @@ pub struct SingularValues {
 pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
     let m = columns.first().map_or(0, Vec::len);
     let x = Mat::from_fn(m, columns.len(), |i, j| columns[j][i]);
-    let found = x.thin_svd().ok()?;
+    let decomposition = x.thin_svd().ok()?;
     let vectors = |of: MatRef<'_, f64>| of.col_iter().map(|column| column.iter().copied().collect()).collect();
-    let sizes = found.S().column_vector().iter().copied().collect();
-    Some(SingularValues { left: vectors(found.U()), values: sizes, right: vectors(found.V()) })
+    let sizes = decomposition.S().column_vector().iter().copied().collect();
+    Some(SingularValues { left: vectors(decomposition.U()), values: sizes, right: vectors(decomposition.V()) })
 }
 
 /// Inner products of every left with every right column of equal length, row-major left × right.
@@ -147,7 +147,7 @@ pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
 #[must_use]
 pub fn inner_products(left: &[&[f64]], right: &[&[f64]], stop: &Stop) -> Vec<f64> {
     let m = left.first().map_or(0, |c| c.len());
-    let made = parallel::map(
+    let blocks = parallel::map(
         pieces(m),
         || (),
         |(), (from, len)| {
@@ -162,7 +162,7 @@ pub fn inner_products(left: &[&[f64]], right: &[&[f64]], stop: &Stop) -> Vec<f64
         },
     );
     let mut out = vec![0.0; left.len() * right.len()];
-    for product in made {
+    for product in blocks {
         let values = product.col_iter().flat_map(|column| column.iter());
         out.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
     }

@@ -62,11 +62,11 @@ pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + QR_BLOCK_ROWS.min(m)); k];
     stacked.iter_mut().for_each(|column| column.resize(k, 0.0));
     for from in (0..m).step_by(QR_BLOCK_ROWS) {
-        for (j, (column, given)) in stacked.iter_mut().zip(columns).enumerate() {
+        for (j, (column, source)) in stacked.iter_mut().zip(columns).enumerate() {
             // A reflection leaves its own vector below the triangle.
             column.truncate(k);
             column.iter_mut().skip(j + 1).for_each(|v| *v = 0.0);
-            let rows = given.get(from..given.len().min(from + QR_BLOCK_ROWS)).unwrap_or_default();
+            let rows = source.get(from..source.len().min(from + QR_BLOCK_ROWS)).unwrap_or_default();
             column.extend_from_slice(rows);
             column.resize(k + QR_BLOCK_ROWS.min(m - from), 0.0);
         }
@@ -116,9 +116,9 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
     let whole = norm(&column);
     // Two passes are enough (Kahan, Parlett).
     dispatch_simd(Projection { basis, column: &mut column, times: 2 });
-    let left = norm(&column);
-    if left > share * whole && left.is_finite() {
-        column.iter_mut().for_each(|v| *v /= left);
+    let remainder = norm(&column);
+    if remainder > share * whole && remainder.is_finite() {
+        column.iter_mut().for_each(|v| *v /= remainder);
         basis.push(column);
     }
 }
@@ -152,14 +152,14 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
             stop.check()?;
             project_out(before, &mut direction);
         }
-        let left = norm(&direction);
-        direction.iter_mut().for_each(|v| *v /= left);
+        let remainder = norm(&direction);
+        direction.iter_mut().for_each(|v| *v /= remainder);
         basis.push(direction);
         let last = &basis[basis.len() - 1..];
-        let without = |(): &mut (), (left, mut column): (f64, Vec<f64>)| {
+        let without = |(): &mut (), (remainder, mut column): (f64, Vec<f64>)| {
             // A column that is half processed after cancellation is discarded.
             if stop.is_set() {
-                return (left, column);
+                return (remainder, column);
             }
             project_out(last, &mut column);
             (norm(&column), column)

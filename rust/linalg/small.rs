@@ -46,7 +46,7 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
 /// ```
 #[must_use]
 pub fn inverse_with_determinant(matrix: &[f64], n: usize) -> Option<(Vec<f64>, f64)> {
-    let (found, determinant) = match (matrix, n) {
+    let (inverse, determinant) = match (matrix, n) {
         (&[a], 1) => (vec![1.0 / a], a),
         (&[a, b, c, d], 2) => {
             let determinant = a * d - b * c;
@@ -58,7 +58,7 @@ pub fn inverse_with_determinant(matrix: &[f64], n: usize) -> Option<(Vec<f64>, f
             (a.try_inverse()?.transpose().as_slice().to_vec(), determinant)
         }
     };
-    (determinant != 0.0 && found.iter().all(|v| v.is_finite())).then_some((found, determinant))
+    (determinant != 0.0 && inverse.iter().all(|v| v.is_finite())).then_some((inverse, determinant))
 }
 
 /// Most steps of an iteration for eigenvalues, of which a polynomial of degree ten needs about thirty.
@@ -74,8 +74,8 @@ const MAX_EIGENVALUE_STEPS: usize = 1000;
 /// ```
 #[must_use]
 pub fn spectral_radius(coefficients: &[f64]) -> Option<f64> {
-    let found = polynomial_roots(coefficients)?;
-    Some(found.iter().map(|(re, im)| re.hypot(*im)).fold(0.0, f64::max)).filter(|_| !found.is_empty())
+    let roots = polynomial_roots(coefficients)?;
+    Some(roots.iter().map(|(re, im)| re.hypot(*im)).fold(0.0, f64::max)).filter(|_| !roots.is_empty())
 }
 
 /// Real and imaginary part of the zeros of a polynomial with these coefficients, the constant first.
@@ -104,8 +104,8 @@ pub fn polynomial_roots(coefficients: &[f64]) -> Option<Vec<(f64, f64)>> {
     let top: Vec<f64> = ratios.iter().enumerate().map(scaled).collect();
     let n = top.len();
     let companion = DMatrix::from_fn(n, n, |i, j| if i == 0 { top[j] } else { f64::from(u8::from(i == j + 1)) });
-    let found = Schur::try_new(companion, f64::EPSILON, MAX_EIGENVALUE_STEPS)?.complex_eigenvalues();
-    Some(found.iter().map(|z| (unit * z.re, unit * z.im)).collect())
+    let eigenvalues = Schur::try_new(companion, f64::EPSILON, MAX_EIGENVALUE_STEPS)?.complex_eigenvalues();
+    Some(eigenvalues.iter().map(|z| (unit * z.re, unit * z.im)).collect())
 }
 
 /// LU factorization of an equilibrated square matrix, whose rows and columns may differ in scale by any factor.
@@ -346,14 +346,14 @@ pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
 fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
     for i in 0..k {
         for j in 0..=i {
-            let known: f64 = (0..j).map(|l| packed[packed_index(i, l)] * packed[packed_index(j, l)]).sum();
-            let left = packed[packed_index(i, j)] - known;
+            let sum: f64 = (0..j).map(|l| packed[packed_index(i, l)] * packed[packed_index(j, l)]).sum();
+            let remainder = packed[packed_index(i, j)] - sum;
             packed[packed_index(i, j)] = if i > j {
-                left / packed[packed_index(j, j)]
+                remainder / packed[packed_index(j, j)]
             } else if packed[packed_index(i, i)] == 0.0 {
                 1.0
-            } else if left > 0.0 && left < f64::INFINITY {
-                left.sqrt()
+            } else if remainder > 0.0 && remainder < f64::INFINITY {
+                remainder.sqrt()
             } else {
                 return None;
             };
@@ -507,12 +507,12 @@ impl Recursion {
         // L Lᵀ x = gain, and the solution replaces the gain.
         let (factor, x) = (&self.factor, &mut self.gain);
         for i in 0..k {
-            let known: f64 = (0..i).map(|j| factor[packed_index(i, j)] * x[j]).sum();
-            x[i] = (x[i] - known) / factor[packed_index(i, i)];
+            let partial_sum: f64 = (0..i).map(|j| factor[packed_index(i, j)] * x[j]).sum();
+            x[i] = (x[i] - partial_sum) / factor[packed_index(i, i)];
         }
         for i in (0..k).rev() {
-            let known: f64 = (i + 1..k).map(|j| factor[packed_index(j, i)] * x[j]).sum();
-            x[i] = (x[i] - known) / factor[packed_index(i, i)];
+            let partial_sum: f64 = (i + 1..k).map(|j| factor[packed_index(j, i)] * x[j]).sum();
+            x[i] = (x[i] - partial_sum) / factor[packed_index(i, i)];
         }
         self.coefficients.iter_mut().zip(&mut self.gain).for_each(|(c, x)| *c += std::mem::take(x));
         Ok(())

@@ -51,8 +51,8 @@ impl Control {
     }
 
     /// Count candidates as processed, and some of them as pruned.
-    pub(crate) fn count(&self, done: u64, pruned: u64) {
-        self.done.fetch_add(done, Ordering::Relaxed);
+    pub(crate) fn count(&self, processed: u64, pruned: u64) {
+        self.done.fetch_add(processed, Ordering::Relaxed);
         self.pruned.fetch_add(pruned, Ordering::Relaxed);
     }
 }
@@ -82,8 +82,8 @@ impl BatchPosition {
 
     /// Whether the position is consistent.
     pub(crate) fn is_valid(&self) -> bool {
-        let begun = self.end == 0 || (self.size > 0 && self.limit >= 0.0);
-        begun && self.evaluated_count <= self.end
+        let has_begun = self.end == 0 || (self.size > 0 && self.limit >= 0.0);
+        has_begun && self.evaluated_count <= self.end
     }
 
     /// Whether the position is before a batch, or in one with enough open candidates and this digest.

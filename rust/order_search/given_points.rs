@@ -142,22 +142,22 @@ impl Points {
     /// Compute the regressors that are not in the cache.
     fn fill_cache(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
         let each = self.samples * std::mem::size_of::<f64>();
-        let mut wanted: Vec<(Key, usize, f64)> = Vec::new();
+        let mut requests: Vec<(Key, usize, f64)> = Vec::new();
         for structure in structures.iter().flatten() {
             for k in 0..structure.terms.len() {
                 let (signal, eta) = (structure.terms[k].signal, structure.integration(k));
-                wanted.push((Key::integral(signal, eta), signal, eta));
+                requests.push((Key::integral(signal, eta), signal, eta));
             }
         }
-        wanted.sort_unstable_by_key(|a| a.0);
-        wanted.dedup_by(|a, b| a.0 == b.0);
-        if (self.cache.len() + wanted.len()) * each > MAX_CACHE_BYTES {
+        requests.sort_unstable_by_key(|a| a.0);
+        requests.dedup_by(|a, b| a.0 == b.0);
+        if (self.cache.len() + requests.len()) * each > MAX_CACHE_BYTES {
             self.cache.clear();
         }
-        wanted.retain(|(key, _, _)| !self.cache.contains_key(key));
+        requests.retain(|(key, _, _)| !self.cache.contains_key(key));
         let (records, output) = (&self.records, self.output);
-        let made: Vec<Vec<Vec<f64>>> = pool.install(|| {
-            wanted
+        let columns: Vec<Vec<Vec<f64>>> = pool.install(|| {
+            requests
                 .par_iter()
                 .map(|&(_, signal, eta)| {
                     let one = |record: &Record| {
@@ -173,7 +173,7 @@ impl Points {
                 })
                 .collect()
         });
-        self.cache.extend(wanted.into_iter().map(|(key, _, _)| key).zip(made));
+        self.cache.extend(requests.into_iter().map(|(key, _, _)| key).zip(columns));
     }
 
     /// Raw error of a candidate on all records. `None` above the limit, or if the simulation diverges.
@@ -190,8 +190,8 @@ impl Points {
             let columns: Vec<(bool, &[f64], f64)> = (0..structure.terms.len())
                 .filter_map(|k| {
                     let signal = structure.terms[k].signal;
-                    let kept = self.cache.get(&Key::integral(signal, structure.integration(k)))?;
-                    Some((signal == self.output, &kept[r][..], coefficients[k]))
+                    let cached_column = self.cache.get(&Key::integral(signal, structure.integration(k)))?;
+                    Some((signal == self.output, &cached_column[r][..], coefficients[k]))
                 })
                 .collect();
             let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));

@@ -44,7 +44,7 @@ impl simd::SimdKernel for Screening<'_> {
     #[inline(always)]
     fn run(self) -> Self::Output {
         let Self { catalogue, lo, hi, limit } = self;
-        let mut found = (Vec::new(), Vec::new());
+        let mut screened = (Vec::new(), Vec::new());
         let mut cursor = Cursor::at(&catalogue.lattice, lo);
         let mut index = lo;
         let width = catalogue.lattice.width();
@@ -56,11 +56,11 @@ impl simd::SimdKernel for Screening<'_> {
             while index < hi {
                 let shared = sharing
                     .as_ref()
-                    .and_then(|sharing| screen.screen_row(catalogue, sharing, &mut cursor, (index, hi), &mut found));
+                    .and_then(|sharing| screen.screen_row(catalogue, sharing, &mut cursor, (index, hi), &mut screened));
                 if let Some(candidates) = shared {
                     index += candidates;
                 } else if index + LANE_COUNT as u64 <= hi {
-                    screen.screen_next(catalogue, &mut cursor, index, limit, &mut found);
+                    screen.screen_next(catalogue, &mut cursor, index, limit, &mut screened);
                     index += LANE_COUNT as u64;
                 } else {
                     break;
@@ -70,10 +70,10 @@ impl simd::SimdKernel for Screening<'_> {
         let mut screen = Screen::<1>::new(width);
         catalogue.positions(&cursor, &mut screen.terms);
         while index < hi {
-            screen.screen_next(catalogue, &mut cursor, index, limit, &mut found);
+            screen.screen_next(catalogue, &mut cursor, index, limit, &mut screened);
             index += 1;
         }
-        found
+        screened
     }
 }
 
@@ -139,7 +139,7 @@ impl<const L: usize> Screen<L> {
         &RowBoundContext { squares, limit }: &RowBoundContext<'_>,
         cursor: &mut Cursor<'_>,
         (index, hi): (u64, u64),
-        found: &mut (Vec<OpenCandidate>, Vec<u64>),
+        screened: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) -> Option<u64> {
         let (term, digit, len) = cursor.adjacent_run()?;
         let len = usize::try_from(hi - index).map_or(len, |all| len.min(all));
@@ -148,10 +148,10 @@ impl<const L: usize> Screen<L> {
         }
         let columns = &catalogue.term_columns(cursor, term)[digit..digit + len];
         let shared = CommonFactor::new(squares, &self.terms, term)?;
-        let mut left = std::mem::take(&mut self.open_positions);
-        left.clear();
-        shared.append_open::<L>(columns, limit, &mut left);
-        for part in left.chunks(L) {
+        let mut open_positions = std::mem::take(&mut self.open_positions);
+        open_positions.clear();
+        shared.append_open::<L>(columns, limit, &mut open_positions);
+        for part in open_positions.chunks(L) {
             for (positions, &column) in self.positions.iter_mut().zip(&self.terms) {
                 *positions = Columns::one(column);
             }
@@ -160,9 +160,9 @@ impl<const L: usize> Screen<L> {
             let indices = at.map(|n| index + n as u64);
             self.positions[term] = Columns::new(at.map(|n| columns[n]));
             self.positions[term].compare();
-            self.screen_positions(catalogue, indices, part.len(), limit, found);
+            self.screen_positions(catalogue, indices, part.len(), limit, screened);
         }
-        self.open_positions = left;
+        self.open_positions = open_positions;
         cursor.skip(len - 1);
         catalogue.next(cursor, &mut self.terms);
         Some(len as u64)
@@ -176,7 +176,7 @@ impl<const L: usize> Screen<L> {
         cursor: &mut Cursor<'_>,
         index: u64,
         limit: f64,
-        found: &mut (Vec<OpenCandidate>, Vec<u64>),
+        screened: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         let Self { positions, initial, terms, .. } = self;
         catalogue.initial(cursor, initial);
@@ -197,7 +197,7 @@ impl<const L: usize> Screen<L> {
             }
             positions.iter_mut().for_each(Columns::compare);
         }
-        self.screen_positions(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, found);
+        self.screen_positions(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, screened);
     }
 
     /// Screen the candidates whose columns have been set.
@@ -218,7 +218,7 @@ impl<const L: usize> Screen<L> {
             coefficients,
             weights,
             norm_cache: memory,
-            lookup: held,
+            lookup: lookup,
             path,
             ..
         } = self;
@@ -261,7 +261,7 @@ impl<const L: usize> Screen<L> {
                 continue;
             }
             if let (Some(tangents), true) = (&catalogue.problem.linearized_vectors, limit < f64::INFINITY)
-                && tangents.excludes_candidate(columns, coefficients, limit, held)
+                && tangents.excludes_candidate(columns, coefficients, limit, lookup)
             {
                 continue;
             }
@@ -284,7 +284,7 @@ impl<const L: usize> Screen<L> {
         columns: &[usize],
         candidates: &[(u64, usize, usize)],
         limit: f64,
-        found: &mut (Vec<OpenCandidate>, Vec<u64>),
+        screened: &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         for (positions, &column) in self.positions.iter_mut().zip(columns) {
             *positions = Columns::one(column);
@@ -297,6 +297,6 @@ impl<const L: usize> Screen<L> {
             self.positions[term].at = at;
             self.positions[term].compare();
         }
-        self.screen_positions(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, found);
+        self.screen_positions(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, screened);
     }
 }

@@ -38,18 +38,18 @@ impl OutputSimulation {
     /// ```
     pub fn exact_samples(&self, initial: &InitialTerms, stop: &Stop) -> Result<Option<OutputSamples>> {
         let rest: Terms = vec![Vec::new(); self.equations.len()];
-        let (given, units, has_level) = match initial {
+        let (exponent_list, units, has_level) = match initial {
             InitialTerms::Given(terms) => (terms, Vec::new(), false),
             InitialTerms::Fitted { exponents, has_level } => (&rest, self.unit_terms(exponents)?, *has_level),
         };
-        check_length("initial terms", rest.len(), given.len())?;
-        let exponents = given.iter().flatten().map(|term| term.0).chain(units.iter().map(|unit| unit.1));
+        check_length("initial terms", rest.len(), exponent_list.len())?;
+        let exponents = exponent_list.iter().flatten().map(|term| term.0).chain(units.iter().map(|unit| unit.1));
         if !self.has_state_space() || !exponents.into_iter().all(|e| e >= 0.0 && is_integer(e)) {
             return Ok(None);
         }
-        let Some(outputs) = self.respond(given, true, stop)? else { return Ok(None) };
+        let Some(outputs) = self.respond(exponent_list, true, stop)? else { return Ok(None) };
         if (units.is_empty() && !has_level) || !outputs.iter().flatten().all(|v| v.is_finite()) {
-            return Ok(Some(OutputSamples { outputs, initial: given.clone() }));
+            return Ok(Some(OutputSamples { outputs, initial: exponent_list.clone() }));
         }
         let unit = |&(equation, exponent): &(usize, f64)| {
             let mut terms = rest.clone();
@@ -97,8 +97,8 @@ impl OutputSimulation {
             let inputs: Vec<InputSignal> = signals.map(|signal| self.input(signal)).collect();
             let mut terms = terms.to_vec();
             terms.iter_mut().for_each(|own| own.sort_by(|a, b| a.0.total_cmp(&b.0)));
-            let found = state_space::respond(equations, &inputs, &terms, step, rows, stop)?;
-            Ok(found.map(|samples| samples.chunks(rows).map(<[f64]>::to_vec).collect::<Rows>()))
+            let response = state_space::respond(equations, &inputs, &terms, step, rows, stop)?;
+            Ok(response.map(|samples| samples.chunks(rows).map(<[f64]>::to_vec).collect::<Rows>()))
         };
         if self.recording.is_coupled {
             return together(&self.equations, terms);

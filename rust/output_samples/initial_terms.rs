@@ -20,9 +20,9 @@ pub struct OutputSamples {
 
 /// Weight of an output: 1 over the standard deviation of its measured samples.
 pub(super) fn weight(measured: &[f64]) -> f64 {
-    let known: Vec<f64> = measured.iter().copied().filter(|v| !v.is_nan()).collect();
-    let level = mean(&known);
-    let deviation = mean(&known.iter().map(|v| (v - level) * (v - level)).collect::<Vec<_>>()).sqrt();
+    let finite: Vec<f64> = measured.iter().copied().filter(|v| !v.is_nan()).collect();
+    let level = mean(&finite);
+    let deviation = mean(&finite.iter().map(|v| (v - level) * (v - level)).collect::<Vec<_>>()).sqrt();
     if deviation > 0.0 {
         1.0 / deviation
     } else {
@@ -75,8 +75,8 @@ pub fn fit_initial_terms(
     }
     let weights: Vec<f64> = measured.iter().map(|row| weight(row)).collect();
     let weighted = |rows: &Rows| -> Vec<f64> {
-        let of = |((row, known), w): ((&Vec<f64>, &Vec<f64>), &f64)| -> Vec<f64> {
-            row.iter().zip(known).map(|(v, known)| if known.is_nan() { 0.0 } else { w * v }).collect()
+        let of = |((row, sample), w): ((&Vec<f64>, &Vec<f64>), &f64)| -> Vec<f64> {
+            row.iter().zip(sample).map(|(v, sample)| if sample.is_nan() { 0.0 } else { w * v }).collect()
         };
         rows.iter().zip(measured).zip(&weights).flat_map(of).collect()
     };
@@ -112,11 +112,11 @@ fn minimum_norm_solution(columns: &[Vec<f64>], share: f64) -> Result<Vec<f64>> {
     if square.is_empty() {
         return Ok(solution);
     }
-    let lost = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
-    let found = dense::singular_values(&square).ok_or_else(lost)?;
-    let least = share * found.values[0];
+    let error = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
+    let factors = dense::singular_values(&square).ok_or_else(error)?;
+    let least = share * factors.values[0];
     for ((left, value), right) in
-        found.left.iter().zip(&found.values).zip(&found.right).filter(|((_, v), _)| **v > least)
+        factors.left.iter().zip(&factors.values).zip(&factors.right).filter(|((_, v), _)| **v > least)
     {
         add_multiple(&mut solution, inner(left, &target) / value, right);
     }

@@ -80,28 +80,28 @@ impl OutputSimulation {
         let what = || format!("the {pulses} pulses of a simulation of run '{}'", self.recording.name());
         check_memory(what, pulse.saturating_mul(pulses), options.memory)?;
         options.max_pulses = options.max_pulses.min(options.memory / pulse);
-        if let Some(found) = refine_long_record(self, initial, options, stop)? {
-            return Ok(found);
+        if let Some(long_samples) = refine_long_record(self, initial, options, stop)? {
+            return Ok(long_samples);
         }
         let intervals = self.recording.len() - 1;
-        let (mut table, mut lost, mut every) = (RichardsonTable::default(), 0, FIRST_REFINEMENT);
+        let (mut table, mut failures, mut every) = (RichardsonTable::default(), 0, FIRST_REFINEMENT);
         loop {
             stop.check()?;
             let last = intervals.saturating_mul(2 * every) > options.max_pulses;
             let OutputSamples { outputs, initial: terms } = match self.samples(every, initial) {
                 // An autoregressive coefficient c meets 1 = c h^α / Γ(α + 2) on one step, not on two.
-                Err(error) if error.kind() == Kind::Model && lost != 1 => self.unknown_samples(),
-                found => found?,
+                Err(error) if error.kind() == Kind::Model && failures != 1 => self.unknown_samples(),
+                long_samples => long_samples?,
             };
             let finite = outputs.iter().flatten().all(|v| v.is_finite());
             let owners = terms.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |_| i));
             let values = terms.iter().flatten().map(|term| term.1).collect();
             table.add(outputs, values, &relative_change);
-            let found = table.estimate(&owners.collect::<Vec<_>>(), options.tolerance, &relative_change);
-            let limit = found.ok_or_else(|| Error::Internal { what: "no grid of a simulation".into() })?;
+            let long_samples = table.estimate(&owners.collect::<Vec<_>>(), options.tolerance, &relative_change);
+            let limit = long_samples.ok_or_else(|| Error::Internal { what: "no grid of a simulation".into() })?;
             // A stiff equation may have no stable scheme on a coarse grid. One that has none on two in a row has none.
-            lost = if finite || every == FIRST_REFINEMENT { 0 } else { lost + 1 };
-            if last || lost == 2 || limit.change.iter().all(|c| *c <= options.tolerance) {
+            failures = if finite || every == FIRST_REFINEMENT { 0 } else { failures + 1 };
+            if last || failures == 2 || limit.change.iter().all(|c| *c <= options.tolerance) {
                 let mut values = limit.terms.into_iter();
                 let initial = terms.into_iter().map(|own| {
                     own.into_iter().zip(values.by_ref()).map(|((exponent, _), value)| (exponent, value)).collect()
@@ -192,7 +192,7 @@ impl<'a> SampleResponses<'a> {
                 let blocks = self.inputs.len() + self.first_samples().count() + self.units.len();
                 Ok(vec![vec![f64::NAN; intervals + 1]; blocks * self.outputs()])
             }
-            found => found,
+            samples => samples,
         }
     }
 
@@ -309,12 +309,12 @@ fn refine_long_record(
         if !by.iter().flatten().all(|v| v.is_finite()) {
             return vec![f64::INFINITY; sizes.len()];
         }
-        let moved = responses.superpose(&by, first, &terms);
+        let changes = responses.superpose(&by, first, &terms);
         let of = |(row, size): (&Vec<f64>, &f64)| match peak(row) {
             0.0 => 0.0,
             most => most / if *size > 0.0 { *size } else { 1e-300 },
         };
-        moved.iter().zip(&sizes).map(of).collect()
+        changes.iter().zip(&sizes).map(of).collect()
     };
     let part =
         |rows: &Rows, first: usize, end: usize| rows.iter().map(|row| row[first..end].to_vec()).collect::<Rows>();
@@ -331,9 +331,9 @@ fn refine_long_record(
     let (best, refinement, change) = loop {
         let estimates =
             pieces.iter().map(|piece| piece.limit.estimate(&[], 0.0, &|new, old| measure(piece.first, new, old)));
-        let lost = || Error::Internal { what: "no grid of a response".into() };
-        let estimates = estimates.collect::<Option<Vec<_>>>().ok_or_else(lost)?;
-        let of = |i: usize| estimates.iter().filter_map(|found| found.change.get(i)).sum::<f64>();
+        let error = || Error::Internal { what: "no grid of a response".into() };
+        let estimates = estimates.collect::<Option<Vec<_>>>().ok_or_else(error)?;
+        let of = |i: usize| estimates.iter().filter_map(|estimate| estimate.change.get(i)).sum::<f64>();
         let change: Vec<f64> = (0..responses.outputs()).map(of).collect();
         let widest = (0..count).rev().find(|&k| {
             !estimates[k].change.iter().all(|c| *c <= share)
@@ -342,8 +342,8 @@ fn refine_long_record(
         let widest = widest.filter(|_| !change.iter().all(|c| *c <= options.tolerance));
         let Some((end, every)) = widest.map(|k| (pieces[k].end, 2 * pieces[k].refinement)) else {
             let mut best = vec![Vec::new(); estimates[0].samples.len()];
-            for found in estimates {
-                best.iter_mut().zip(found.samples).for_each(|(row, more)| row.extend(more));
+            for estimate in estimates {
+                best.iter_mut().zip(estimate.samples).for_each(|(row, more)| row.extend(more));
             }
             break (best, pieces[count - 1].refinement, change);
         };

@@ -26,7 +26,7 @@ pub(super) fn peak(row: &[f64]) -> f64 {
 
 /// Largest change of a row, relative to its largest value.
 pub(super) fn relative_change(new: &Rows, old: &Rows) -> Vec<f64> {
-    let of = |(moved, new): (Vec<f64>, &Vec<f64>)| match peak(&moved) {
+    let of = |(change, new): (Vec<f64>, &Vec<f64>)| match peak(&change) {
         0.0 => 0.0,
         most => most / peak(new),
     };
@@ -115,10 +115,10 @@ impl RichardsonTable {
             return Some(best);
         }
         for column in 0..self.grids.iter().map(|grid| grid.columns.len()).min().unwrap_or(0) {
-            if let Some(found) = self.estimate_by_ratio(column, owners, measure)
-                && found.largest_change() < best.largest_change()
+            if let Some(by_ratio) = self.estimate_by_ratio(column, owners, measure)
+                && by_ratio.largest_change() < best.largest_change()
             {
-                best = found;
+                best = by_ratio;
             }
         }
         Some(best)
@@ -132,13 +132,13 @@ impl RichardsonTable {
         let [(oldest, _), (older, _), (old, second), (new, third)] =
             [0, 1, 2, 3].map(|k| &self.grids[k].columns[column]);
         let (before, now) = (remaining_change_ratios(oldest, older, old)?, remaining_change_ratios(older, old, new)?);
-        let ahead = |new: &Rows, old: &Rows, ratios: &[f64]| -> Rows {
+        let extrapolate = |new: &Rows, old: &Rows, ratios: &[f64]| -> Rows {
             let of =
                 |((n, o), r): ((&Vec<f64>, &Vec<f64>), &f64)| n.iter().zip(o).map(|(n, o)| n + r * (n - o)).collect();
             new.iter().zip(old).zip(ratios).map(of).collect()
         };
-        let samples = ahead(new, old, &now);
-        let change = measure(&samples, &ahead(old, older, &before));
+        let samples = extrapolate(new, old, &now);
+        let change = measure(&samples, &extrapolate(old, older, &before));
         let terms = third.iter().zip(second).zip(owners).map(|((t, s), &o)| t + now[o] * (t - s)).collect();
         Some(LimitEstimate { samples, change, terms })
     }
@@ -149,15 +149,15 @@ impl RichardsonTable {
         let mut best = (if count <= 2 { count - 1 } else { 1 }, vec![f64::INFINITY; grid.columns[0].0.len()]);
         let older = self.grids.len().checked_sub(2).map_or(&[][..], |k| &self.grids[k].changes);
         for (column, change) in grid.changes.iter().enumerate().skip(1) {
-            let mut found = vec![(column, change.clone())];
+            let mut columns = vec![(column, change.clone())];
             if let (Some(before), true) = (older.get(column), column + 1 < count) {
                 let factor = 2.0_f64.powi(ERROR_POWERS[column]);
                 // The next column eliminates the remaining error of a column that has the error of its power.
                 if change.iter().zip(before).all(|(c, b)| c * (MIN_POWER_RATIO * factor) <= *b) {
-                    found.push((column + 1, change.iter().map(|c| c / (factor - 1.0)).collect()));
+                    columns.push((column + 1, change.iter().map(|c| c / (factor - 1.0)).collect()));
                 }
             }
-            for each in found {
+            for each in columns {
                 if largest_change(&each.1) < largest_change(&best.1) {
                     best = each;
                 }

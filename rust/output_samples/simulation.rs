@@ -139,18 +139,18 @@ impl OutputSimulation {
             let remedy = "the sensor filter does not commute with them: use coupling='simulated' and inputs before it";
             return Err(nonlinear::unsupported_with("inputs behind the sensor filter", remedy));
         }
-        let found = Self { recording, equations, frictions, times, derived };
-        found.system().check()?;
-        for (i, Equation { structure, .. }) in found.equations.iter().enumerate() {
+        let simulation = Self { recording, equations, frictions, times, derived };
+        simulation.system().check()?;
+        for (i, Equation { structure, .. }) in simulation.equations.iter().enumerate() {
             let driven = |signal: usize| match signal.checked_sub(recorded) {
-                None => found.system().output_index(i, signal).is_none(),
+                None => simulation.system().output_index(i, signal).is_none(),
                 Some(at) => {
-                    let channels = &found.derived[at].channels;
-                    channels.iter().any(|channel| found.system().output_index(i, channel.0).is_none())
+                    let channels = &simulation.derived[at].channels;
+                    channels.iter().any(|channel| simulation.system().output_index(i, channel.0).is_none())
                 }
             };
-            let beyond = |t: &&Term| t.order >= structure.order - ORDER_TOLERANCE && driven(t.signal);
-            if let Some(term) = structure.terms.iter().find(beyond) {
+            let is_improper = |t: &&Term| t.order >= structure.order - ORDER_TOLERANCE && driven(t.signal);
+            if let Some(term) = structure.terms.iter().find(is_improper) {
                 return Err(Error::OutOfRange {
                     name: "order of an input beside non-linear terms".into(),
                     value: term.order,
@@ -159,7 +159,7 @@ impl OutputSimulation {
                 });
             }
         }
-        Ok(found)
+        Ok(simulation)
     }
 
     /// Equations with their derived signals.
@@ -210,19 +210,19 @@ impl OutputSimulation {
             .map(|&output| initial_terms::weight(&self.recording.channels()[output].samples))
             .collect();
         let experiments = [experiment.with_weights(&weights, None)?];
-        let known = |factor: f64| Monomial { factor, powers: Vec::new() };
+        let monomial = |factor: f64| Monomial { factor, powers: Vec::new() };
         let order = |constant: f64| AffineOrder { constant, weights: Vec::new() };
         let fixed = |Equation { structure, coefficients }: &Equation| FreeEquation {
             output: structure.output,
             order: order(structure.order),
             terms: (structure.terms.iter().zip(coefficients))
-                .map(|(term, c)| (term.signal, order(term.order), known(*c)))
+                .map(|(term, c)| (term.signal, order(term.order), monomial(*c)))
                 .collect(),
         };
         let law = |law: FrictionLaw| FreeFrictionLaw {
-            coulomb: known(law.coulomb),
-            stribeck: known(law.stribeck),
-            speed: known(law.speed),
+            coulomb: monomial(law.coulomb),
+            stribeck: monomial(law.stribeck),
+            speed: monomial(law.speed),
         };
         let (equations, filtered) =
             (self.equations.iter().map(fixed).collect(), nonlinear::filtered_outputs(&experiments));
@@ -236,8 +236,8 @@ impl OutputSimulation {
             initial,
         };
         let model = NonlinearModel { model, derived: self.derived.clone(), frictions, filtered };
-        let found = nonlinear::fit(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?;
-        Ok(found.initial.into_iter().flatten().collect())
+        let optimum = nonlinear::fit(&model, &experiments, &Start::default(), INITIAL_STATE_SETTINGS, stop)?;
+        Ok(optimum.initial.into_iter().flatten().collect())
     }
 
     /// Samples on a grid of `every` pulses per sampling interval; not finite if the model diverges there.
@@ -447,7 +447,7 @@ impl<'a> Grid<'a> {
             Some(drive) => combine(means, drive, |mean, driven| mean - driven),
             None => means.clone(),
         };
-        let (mut gains, mut held) = (vec![1.0; n], vec![0.0; n]);
+        let (mut gains, mut offsets) = (vec![1.0; n], vec![0.0; n]);
         if let (Some(series), Some(filter)) = (&self.output_filter, &recording.filter) {
             for i in 0..n {
                 if !self.is_filtered(equations[i].structure.output) || !means[i].iter().all(|v| v.is_finite()) {
@@ -455,7 +455,7 @@ impl<'a> Grid<'a> {
                 }
                 gains[i] = leading_gain(filter, 0.0);
                 if degree > 0.0 {
-                    held[i] = after_filter(i);
+                    offsets[i] = after_filter(i);
                 }
                 rest[i] = series::multiply(series, &means[i], m);
                 if let Some(drive) = &drive {
@@ -471,7 +471,7 @@ impl<'a> Grid<'a> {
                 for (i, (row, kinks)) in out.iter_mut().zip(kinks).enumerate() {
                     add_multiple(row, 1.0, &kinks);
                     // At the very start nothing has been integrated yet.
-                    let begins = gains[i] * start[i][0] + held[i];
+                    let begins = gains[i] * start[i][0] + offsets[i];
                     row.iter_mut().zip(times).filter(|(_, t)| **t <= 0.0).for_each(|(v, _)| *v = begins);
                 }
                 out
@@ -482,7 +482,7 @@ impl<'a> Grid<'a> {
                 let of = |i: usize| {
                     let row = &rest[i];
                     let mut out = Vec::with_capacity(count);
-                    out.push(gains[i] * start[i][0] + held[i]);
+                    out.push(gains[i] * start[i][0] + offsets[i]);
                     for (k, at) in (every..=m).step_by(every).enumerate() {
                         out.push(if !improper || m < 3 {
                             1.5 * row[at - 1] - 0.5 * row[at.saturating_sub(2)]
@@ -598,13 +598,13 @@ impl<'a> Grid<'a> {
                 let jump = at.jumps(&[0.0], &[value * libm::tgamma(power + 1.0)]);
                 add_multiple(&mut out[i], 1.0, &at.kink_corrections(&jump, power, step));
             }
-            let known = |k: usize| {
+            let is_known_correction = |k: usize| {
                 let signal = structure.terms[k].signal;
                 self.is_derived(signal) || self.simulation.simulated_output(signal).is_some()
             };
             let own: Vec<usize> =
                 (0..coefficients.len()).filter(|&k| structure.terms[k].signal == structure.output).collect();
-            for k in (0..coefficients.len()).filter(|&k| is_driven && !own.contains(&k) && !known(k)) {
+            for k in (0..coefficients.len()).filter(|&k| is_driven && !own.contains(&k) && !is_known_correction(k)) {
                 let Some((times, sizes)) = recording.jumps(structure.terms[k].signal) else { continue };
                 let jumps = at.jumps(&times.iter().map(|time| time / step).collect::<Vec<_>>(), &sizes);
                 for path in std::iter::once(vec![k]).chain(own.iter().map(|&other| vec![k, other])) {

@@ -87,16 +87,18 @@ pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
 }
 
 pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
-    let (step, signals, filter, begun) = match argument {
-        RecordArg::WithInitialState(step, signals, filter, begun) => (step, signals, filter, Some(begun)),
+    let (step, signals, filter, initial_state) = match argument {
+        RecordArg::WithInitialState(step, signals, filter, initial_state) => {
+            (step, signals, filter, Some(initial_state))
+        }
         RecordArg::Plain(step, signals, filter) => (step, signals, filter, None),
     };
     let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
     let record = Record::from_rows(*step, rows(signals)?, filter)?;
-    Ok(match begun {
-        Some((held, levels, answers)) => {
+    Ok(match initial_state {
+        Some((states, levels, answers)) => {
             let answers = answers.as_ref().map(rows).transpose()?.unwrap_or_default();
-            record.with_initial_state(held.to_vec(), levels, answers)?
+            record.with_initial_state(states.to_vec(), levels, answers)?
         }
         None => record,
     })
@@ -195,15 +197,15 @@ impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
         if words || !object.hasattr("__getitem__")? {
             return Err(PyTypeError::new_err(format!("{} is no sequence", object.get_type().name()?)));
         }
-        let told = object.len()?;
-        if told > MOST_ITEMS {
-            let what = format!("a sequence of {told} items");
+        let length = object.len()?;
+        if length > MOST_ITEMS {
+            let what = format!("a sequence of {length} items");
             return Err(Error::Structure { what, remedy: format!("give a list, or at most {MOST_ITEMS}") }.into());
         }
         let mut items = Vec::new();
         for next in object.try_iter()? {
-            if items.len() == told {
-                let what = format!("a sequence that tells of {told} items and hands over more");
+            if items.len() == length {
+                let what = format!("a sequence that tells of {length} items and hands over more");
                 return Err(Error::Structure { what, remedy: "give a list".into() }.into());
             }
             items.push(item(next?)?);

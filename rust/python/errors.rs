@@ -28,8 +28,8 @@ impl From<Error> for PyErr {
 
 fn raise(class: &str, message: String) -> PyErr {
     Python::attach(|py| {
-        let found = py.import("ftlm.errors").and_then(|m| m.getattr(class));
-        match found.and_then(|c| c.cast_into::<PyType>().map_err(PyErr::from)) {
+        let class_object = py.import("ftlm.errors").and_then(|m| m.getattr(class));
+        match class_object.and_then(|c| c.cast_into::<PyType>().map_err(PyErr::from)) {
             Ok(class) => PyErr::from_type(class, message),
             Err(_) => PyRuntimeError::new_err(message),
         }

@@ -75,10 +75,10 @@ pub fn projected_errors(
     let initial = initial(terms)?;
     let points: Vec<Vec<f64>> = points.iter().map(|point| point.to_vec()).collect();
     let work = pulses(&records).saturating_mul(points.len());
-    let found = run_interruptible(py, work, None, move |_| {
+    let projections = run_interruptible(py, work, None, move |_| {
         resonance_scan::fit_with_fixed_poles(&records, &structure, &fixed, &initial, &own, &points)
     })?;
-    Ok(found.into_iter().map(|at| at.map(|p| (p.error, p.coefficients))).collect())
+    Ok(projections.into_iter().map(|at| at.map(|p| (p.error, p.coefficients))).collect())
 }
 
 #[pyfunction]
@@ -229,9 +229,9 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
         Some(shares) => experiment.with_sample_weights(rows(shares)?)?,
     };
     let instants = (argument.signals.iter())
-        .map(|(values, held)| {
+        .map(|(values, is_hold)| {
             let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;
-            Ok(joint::PointValues { values, is_zero_order_hold: *held })
+            Ok(joint::PointValues { values, is_zero_order_hold: *is_hold })
         })
         .collect::<PyResult<Vec<_>>>()?;
     let experiment = experiment.with_point_values(instants)?;

@@ -201,22 +201,22 @@ pub fn multi_innovation_rows<'py>(
 ) -> PyResult<Matrix<'py>> {
     let (batch, target) = (Batch::new("Q", &q)?, vector("m", &m)?);
     let width = batch.width;
-    let found = run_interruptible(py, batch.values.len(), None, move |stop| {
+    let coefficient_rows = run_interruptible(py, batch.values.len(), None, move |stop| {
         check_length("rows of Q", target.len(), batch.count())?;
-        let mut found = Vec::new();
+        let mut coefficient_rows = Vec::new();
         for (rows, target) in batch.values.chunks(count.max(1) * width.max(1)).zip(target.chunks(count.max(1))) {
             stop.check()?;
             // One column after another.
             let flat: Vec<f64> = (0..width).flat_map(|j| rows.iter().skip(j).step_by(width).copied()).collect();
             let columns: Vec<&[f64]> = flat.chunks_exact(target.len()).collect();
-            found.extend(if path {
+            coefficient_rows.extend(if path {
                 multi_innovation::path(&columns, target, length, &prior_covariance, stop)?
             } else {
                 multi_innovation::estimate(&columns, target, length, &prior_covariance)?
             });
         }
-        Ok(found)
+        Ok(coefficient_rows)
     })?;
-    let rows = found.len().checked_div(width).unwrap_or(0);
-    PyArray1::from_vec(py, found).reshape([rows, width])
+    let rows = coefficient_rows.len().checked_div(width).unwrap_or(0);
+    PyArray1::from_vec(py, coefficient_rows).reshape([rows, width])
 }

@@ -212,11 +212,11 @@ pub fn filter_series(
 }
 
 fn finite(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
-    let given = rows(array)?;
-    for column in &given {
+    let columns = rows(array)?;
+    for column in &columns {
         check_finite("a column", column)?;
     }
-    Ok(given)
+    Ok(columns)
 }
 
 #[pyfunction]
@@ -234,11 +234,11 @@ pub fn singular_values<'py>(
     given: PyReadonlyArray2<'py, f64>,
 ) -> PyResult<(Matrix<'py>, Bound<'py, PyArray1<f64>>, Matrix<'py>)> {
     let tall = finite(&given)?;
-    let found = run_interruptible(py, columns(&given), None, move |_| {
+    let factors = run_interruptible(py, columns(&given), None, move |_| {
         dense::singular_values(&tall).ok_or_else(|| Error::Structure {
             what: "singular values are not found".into(),
             remedy: "scale the columns".into(),
         })
     })?;
-    Ok((stack_rows(py, &found.left)?, PyArray1::from_vec(py, found.values), stack_rows(py, &found.right)?))
+    Ok((stack_rows(py, &factors.left)?, PyArray1::from_vec(py, factors.values), stack_rows(py, &factors.right)?))
 }

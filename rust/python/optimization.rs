@@ -52,8 +52,8 @@ impl LeastSquaresProblem for CallbackProblem<'_> {
     type Evaluation = Vec<f64>;
 
     fn evaluate(&self, point: &Vec<f64>) -> Result<Vec<f64>> {
-        self.call(&self.residuals, point, |found| {
-            copy_vector("residuals", &found.extract::<PyReadonlyArray1<'_, f64>>()?)
+        self.call(&self.residuals, point, |answer| {
+            copy_vector("residuals", &answer.extract::<PyReadonlyArray1<'_, f64>>()?)
         })
     }
 
@@ -62,13 +62,14 @@ impl LeastSquaresProblem for CallbackProblem<'_> {
     }
 
     fn jacobian(&self, point: &Vec<f64>, evaluation: &Vec<f64>) -> Result<Vec<Vec<f64>>> {
-        let found = self.call(&self.jacobian, point, |found| rows(&found.extract::<PyReadonlyArray2<'_, f64>>()?))?;
-        check_length("rows of the Jacobian", evaluation.len(), found.len())?;
-        found.iter().try_for_each(|row| check_length("a row of the Jacobian", point.len(), row.len()))?;
-        if let Some(index) = found.iter().position(|row| row.iter().any(|v| !v.is_finite())) {
+        let answer =
+            self.call(&self.jacobian, point, |answer| rows(&answer.extract::<PyReadonlyArray2<'_, f64>>()?))?;
+        check_length("rows of the Jacobian", evaluation.len(), answer.len())?;
+        answer.iter().try_for_each(|row| check_length("a row of the Jacobian", point.len(), row.len()))?;
+        if let Some(index) = answer.iter().position(|row| row.iter().any(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "Jacobian".into(), index });
         }
-        Ok((0..point.len()).map(|k| found.iter().map(|row| row[k]).collect()).collect())
+        Ok((0..point.len()).map(|k| answer.iter().map(|row| row[k]).collect()).collect())
     }
 
     fn apply_step(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
@@ -81,8 +82,8 @@ impl LeastSquaresProblem for CallbackProblem<'_> {
             }
         }
         let next: Vec<f64> = point.iter().zip(steps).map(|(x, s)| x + share * s).collect();
-        let moved = steps.iter().zip(&next).map(|(s, x)| (share * s).abs() / x.abs().max(f64::MIN_POSITIVE));
-        (next.clone(), moved.fold(0.0, f64::max))
+        let changes = steps.iter().zip(&next).map(|(s, x)| (share * s).abs() / x.abs().max(f64::MIN_POSITIVE));
+        (next.clone(), changes.fold(0.0, f64::max))
     }
 
     fn constraints(&self, point: &Vec<f64>) -> Vec<(Vec<f64>, f64)> {
@@ -117,17 +118,17 @@ pub fn minimize<'py>(
     check_length("limits", rows.len(), limits.len())?;
     rows.iter().try_for_each(|row| check_length("a row of the constraints", start.len(), row.len()))?;
     let problem = CallbackProblem { residuals, jacobian, rows, limits, signal_norm, raised: RefCell::new(None) };
-    let found = run_attached(|| {
-        let found =
+    let optimum = run_attached(|| {
+        let optimum =
             find_minimum(&problem, start, MinimizationSettings { evaluations, tolerance: COST_REDUCTION_TOLERANCE })?;
-        let linear = LinearizedProblem::at(&problem, &found.point, &found.jacobian, &found.evaluation, false);
+        let linear = LinearizedProblem::at(&problem, &optimum.point, &optimum.jacobian, &optimum.evaluation, false);
         let active = linear.active_constraints().into_iter().map(|(k, _)| k).collect::<Vec<_>>();
-        Ok((found, active))
+        Ok((optimum, active))
     });
     if let Some(error) = problem.raised.take() {
         return Err(error);
     }
-    let (found, active) = found?;
-    let values = PyArray1::from_vec(py, found.point);
-    Ok((values, 2.0 * found.cost, status(found.status), found.evaluations, active))
+    let (optimum, active) = optimum?;
+    let values = PyArray1::from_vec(py, optimum.point);
+    Ok((values, 2.0 * optimum.cost, status(optimum.status), optimum.evaluations, active))
 }

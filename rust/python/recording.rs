@@ -129,12 +129,17 @@ impl Recording {
     fn pulses<'py>(&self, py: Python<'py>, m: usize, filtered: bool) -> PyResult<PulsesTuple<'py>> {
         let run = Arc::clone(&self.inner);
         let points = m.saturating_mul(run.channels().len());
-        let found = run_interruptible(py, points, None, move |_| run.pulses(m, filtered))?;
-        let means: Vec<_> = found.means.into_iter().map(PulseMeans::into_vec).collect();
-        let responses = &found.impulse_responses;
+        let block_pulses = run_interruptible(py, points, None, move |_| run.pulses(m, filtered))?;
+        let means: Vec<_> = block_pulses.means.into_iter().map(PulseMeans::into_vec).collect();
+        let responses = &block_pulses.impulse_responses;
         let responses = if responses.is_empty() { None } else { Some(stack_rows(py, responses)?) };
-        let series = found.filter.map(|series| PyArray1::from_vec(py, series));
-        Ok((found.step, stack_rows(py, &means)?, series, (found.has_transient, found.initial_levels, responses)))
+        let series = block_pulses.filter.map(|series| PyArray1::from_vec(py, series));
+        Ok((
+            block_pulses.step,
+            stack_rows(py, &means)?,
+            series,
+            (block_pulses.has_transient, block_pulses.initial_levels, responses),
+        ))
     }
 
     /// Experiment with `every` pulses a sampling interval of each `decimation`-th sample, weights of the outputs, and
@@ -164,8 +169,8 @@ impl Recording {
     /// Times \[s\] and sizes of the jumps of a held input; None for other signals.
     fn jumps<'py>(&self, py: Python<'py>, signal: usize) -> PyResult<Option<(Array<'py>, Array<'py>)>> {
         self.inner.channel(signal)?;
-        let found = run_detached(py, || Ok(self.inner.jumps(signal)))?;
-        Ok(found.map(|(times, sizes)| (PyArray1::from_vec(py, times), PyArray1::from_vec(py, sizes))))
+        let discontinuities = run_detached(py, || Ok(self.inner.jumps(signal)))?;
+        Ok(discontinuities.map(|(times, sizes)| (PyArray1::from_vec(py, times), PyArray1::from_vec(py, sizes))))
     }
 
     /// Values of a signal just after given times \[s\]; None for a derived signal.

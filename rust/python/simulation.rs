@@ -68,9 +68,9 @@ pub fn equation_error<'py>(
     let record = record(&run)?;
     let equations = equations(vec![equation].into(), record.len(), &inputs)?;
     let initial = initial(terms)?;
-    let found =
+    let errors =
         run_interruptible(py, record.m(), None, move |_| simulate::equation_error(&equations[0], &record, &initial))?;
-    Ok(PyArray1::from_vec(py, found))
+    Ok(PyArray1::from_vec(py, errors))
 }
 
 #[pyfunction]
@@ -100,8 +100,8 @@ pub fn trace_errors<'py>(
     let record = record(&run)?;
     let structure = structure(equation, record.len(), &inputs)?;
     let rows = rows(&trace)?;
-    let found = run_interruptible(py, record.m(), None, move |_| simulate::trace_errors(&structure, &record, &rows))?;
-    Ok(PyArray1::from_vec(py, found))
+    let errors = run_interruptible(py, record.m(), None, move |_| simulate::trace_errors(&structure, &record, &rows))?;
+    Ok(PyArray1::from_vec(py, errors))
 }
 
 #[pyfunction]
@@ -119,8 +119,8 @@ pub fn metrics(
 ) -> PyResult<(f64, f64, f64, f64)> {
     let measured = vector("measured", &measured)?;
     let residuals = copy_vector("residuals", &residuals)?;
-    let found = run_detached(py, || crate::signal::metrics::metrics(&measured, &residuals))?;
-    Ok((found.error, found.rmse, found.nr, found.fit_percent))
+    let figures = run_detached(py, || crate::signal::metrics::metrics(&measured, &residuals))?;
+    Ok((figures.error, figures.rmse, figures.nr, figures.fit_percent))
 }
 
 #[pyfunction]
@@ -133,8 +133,8 @@ pub fn correlation<'py>(
 ) -> PyResult<(Bound<'py, PyArray1<f64>>, f64, usize)> {
     let x = x.iter().map(|a| vector("x", a)).collect::<PyResult<Vec<_>>>()?;
     let y = y.iter().map(|a| vector("y", a)).collect::<PyResult<Vec<_>>>()?;
-    let found = run_detached(py, || crate::signal::metrics::correlation(&x, &y, lags))?;
-    Ok((PyArray1::from_vec(py, found.values), found.variance, found.window))
+    let result = run_detached(py, || crate::signal::metrics::correlation(&x, &y, lags))?;
+    Ok((PyArray1::from_vec(py, result.values), result.variance, result.window))
 }
 
 #[pyfunction]
@@ -251,8 +251,8 @@ impl OutputSimulation {
         stop: Option<&Stop>,
     ) -> PyResult<Option<SamplesTuple<'py>>> {
         let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
-        let found = run_interruptible(py, self.points, stop, move |stop| inner.exact_samples(&initial, stop))?;
-        found.map(|samples| samples_tuple(py, samples)).transpose()
+        let exact = run_interruptible(py, self.points, stop, move |stop| inner.exact_samples(&initial, stop))?;
+        exact.map(|samples| samples_tuple(py, samples)).transpose()
     }
 
     /// Samples in the limit for zero step, initial terms, pulses per sampling interval, and remaining change by output.
@@ -271,8 +271,8 @@ impl OutputSimulation {
         let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
         let options = Refinement { tolerance, max_pulses, long_record_intervals, memory };
         // How far a simulation is refined is not known.
-        let found = run_interruptible(py, usize::MAX, stop, move |stop| inner.refine(&initial, options, stop))?;
-        Ok((samples_tuple(py, found.samples)?, found.refinement, PyArray1::from_vec(py, found.change)))
+        let samples = run_interruptible(py, usize::MAX, stop, move |stop| inner.refine(&initial, options, stop))?;
+        Ok((samples_tuple(py, samples.samples)?, samples.refinement, PyArray1::from_vec(py, samples.change)))
     }
 
     /// (exponent, coefficient) of the initial terms of a model with friction or non-linear terms by equation, fitted on a grid.
@@ -300,7 +300,7 @@ pub fn richardson_limit<'py>(
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray1<f64>>, Vec<f64>)> {
     let grids = grids.iter().map(|(samples, numbers)| Ok((rows(samples)?, numbers.to_vec())));
     let grids = grids.collect::<PyResult<Vec<_>>>()?;
-    let found = run_detached(py, || {
+    let limit = run_detached(py, || {
         for (samples, numbers) in &grids {
             check_length(
                 "outputs of a grid",
@@ -311,5 +311,5 @@ pub fn richardson_limit<'py>(
         }
         Ok(output_samples::richardson_limit(grids, &owners).unwrap_or_default())
     })?;
-    Ok((stack_rows(py, &found.samples)?, PyArray1::from_vec(py, found.change), found.terms))
+    Ok((stack_rows(py, &limit.samples)?, PyArray1::from_vec(py, limit.change), limit.terms))
 }

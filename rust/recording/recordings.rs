@@ -112,9 +112,9 @@ impl Recordings {
     /// ```
     #[must_use]
     pub fn inputs(&self) -> Vec<Option<Intersample>> {
-        let held = |signal: usize| self.runs.iter().any(|run| run.channels()[signal].is_held_input());
+        let is_held_input = |signal: usize| self.runs.iter().any(|run| run.channels()[signal].is_held_input());
         let of = |(signal, channel): (usize, &Channel)| match channel.role {
-            Role::Input(_) if held(signal) => Some(Intersample::Hold),
+            Role::Input(_) if is_held_input(signal) => Some(Intersample::Hold),
             Role::Input(_) => Some(Intersample::Linear),
             _ => None,
         };
@@ -159,9 +159,9 @@ impl Recordings {
     /// ```
     pub fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
         let of = |run: &Recording| {
-            let mut known = run.with_free_inputs(inputs)?;
-            known.is_coupled = false;
-            known.pulses(m, true)?.into_record()
+            let mut with_inputs = run.with_free_inputs(inputs)?;
+            with_inputs.is_coupled = false;
+            with_inputs.pulses(m, true)?.into_record()
         };
         self.runs.iter().map(of).collect()
     }

@@ -151,9 +151,9 @@ impl Pulses {
         let transient = std::mem::take(&mut self.has_transient);
         let (levels, responses) =
             (std::mem::take(&mut self.initial_levels), std::mem::take(&mut self.impulse_responses));
-        let begun = transient.contains(&true) || levels.iter().any(|v| *v != 0.0);
+        let has_initial_state = transient.contains(&true) || levels.iter().any(|v| *v != 0.0);
         let record = self.into_record()?;
-        if begun {
+        if has_initial_state {
             record.with_initial_state(transient, &levels, responses)
         } else {
             Ok(record)
@@ -185,8 +185,8 @@ impl Recording {
         for channel in &channels {
             check_length(&format!("signal {}", channel.name), rows, channel.samples.len())?;
             if channel.role != Role::Derived {
-                let (expected, found) = (times.as_ref().map(Vec::len), channel.nonuniform.as_ref().map(Vec::len));
-                check_length("samples at their own times", expected.unwrap_or(0), found.unwrap_or(0))?;
+                let (expected, actual) = (times.as_ref().map(Vec::len), channel.nonuniform.as_ref().map(Vec::len));
+                check_length("samples at their own times", expected.unwrap_or(0), actual.unwrap_or(0))?;
             }
             channel.check()?;
         }
@@ -328,10 +328,10 @@ impl Recording {
     /// ```
     pub fn with_free_inputs(&self, values: &[f64]) -> Result<Self> {
         check_length("free numbers of inputs", self.free_inputs.len(), values.len())?;
-        let mut known = self.clone();
+        let mut copy = self.clone();
         self.free_inputs.iter().try_for_each(|(signal, _)| self.channel(*signal).map(drop))?;
         for (&(signal, law), &value) in self.free_inputs.iter().zip(values) {
-            let channel = &mut known.channels[signal];
+            let channel = &mut copy.channels[signal];
             if law == InputLaw::Delay {
                 channel.delay = Some(value);
             }
@@ -340,8 +340,8 @@ impl Recording {
             }
             channel.check()?;
         }
-        known.free_inputs.clear();
-        Ok(known)
+        copy.free_inputs.clear();
+        Ok(copy)
     }
 
     /// Recording of the leading samples.
@@ -430,7 +430,7 @@ impl Recording {
         let channel = &self.channels[signal];
         let limited = channel.behind_limits(&channel.samples);
         match self.transient(signal, &limited) {
-            Some(transient) => limited.iter().zip(transient).map(|(v, held)| v - held).collect(),
+            Some(transient) => limited.iter().zip(transient).map(|(v, offset)| v - offset).collect(),
             None => limited,
         }
     }
@@ -441,9 +441,10 @@ impl Recording {
         let limited = channel.behind_limits(channel.nonuniform.as_ref()?);
         let uniform = channel.behind_limits(&channel.samples);
         let Some(transient) = self.transient(signal, &uniform) else { return Some(limited) };
-        let held: Vec<f64> = uniform.iter().zip(transient).map(|(v, held)| v - (v - held)).collect();
+        let held_values: Vec<f64> =
+            uniform.iter().zip(transient).map(|(v, held_values)| v - (v - held_values)).collect();
         let grid = self.uniform_times();
-        Some(limited.iter().zip(times).map(|(v, &time)| v - interpolate(time, &grid, &held)).collect())
+        Some(limited.iter().zip(times).map(|(v, &time)| v - interpolate(time, &grid, &held_values)).collect())
     }
 
     fn transient(&self, signal: usize, samples: &[f64]) -> Option<Vec<f64>> {
@@ -482,15 +483,15 @@ impl Recording {
     pub fn pulse_means(&self, signal: usize, m: usize) -> Result<PulseMeans> {
         check_pulses(m)?;
         let channel = &self.channels[signal];
-        let held = channel.intersample();
+        let intersample = channel.intersample();
         if channel.role == Role::Derived {
-            return pulse_means(&channel.samples, m, held);
+            return pulse_means(&channel.samples, m, intersample);
         }
         if let (Some(times), Some(samples)) = (&self.times, self.acting_nonuniform_samples(signal))
             && (channel.role != Role::Output || !channel.nonuniform.iter().flatten().any(|v| v.is_nan()))
         {
             let before = self.value_before(&self.acting_samples(signal));
-            let line = NonuniformSignal::new_unchecked(times, &samples, held);
+            let line = NonuniformSignal::new_unchecked(times, &samples, intersample);
             return line.with_delay(channel.lag(), before).means(m, self.duration() / m as f64);
         }
         let acting = self.acting_samples(signal);
@@ -499,14 +500,17 @@ impl Recording {
             let intervals = self.len() - 1;
             // On a finer grid the delayed command switches within an interval, so it is held on that grid before the
             // delay.
-            let every =
-                if held == Intersample::Hold && m.is_multiple_of(intervals) { (m / intervals).max(1) } else { 1 };
+            let every = if intersample == Intersample::Hold && m.is_multiple_of(intervals) {
+                (m / intervals).max(1)
+            } else {
+                1
+            };
             let before = self.value_before(&samples);
             let repeated: Vec<f64> =
                 samples.iter().flat_map(|v| std::iter::repeat_n(*v, every)).take(intervals * every + 1).collect();
             samples = delay_samples(&repeated, channel.lag() / self.step * every as f64, before)?.into();
         }
-        pulse_means(&samples, m, held)
+        pulse_means(&samples, m, intersample)
     }
 
     /// Pulse means of every signal as it acts on the equations.
@@ -626,10 +630,10 @@ impl Recording {
         };
         let experiment = match unread {
             None => experiment,
-            Some(known) if nonuniform => experiment.with_sample_weights(known)?,
+            Some(sample_weights) if nonuniform => experiment.with_sample_weights(sample_weights)?,
             // The first and the last sample are not compared.
-            Some(known) => {
-                let inner = known.into_iter().map(|row| row[1..row.len() - 1].to_vec()).collect();
+            Some(sample_weights) => {
+                let inner = sample_weights.into_iter().map(|row| row[1..row.len() - 1].to_vec()).collect();
                 experiment.with_sample_weights(inner)?
             }
         };
@@ -660,8 +664,8 @@ impl Recording {
         let Some(times) = self.times.as_ref().filter(|_| self.compares_nonuniform_samples()) else {
             return outputs.map(|channel| channel.samples.clone()).collect();
         };
-        let known = times.partition_point(|time| *time <= self.duration() * (1.0 + TIME_TOLERANCE));
-        outputs.map(|channel| channel.leading_part(0, known).nonuniform.unwrap_or_default()).collect()
+        let count = times.partition_point(|time| *time <= self.duration() * (1.0 + TIME_TOLERANCE));
+        outputs.map(|channel| channel.leading_part(0, count).nonuniform.unwrap_or_default()).collect()
     }
 
     /// Memory of an experiment \[bytes\]: pulse means and values of the signals, samples and weights of the outputs.
@@ -769,14 +773,14 @@ impl Recording {
     ) -> Result<(Experiment, Option<Vec<Vec<f64>>>, Vec<PointValues>)> {
         let times = self.times.as_deref().unwrap_or_default();
         let last = self.duration() * (1.0 + TIME_TOLERANCE);
-        let kept: Vec<usize> =
+        let rows: Vec<usize> =
             (0..times.len()).filter(|&row| times[row] > 0.0 && times[row] <= last).step_by(decimation).collect();
-        let at: Vec<f64> = kept.iter().map(|&row| times[row]).collect();
+        let at: Vec<f64> = rows.iter().map(|&row| times[row]).collect();
         let (m, step) = (pulses.means[0].values().len(), pulses.step);
         let readings = SampleInterpolation::new(at.iter().map(|time| (time / step).min(m as f64)).collect(), m)?;
         let of = |&output: &usize| {
             let read = self.channels[output].nonuniform.as_deref().unwrap_or_default();
-            kept.iter().map(|&row| read[row]).collect()
+            rows.iter().map(|&row| read[row]).collect()
         };
         let (samples, unread) = without_gaps(self.outputs.iter().map(of).collect());
         let mut jumps = Vec::with_capacity(self.channels.len());
@@ -851,7 +855,7 @@ fn without_gaps(samples: Vec<Vec<f64>>) -> (Vec<Vec<f64>>, Option<Vec<Vec<f64>>>
     if !samples.iter().flatten().any(|v| v.is_nan()) {
         return (samples, None);
     }
-    let known = samples.iter().map(|row| row.iter().map(|v| f64::from(u8::from(!v.is_nan()))).collect()).collect();
+    let weights = samples.iter().map(|row| row.iter().map(|v| f64::from(u8::from(!v.is_nan()))).collect()).collect();
     let zeroed = |row: Vec<f64>| row.into_iter().map(|v| if v.is_nan() { 0.0 } else { v }).collect();
-    (samples.into_iter().map(zeroed).collect(), Some(known))
+    (samples.into_iter().map(zeroed).collect(), Some(weights))
 }

@@ -91,9 +91,10 @@ impl FilterStates {
     /// to an impulse and its derivatives, `states` in all, are fitted.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn transient(&self, samples: &[f64], step: f64, states: usize) -> Option<Vec<f64>> {
-        let shown = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest * step);
-        let shown = if self.fastest > 0.0 { shown.round_ties_even().min(samples.len() as f64) as usize } else { 0 };
-        let count = shown.max(SAMPLES_PER_PARAMETER * (states + 2)).min(samples.len());
+        let row_count = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest * step);
+        let row_count =
+            if self.fastest > 0.0 { row_count.round_ties_even().min(samples.len() as f64) as usize } else { 0 };
+        let count = row_count.max(SAMPLES_PER_PARAMETER * (states + 2)).min(samples.len());
         // A level and a slope that come in are two states more, which nothing moves but the slope the level.
         let n = self.size;
         let whole = self.extended_system(2, &[(n - 1, n, self.gain), (n, n + 1, 1.0)], step);
@@ -108,12 +109,12 @@ impl FilterStates {
         let scaled: Vec<Vec<f64>> =
             columns.iter().zip(&sizes).map(|(c, size)| c.iter().map(|v| v / size).collect()).collect();
         let rest: Vec<f64> = samples.iter().zip(&first).map(|(v, one)| v - level * one).collect();
-        let mut found = minimum_norm_solution(&scaled, &rest)?;
-        found.iter_mut().zip(&sizes).for_each(|(x, size)| *x /= size);
-        found.truncate(states - 1);
-        found.push(level);
+        let mut scaled_states = minimum_norm_solution(&scaled, &rest)?;
+        scaled_states.iter_mut().zip(&sizes).for_each(|(x, size)| *x /= size);
+        scaled_states.truncate(states - 1);
+        scaled_states.push(level);
         let mut start = vec![0.0; n];
-        for (state, x) in impulses.iter().zip(&found) {
+        for (state, x) in impulses.iter().zip(&scaled_states) {
             start.iter_mut().zip(state).for_each(|(sum, v)| *sum += v * x);
         }
         free_responses(&self.extended_system(0, &[], step), n, &[start], samples.len(), 0)
@@ -145,29 +146,29 @@ fn free_responses(system: &[f64], n: usize, starts: &[Vec<f64>], count: usize, s
     // Powers of the transition double the number of steps that are known: a row of each is read at those before.
     let mut power = exponential(system, n)?;
     let rows = starts.len();
-    let mut known: Vec<f64> = starts.concat();
+    let mut responses: Vec<f64> = starts.concat();
     let mut steps = 1;
     while steps < count {
         // States are rows, so that they are multiplied by the transposed transition.
         let transposed: Vec<f64> = (0..n * n).map(|k| power[(k % n) * n + k / n]).collect();
-        known.extend(multiply(&known, &transposed, steps * rows, n, n));
+        responses.extend(multiply(&responses, &transposed, steps * rows, n, n));
         steps *= 2;
         power = multiply(&power, &power, n, n, n);
     }
-    Some((0..rows).map(|row| (0..count).map(|k| known[(k * rows + row) * n + state]).collect()).collect())
+    Some((0..rows).map(|row| (0..count).map(|k| responses[(k * rows + row) * n + state]).collect()).collect())
 }
 
 /// Least-squares solution of smallest norm; None if the singular values cannot be computed.
 #[allow(clippy::cast_precision_loss)]
 fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64]) -> Option<Vec<f64>> {
-    let found = singular_values(columns)?;
-    let least = found.values.first().copied().unwrap_or(0.0)
+    let factors = singular_values(columns)?;
+    let least = factors.values.first().copied().unwrap_or(0.0)
         * f64::EPSILON
         * target.len().min(columns.first().map_or(0, Vec::len)).max(columns.len()) as f64;
     let mut solution = vec![0.0; columns.len()];
-    for ((left, value), right) in found.left.iter().zip(&found.values).zip(&found.right) {
+    for ((direction, value), right) in factors.left.iter().zip(&factors.values).zip(&factors.right) {
         if *value > least {
-            let share = left.iter().zip(target).map(|(u, v)| u * v).sum::<f64>() / value;
+            let share = direction.iter().zip(target).map(|(u, v)| u * v).sum::<f64>() / value;
             solution.iter_mut().zip(right).for_each(|(x, v)| *x += share * v);
         }
     }

@@ -365,8 +365,8 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
             let momentum = order > 1.0;
             let order = tidy(if momentum { order - 1.0 } else { order });
             #[allow(clippy::float_cmp)]
-            let known = operators.iter().position(|o| o.signal == signal && o.order == order);
-            let at = known.unwrap_or_else(|| {
+            let position = operators.iter().position(|o| o.signal == signal && o.order == order);
+            let at = position.unwrap_or_else(|| {
                 operators.push(Operator { signal, order, ..Operator::default() });
                 operators.len() - 1
             });

@@ -382,15 +382,15 @@ impl Guard {
 
     fn check_encoder(&mut self, j: usize, counts: i32) {
         let Some(previous) = self.previous else { return };
-        let moved = i64::from(counts) - i64::from(previous[j]);
+        let change = i64::from(counts) - i64::from(previous[j]);
         let s = &self.settings;
         #[allow(clippy::cast_precision_loss)]
-        let far = (moved.abs() as f64) * s.encoder_scale[j] > s.fastest * s.step + 2.0 * s.encoder_scale[j];
+        let far = (change.abs() as f64) * s.encoder_scale[j] > s.fastest * s.step + 2.0 * s.encoder_scale[j];
         if far {
-            self.fail(Fault::EncoderJump { stage: j + 1, counts: moved });
+            self.fail(Fault::EncoderJump { stage: j + 1, counts: change });
         }
         let s = &self.settings;
-        if moved != 0 {
+        if change != 0 {
             self.still[j] = 0.0;
         } else if self.written[j].abs() >= s.moving_current {
             self.still[j] += s.step;

@@ -167,8 +167,8 @@ impl Plant {
             analog[j] = s.convert(if rail[j] { s.range } else { strain });
             let sense = s.sense_bias[j] - self.current[j] / s.sense_scale + s.noise[2 + j] * noise[2 + j];
             analog[2 + j] = s.convert(sense);
-            for (line, beyond) in [(2 * j, -angles[2 * j]), (2 * j + 1, angles[2 * j])] {
-                if beyond > s.travel[j] {
+            for (line, excess) in [(2 * j, -angles[2 * j]), (2 * j + 1, angles[2 * j])] {
+                if excess > s.travel[j] {
                     switches[line] = 0;
                 }
             }
@@ -206,8 +206,8 @@ impl Plant {
     pub fn advance(&mut self, volts: [f64; 2], enabled: bool) {
         let s = &self.sensors;
         for ((current, volts), limit) in self.current.iter_mut().zip(volts).zip(s.current_limit) {
-            let asked = -s.convert(volts) * s.command_scale;
-            *current = if enabled { asked.clamp(-limit, limit) } else { 0.0 };
+            let current_command = -s.convert(volts) * s.command_scale;
+            *current = if enabled { current_command.clamp(-limit, limit) } else { 0.0 };
         }
         let offset = if enabled { s.offset } else { [0.0; 2] };
         self.arm.advance(std::array::from_fn(|j| self.current[j] + offset[j]));
@@ -312,7 +312,7 @@ impl Pace {
             let now = Instant::now();
             match due.checked_duration_since(now) {
                 None => return now.duration_since(due).as_secs_f64(),
-                Some(left) if left > SPIN_WAIT => std::thread::sleep(left - SPIN_WAIT),
+                Some(remaining) if remaining > SPIN_WAIT => std::thread::sleep(remaining - SPIN_WAIT),
                 Some(_) => std::hint::spin_loop(),
             }
         }

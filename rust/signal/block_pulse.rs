@@ -330,16 +330,16 @@ impl SampleInterpolation {
         let powers: Vec<f64> = (0..=longest + 1).map(|n| libm::pow(n as f64, eta + 1.0)).collect();
         let of_pulse = |n: isize| usize::try_from(n).map_or(0.0, |n| mean * (powers[n + 1] - powers[n]));
         let lacking = |near: &NearbyJump, weights: &[f64; STENCIL_PULSES]| {
-            let there = match near.before {
+            let sample = match near.before {
                 before if before < 0.0 => 0.0,
                 before if eta == 0.0 && before == 0.0 => corner,
                 before => corner * libm::pow(before, eta),
             };
-            let shown: f64 = (near.first..)
+            let sampled_share: f64 = (near.first..)
                 .zip(weights)
                 .map(|(n, w)| w * ((1.0 - near.share) * of_pulse(n) + near.share * of_pulse(n - 1)))
                 .sum();
-            near.size * (there - shown)
+            near.size * (sample - sampled_share)
         };
         let spans = jumps.starts.iter().zip(jumps.starts.iter().skip(1)).zip(&self.weights);
         spans.map(|((&from, &to), weights)| jumps.near[from..to].iter().map(|n| lacking(n, weights)).sum()).collect()

@@ -123,8 +123,8 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
 fn pool_covariances(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Vec<f64> {
     let mut sums = vec![0.0; 2 * lags + 1];
     for (a, b) in x.iter().zip(y) {
-        let found = covariances(&subtract_mean(a), &subtract_mean(b), lags);
-        sums.iter_mut().zip(found).for_each(|(s, c)| *s += c);
+        let run_covariances = covariances(&subtract_mean(a), &subtract_mean(b), lags);
+        sums.iter_mut().zip(run_covariances).for_each(|(s, c)| *s += c);
     }
     sums
 }
@@ -160,6 +160,6 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
 #[must_use]
 pub fn covariances_naive(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     let sum =
-        |ahead: &[f64], behind: &[f64], k: usize| ahead.iter().skip(k).zip(behind).map(|(a, b)| a * b).sum::<f64>();
+        |lagged: &[f64], behind: &[f64], k: usize| lagged.iter().skip(k).zip(behind).map(|(a, b)| a * b).sum::<f64>();
     (1..=lags).rev().map(|k| sum(y, x, k)).chain((0..=lags).map(|k| sum(x, y, k))).collect()
 }

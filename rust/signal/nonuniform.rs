@@ -45,10 +45,11 @@ impl<'a> NonuniformSignal<'a> {
         }
         if delay < 0.0 {
             let (first, last) = (self.at(&[-delay])[0], self.times.len().checked_sub(1));
-            let kept = self.times.partition_point(|t| t + delay <= 0.0);
+            let first_row = self.times.partition_point(|t| t + delay <= 0.0);
             let ends = last.map(|k| (self.times[k], self.values[k]));
-            let moved = self.times.iter().zip(self.values.iter()).skip(kept).map(|(t, v)| (t + delay, *v));
-            let (times, values): (Vec<f64>, Vec<f64>) = std::iter::once((0.0, first)).chain(moved).chain(ends).unzip();
+            let shifted = self.times.iter().zip(self.values.iter()).skip(first_row).map(|(t, v)| (t + delay, *v));
+            let (times, values): (Vec<f64>, Vec<f64>) =
+                std::iter::once((0.0, first)).chain(shifted).chain(ends).unzip();
             return Self { times: times.into(), values: values.into(), ..self };
         }
         let times = std::iter::once(0.0).chain(self.times.iter().map(|t| t + delay)).collect();
@@ -145,8 +146,8 @@ impl<'a> NonuniformSignal<'a> {
         }
         // Times that differ from a switch by rounding only count as equal.
         let slack = TIME_TOLERANCE * own.last().copied().unwrap_or(0.0).max(1e-300);
-        let held = |time: &f64| values[own.partition_point(|at| *at <= time + slack).saturating_sub(1)];
-        times.iter().map(held).collect()
+        let value_before = |time: &f64| values[own.partition_point(|at| *at <= time + slack).saturating_sub(1)];
+        times.iter().map(value_before).collect()
     }
 
     /// Times \[s\] and sizes of the jumps of a hold, the one from 0 at the start included; None for a linear signal.
@@ -202,9 +203,9 @@ pub fn interpolate_gaps(samples: &[f64]) -> Cow<'_, [f64]> {
     if !samples.iter().any(|v| v.is_nan()) || samples.iter().all(|v| v.is_nan()) {
         return Cow::Borrowed(samples);
     }
-    let there = || samples.iter().enumerate().filter(|(_, v)| !v.is_nan());
-    let rows: Vec<f64> = there().map(|(row, _)| row as f64).collect();
-    let values: Vec<f64> = there().map(|(_, v)| *v).collect();
+    let finite_samples = || samples.iter().enumerate().filter(|(_, v)| !v.is_nan());
+    let rows: Vec<f64> = finite_samples().map(|(row, _)| row as f64).collect();
+    let values: Vec<f64> = finite_samples().map(|(_, v)| *v).collect();
     let filled = |(row, &v): (usize, &f64)| if v.is_nan() { interpolate(row as f64, &rows, &values) } else { v };
     Cow::Owned(samples.iter().enumerate().map(filled).collect())
 }

@@ -87,12 +87,12 @@ pub fn white_noise_deviation(samples: &[f64]) -> f64 {
         let second = samples.windows(3).map(|w| (w[2] - w[1]) - (w[1] - w[0]));
         second.filter(|bend| !bend.is_nan()).collect()
     };
-    let mut found = bends(samples);
-    if found.is_empty() {
+    let mut differences = bends(samples);
+    if differences.is_empty() {
         // No three neighboring samples are present: use the samples that are, in order.
-        found = bends(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
+        differences = bends(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
     }
-    robust_deviation(&found) / 6.0_f64.sqrt()
+    robust_deviation(&differences) / 6.0_f64.sqrt()
 }
 
 /// Median of values, NaN if there are none.
@@ -123,10 +123,10 @@ pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
     for values in series {
         let x = subtract_mean(values);
         let gaps = values.iter().any(|v| v.is_nan());
-        let known: Vec<f64> = if gaps { values.iter().map(|v| f64::from(!v.is_nan())).collect() } else { Vec::new() };
+        let weights: Vec<f64> = if gaps { values.iter().map(|v| f64::from(!v.is_nan())).collect() } else { Vec::new() };
         for lag in 0..(most + 1).min(x.len()) {
             sums[lag] += inner(&x[lag..], &x[..x.len() - lag]);
-            pairs[lag] += if gaps { inner(&known[lag..], &known[..x.len() - lag]) } else { (x.len() - lag) as f64 };
+            pairs[lag] += if gaps { inner(&weights[lag..], &weights[..x.len() - lag]) } else { (x.len() - lag) as f64 };
         }
     }
     sums.iter_mut().zip(&pairs).for_each(|(sum, count)| *sum /= count.max(1.0));
@@ -135,8 +135,8 @@ pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
 
 /// A series about its own mean, 0 at missing samples.
 fn subtract_mean(values: &[f64]) -> Vec<f64> {
-    let there: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
-    let center = if there.is_empty() { 0.0 } else { mean(&there) };
+    let finite: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
+    let center = if finite.is_empty() { 0.0 } else { mean(&finite) };
     values.iter().map(|v| if v.is_nan() { 0.0 } else { v - center }).collect()
 }
 
@@ -187,8 +187,8 @@ pub fn portmanteau(series: &[&[f64]], lags: usize) -> f64 {
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn is_white(series: &[f64], lags: usize) -> bool {
-    let there = series.iter().filter(|v| !v.is_nan()).count();
-    there <= lags + 1 || portmanteau(&[series], lags) <= chi_squared(lags as f64, NORMAL_99)
+    let count = series.iter().filter(|v| !v.is_nan()).count();
+    count <= lags + 1 || portmanteau(&[series], lags) <= chi_squared(lags as f64, NORMAL_99)
 }
 
 /// Quantile of chi-squared at the level of a normal `quantile`, by Wilson and Hilferty.
@@ -232,7 +232,7 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     }
     let (mut best, mut current) = (vec![1.0], vec![1.0]);
     let mut power = covariance[0];
-    let mut left = power;
+    let mut remaining = power;
     if power.is_nan() || power <= 0.0 {
         return (best, 0.0);
     }
@@ -249,11 +249,11 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
         }
         let criterion = count * libm::log(power) + order as f64 * libm::log(count);
         if criterion < least {
-            (least, left) = (criterion, power);
+            (least, remaining) = (criterion, power);
             best.clone_from(&current);
         }
     }
-    (best, left)
+    (best, remaining)
 }
 
 /// Samples needed for each lag of an input in an ARX model, all runs together.
@@ -313,8 +313,11 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
             columns.iter_mut().enumerate().for_each(|(k, value)| *value = input[run][t - 1 - k]);
         }
         // A missing sample counts as the mean, so that few gaps do not cost most rows.
-        let there = |value: f64| if value.is_nan() { 0.0 } else { value };
-        row[fixed..size - 1].iter_mut().enumerate().for_each(|(k, value)| *value = there(series[run][t - 1 - k]));
+        let value_or_zero = |value: f64| if value.is_nan() { 0.0 } else { value };
+        row[fixed..size - 1]
+            .iter_mut()
+            .enumerate()
+            .for_each(|(k, value)| *value = value_or_zero(series[run][t - 1 - k]));
         row[size - 1] = series[run][t];
         !row[size - 1].is_nan()
     };
@@ -342,11 +345,11 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
         if order > 0 {
             regression.add(fixed + order - 1);
         }
-        let left = regression.residual_power();
-        if left.is_nan() || left <= 0.0 {
+        let power = regression.residual_power();
+        if power.is_nan() || power <= 0.0 {
             break;
         }
-        let criterion = count * libm::log(left) + order as f64 * libm::log(count.max(1.0));
+        let criterion = count * libm::log(power) + order as f64 * libm::log(count.max(1.0));
         if criterion < best.0 {
             best = (criterion, regression.clone(), order);
         }
@@ -358,9 +361,9 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
         .enumerate()
         .map(|(run, values)| {
             let error = |t: usize| {
-                let there = fill(run, t, &mut row) && (1..=order).all(|k| !values[t - k].is_nan());
+                let value_or_zero = fill(run, t, &mut row) && (1..=order).all(|k| !values[t - k].is_nan());
                 let fitted: f64 = row.iter().zip(&coefficients).map(|(value, factor)| value * factor).sum();
-                if there {
+                if value_or_zero {
                     scale * (row[size - 1] - fitted)
                 } else {
                     0.0
@@ -409,7 +412,7 @@ impl Regression {
         let line: Vec<f64> = self.gram[column].iter().map(|value| value / pivot).collect();
         for (_, other) in self.gram.iter_mut().enumerate().filter(|(k, _)| *k != column) {
             let factor = other[column];
-            other.iter_mut().zip(&line).for_each(|(value, taken)| *value -= factor * taken);
+            other.iter_mut().zip(&line).for_each(|(value, entry)| *value -= factor * entry);
             other[column] = -factor / pivot;
         }
         self.gram[column] = line;
@@ -425,9 +428,9 @@ impl Regression {
     /// Coefficient of each column, 0 for those that are not used; none for the last.
     fn coefficients(&self) -> Vec<f64> {
         let last = self.gram.len() - 1;
-        let mut found = vec![0.0; last];
-        self.used.iter().for_each(|&column| found[column] = self.gram[column][last]);
-        found
+        let mut values = vec![0.0; last];
+        self.used.iter().for_each(|&column| values[column] = self.gram[column][last]);
+        values
     }
 }
 

@@ -97,22 +97,22 @@ impl CoupledProblem<'_> {
                 .zip(self.structures)
                 .all(|((a, b), s)| has_converged(a, b, s.terms.len(), settings.tolerance));
             let mut share = 1.0;
-            let mut taken = false;
+            let mut is_accepted = false;
             for _ in 0..MAX_STEP_HALVINGS {
-                let tried: Vec<Solution> = solutions
+                let candidates: Vec<Solution> = solutions
                     .iter()
                     .zip(&next)
                     .map(|(a, b)| a.iter().zip(b).map(|(a, b)| a + share * (b - a)).collect())
                     .collect();
-                match self.evaluate(&tried)? {
-                    Some(found) if found.cost <= point.cost + COST_TOLERANCE => {
-                        (solutions, point, taken) = (tried, found, true);
+                match self.evaluate(&candidates)? {
+                    Some(candidate) if candidate.cost <= point.cost + COST_TOLERANCE => {
+                        (solutions, point, is_accepted) = (candidates, candidate, true);
                         break;
                     }
                     _ => share *= 0.5,
                 }
             }
-            if !taken {
+            if !is_accepted {
                 // No shorter step lowers the cost.
                 break;
             }
@@ -126,8 +126,8 @@ impl CoupledProblem<'_> {
         for (i, fixed) in self.fixed.iter().enumerate() {
             out.extend((0..fixed.len()).filter(|&k| fixed[k].is_none()).map(|k| FreeCoefficient::Term(i, k)));
             for r in 0..self.records.len() {
-                let kept = (0..self.exponents[i].len()).filter(|&e| !self.dropped[i].contains(&(r, e)));
-                out.extend(kept.map(|e| FreeCoefficient::Initial(i, r, e)));
+                let indices = (0..self.exponents[i].len()).filter(|&e| !self.dropped[i].contains(&(r, e)));
+                out.extend(indices.map(|e| FreeCoefficient::Initial(i, r, e)));
             }
         }
         out
@@ -253,8 +253,8 @@ impl CoupledProblem<'_> {
         let mut covariances = Vec::new();
         if with_covariance {
             let (mut meat, inverse) = (vec![0.0; k * k], solved.inverse());
-            for (((phi, target), made), record) in parts.iter().zip(&instruments).zip(self.records) {
-                let RecordInstruments { columns: psi, unknown_indices: places } = made;
+            for (((phi, target), run_instruments), record) in parts.iter().zip(&instruments).zip(self.records) {
+                let RecordInstruments { columns: psi, unknown_indices: places } = run_instruments;
                 let mut rest = target.clone();
                 for (column, &place) in phi.iter().zip(places) {
                     rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);

@@ -120,14 +120,14 @@ pub fn fit(
     let mut refined: Vec<&[Solution]> = Vec::new();
     for (start, ended) in ends.iter().filter(|_| structures.len() > 1) {
         // Most initial guesses end at the same estimates, which have one refinement.
-        if refined.iter().any(|known| problem.agree(known, &ended.solutions, SAME_SOLUTION_TOLERANCE)) {
+        if refined.iter().any(|earlier| problem.agree(earlier, &ended.solutions, SAME_SOLUTION_TOLERANCE)) {
             continue;
         }
         refined.push(&ended.solutions);
         for from in [&ended.solutions, start] {
-            let Some(found) = problem.refine_together(from, settings)? else { continue };
-            if together.as_ref().is_none_or(|t| found.cost < t.cost) {
-                together = Some(found);
+            let Some(candidate) = problem.refine_together(from, settings)? else { continue };
+            if together.as_ref().is_none_or(|t| candidate.cost < t.cost) {
+                together = Some(candidate);
             }
             break;
         }
@@ -136,13 +136,13 @@ pub fn fit(
     let Some(mut ended) = best else {
         return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
     };
-    if let Some(found) = together {
+    if let Some(candidate) = together {
         ended = RefinementResult {
             error: ended.error,
-            solutions: found.solutions,
-            covariances: found.covariances,
-            iterations: ended.iterations + found.iterations,
-            converged: found.converged,
+            solutions: candidate.solutions,
+            covariances: candidate.covariances,
+            iterations: ended.iterations + candidate.iterations,
+            converged: candidate.converged,
             damped: false,
         };
     }
@@ -314,12 +314,13 @@ impl<'a> CoupledProblem<'a> {
         for (i, fixed) in self.fixed.iter().enumerate() {
             let driven = |signal: usize| self.structures.iter().any(|e| e.output == signal);
             let pairs = self.spectra[i].iter().zip(&simulated);
-            let made: Vec<Vec<Option<Kernel>>> =
+            let kernels: Vec<Vec<Option<Kernel>>> =
                 pairs.map(|(shelf, record)| shelf.substitute_spectra(record, driven)).collect();
             let terms = &self.structures[i].terms;
-            let sources: Vec<InstrumentSource<'_>> = (0..made.len())
+            let sources: Vec<InstrumentSource<'_>> = (0..kernels.len())
                 .map(|r| {
-                    let of = |k: usize| if driven(terms[k].signal) { &made[r][k] } else { &self.substitutes[i][r][k] };
+                    let of =
+                        |k: usize| if driven(terms[k].signal) { &kernels[r][k] } else { &self.substitutes[i][r][k] };
                     self.spectra[i][r].source(|k| of(k).as_ref())
                 })
                 .collect();

@@ -136,13 +136,16 @@ const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 /// # Errors
 /// As [`project`], [`Error::Interrupted`].
 pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &Stop) -> Result<Record> {
-    let known: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
+    let input_signals: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
     // One basis for all signals; none where all are inputs.
-    let basis =
-        if known.len() < record.len() { input_response_basis(&record, &known, at_rest, stop)? } else { Vec::new() };
+    let basis = if input_signals.len() < record.len() {
+        input_response_basis(&record, &input_signals, at_rest, stop)?
+    } else {
+        Vec::new()
+    };
     let clean = (0..record.len()).map(|s| {
         let signal = record.signal(s);
-        PulseMeans::new(if known.contains(&s) { signal.to_vec() } else { project_on_basis(&basis, signal) })
+        PulseMeans::new(if input_signals.contains(&s) { signal.to_vec() } else { project_on_basis(&basis, signal) })
     });
     let clean = clean.collect();
     record.with_clean(clean)

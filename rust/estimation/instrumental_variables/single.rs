@@ -82,13 +82,13 @@ impl<'a> EquationSpectra<'a> {
 
     /// Spectra of the terms of other signals than the output, with the signals of `substitute`.
     ///
-    /// None for signals that are not `wanted` or that equal the measured ones.
+    /// None for signals that are not `is_selected` or that equal the measured ones.
     pub(super) fn substitute_spectra(
         &self,
         substitute: &Record,
-        wanted: impl Fn(usize) -> bool,
+        is_selected: impl Fn(usize) -> bool,
     ) -> Vec<Option<Kernel>> {
-        let other = |s: usize| s != self.output && wanted(s) && substitute.signal(s) != self.record.signal(s);
+        let other = |s: usize| s != self.output && is_selected(s) && substitute.signal(s) != self.record.signal(s);
         self.terms.iter().map(|t| other(t.signal).then(|| t.integral_spectrum(substitute.signal(t.signal)))).collect()
     }
 
@@ -154,11 +154,11 @@ pub fn step(
 ) -> Result<(Solution, Vec<f64>)> {
     let free: Vec<usize> = (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect();
     let width = sources.first().map_or(0, |s| s.initial.len());
-    let kept: Vec<(usize, usize)> = (0..sources.len())
+    let pairs: Vec<(usize, usize)> = (0..sources.len())
         .flat_map(|r| (0..width).map(move |i| (r, i)))
         .filter(|place| !dropped.contains(place))
         .collect();
-    let k = free.len() + kept.len();
+    let k = free.len() + pairs.len();
     let (mut filtered, mut instruments) = (Vec::with_capacity(sources.len()), Vec::with_capacity(sources.len()));
     for (r, source) in sources.iter().enumerate() {
         let m = source.output.len();
@@ -182,7 +182,7 @@ pub fn step(
             });
         }
         let mut places: Vec<usize> = (0..free.len()).collect();
-        for (place, &(_, i)) in kept.iter().enumerate().filter(|&(_, &(record, _))| record == r) {
+        for (place, &(_, i)) in pairs.iter().enumerate().filter(|&(_, &(record, _))| record == r) {
             let column = product(filter, source.initial[i], m, scratch)?;
             psi.push(column.clone());
             phi.push(column);
@@ -210,7 +210,7 @@ pub fn step(
         solution[j] = value;
     }
     solution.resize(fixed.len() + sources.len() * width, 0.0);
-    for (&(r, i), &value) in kept.iter().zip(&x[free.len()..]) {
+    for (&(r, i), &value) in pairs.iter().zip(&x[free.len()..]) {
         solution[fixed.len() + r * width + i] = value;
     }
     let mut covariance = Vec::new();
@@ -277,7 +277,7 @@ pub fn refine(
     scratch: &mut Scratch,
 ) -> Result<(Solution, usize, bool)> {
     let mut solution = start.to_vec();
-    for made in 1..=settings.iterations {
+    for iteration in 1..=settings.iterations {
         let mut filters = Vec::with_capacity(sources.len());
         let mut responses = Vec::with_capacity(sources.len());
         for (r, source) in sources.iter().enumerate() {
@@ -303,7 +303,7 @@ pub fn refine(
         let still = has_converged(&solution, &next, fixed.len(), settings.tolerance);
         solution = next;
         if still {
-            return Ok((solution, made, true));
+            return Ok((solution, iteration, true));
         }
     }
     Ok((solution, settings.iterations, false))

@@ -130,15 +130,15 @@ const RANK_TOLERANCE: f64 = 1e-13;
 /// # Errors
 /// [`Error::Singular`] if a column depends linearly on the previous ones.
 pub(super) fn orthonormalize_instruments(records: &mut [RecordInstruments], k: usize) -> Result<()> {
-    let mut held = vec![0; k];
-    records.iter().flat_map(|r| &r.unknown_indices).for_each(|&place| held[place] += 1);
+    let mut counts = vec![0; k];
+    records.iter().flat_map(|r| &r.unknown_indices).for_each(|&place| counts[place] += 1);
     let singular = |place| Error::Singular { index: place, count: k };
     // Coefficients of a single record come first: columns of different records are already orthogonal.
     for record in &mut *records {
-        for at in (0..record.unknown_indices.len()).filter(|&at| held[record.unknown_indices[at]] == 1) {
+        for at in (0..record.unknown_indices.len()).filter(|&at| counts[record.unknown_indices[at]] == 1) {
             let mut column = [std::mem::take(&mut record.columns[at])];
             let spanned = orthonormalize_column(&mut column, |column| {
-                for before in (0..at).filter(|&before| held[record.unknown_indices[before]] == 1) {
+                for before in (0..at).filter(|&before| counts[record.unknown_indices[before]] == 1) {
                     subtract_projection(&mut column[0], &record.columns[before], None);
                 }
             });
@@ -148,14 +148,15 @@ pub(super) fn orthonormalize_instruments(records: &mut [RecordInstruments], k: u
             [record.columns[at]] = column;
         }
     }
-    let shared: Vec<usize> = (0..k).filter(|&place| held[place] > 1).collect();
+    let shared: Vec<usize> = (0..k).filter(|&place| counts[place] > 1).collect();
     for (n, &place) in shared.iter().enumerate() {
         // The column of a coefficient is empty in records without it.
         let mut pieces: Vec<Vec<f64>> =
             records.iter().map(|r| r.column_of(place).cloned().unwrap_or_default()).collect();
         let spanned = orthonormalize_column(&mut pieces, |pieces| {
             for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
-                for (column, _) in record.columns.iter().zip(&record.unknown_indices).filter(|(_, p)| held[**p] == 1) {
+                for (column, _) in record.columns.iter().zip(&record.unknown_indices).filter(|(_, p)| counts[**p] == 1)
+                {
                     subtract_projection(piece, column, None);
                 }
             }
@@ -193,19 +194,19 @@ fn subtract_projection(column: &mut [f64], direction: &[f64], along: Option<f64>
 /// Return false if the remainder is at rounding level.
 fn orthonormalize_column(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
     let whole = stacked_norm(pieces);
-    let (mut before, mut left) = (whole, whole);
+    let (mut before, mut remainder) = (whole, whole);
     for _ in 0..2 {
         clear(pieces);
-        left = stacked_norm(pieces);
+        remainder = stacked_norm(pieces);
         // Rounding errors along the previous columns grow by the factor by which the column has shrunk.
-        if left > 0.5 * before {
+        if remainder > 0.5 * before {
             break;
         }
-        before = left;
+        before = remainder;
     }
-    let scale = 1.0 / left;
+    let scale = 1.0 / remainder;
     pieces.iter_mut().flatten().for_each(|v| *v *= scale);
-    left > RANK_TOLERANCE * whole && scale.is_finite() && left.is_finite()
+    remainder > RANK_TOLERANCE * whole && scale.is_finite() && remainder.is_finite()
 }
 
 fn stacked_norm(pieces: &[Vec<f64>]) -> f64 {

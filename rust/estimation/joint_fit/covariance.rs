@@ -48,13 +48,13 @@ pub fn robust_covariance(jacobian: &[Vec<f64>], series: Vec<Vec<f64>>, shares: O
 /// Pseudo-residuals of Huber's loss: least squares on them has the covariance of the M-estimator.
 #[allow(clippy::cast_precision_loss)]
 fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<Vec<f64>> {
-    let known: Vec<f64> = series.iter().flatten().copied().filter(|e| !e.is_nan()).collect();
-    let level = match robust_deviation(&known) {
+    let finite: Vec<f64> = series.iter().flatten().copied().filter(|e| !e.is_nan()).collect();
+    let level = match robust_deviation(&finite) {
         0.0 => 1.0,
         level => level,
     };
-    let (most, count) = (HUBER_THRESHOLD * level, known.len().max(1) as f64);
-    let moving = (known.iter().filter(|e| e.abs() < most).count() as f64 / count).max(1.0 / count);
+    let (most, count) = (HUBER_THRESHOLD * level, finite.len().max(1) as f64);
+    let moving = (finite.iter().filter(|e| e.abs() < most).count() as f64 / count).max(1.0 / count);
     // Huber's small-sample correction.
     let few = 1.0 + parameters as f64 / count * (1.0 - moving) / moving;
     series.iter_mut().flatten().for_each(|e| *e = if e.is_nan() { *e } else { e.clamp(-most, most) * few / moving });
@@ -76,7 +76,7 @@ pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squar
     if p == 0 {
         return Ok(Vec::new());
     }
-    let known = series.iter().flatten().filter(|e| !e.is_nan()).count();
+    let finite_count = series.iter().flatten().filter(|e| !e.is_nan()).count();
     let lengths: Vec<f64> = jacobian
         .iter()
         .map(|row| {
@@ -104,22 +104,23 @@ pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squar
         dense::singular_values(&columns).ok_or_else(unfound)?;
     let largest = sizes.iter().copied().fold(0.0, f64::max);
     let rounding = f64::EPSILON * (count.max(1) as f64).sqrt() * largest;
-    let seen: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k] > rounding).collect();
+    let significant: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k] > rounding).collect();
     // Largest angle between an identifiable and a non-identifiable direction that rounding can cause.
-    let turned = seen.iter().map(|&k| sizes[k]).reduce(f64::min).map_or(0.0, |least| rounding / least);
-    let beyond = |i: usize| {
-        let lost = (0..sizes.len()).filter(|k| sizes[*k] <= rounding).map(|k| right[k][i] * right[k][i]);
-        lost.sum::<f64>().sqrt() > turned
+    let turned = significant.iter().map(|&k| sizes[k]).reduce(f64::min).map_or(0.0, |least| rounding / least);
+    let is_beyond = |i: usize| {
+        let lost_share = (0..sizes.len()).filter(|k| sizes[*k] <= rounding).map(|k| right[k][i] * right[k][i]);
+        lost_share.sum::<f64>().sqrt() > turned
     };
-    let mut unseen: Vec<bool> = (0..p).map(|i| seen.len() < sizes.len() && beyond(i)).collect();
+    let mut unseen: Vec<bool> = (0..p).map(|i| significant.len() < sizes.len() && is_beyond(i)).collect();
     // Rows of the pseudoinverse in the singular basis: the "bread" of the sandwich in factored form.
-    let inverse: Vec<Vec<f64>> = (0..p).map(|i| seen.iter().map(|&k| right[k][i] / sizes[k]).collect()).collect();
+    let inverse: Vec<Vec<f64>> =
+        (0..p).map(|i| significant.iter().map(|&k| right[k][i] / sizes[k]).collect()).collect();
     let middle = if series.iter().all(|e| is_white(e, WHITENESS_LAGS)) {
-        let level = squares / known.saturating_sub(p).max(1) as f64;
+        let level = squares / finite_count.saturating_sub(p).max(1) as f64;
         (0..p * p).map(|at| level * inner(&inverse[at / p], &inverse[at % p])).collect()
     } else {
         check_length("residuals", count, series.iter().map(Vec::len).sum())?;
-        let basis: Vec<&[f64]> = seen.iter().map(|&k| &rows[k][..count]).collect();
+        let basis: Vec<&[f64]> = significant.iter().map(|&k| &rows[k][..count]).collect();
         let answers = inverse.iter().map(|row| weighted_row_sum(row, &basis, count)).collect::<Vec<_>>();
         widen_covariance(autoregressive_covariance(&answers, &basis, series), &long_run_covariance(&answers, series)?)
     };
@@ -168,23 +169,23 @@ fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[V
     let mut total = vec![0.0; answers.len() * answers.len()];
     let mut at = 0;
     for residuals in series {
-        let there = at..at + residuals.len();
-        at = there.end;
-        let known = residuals.iter().filter(|e| !e.is_nan()).count();
-        if known == 0 {
+        let range = at..at + residuals.len();
+        at = range.end;
+        let count = residuals.iter().filter(|e| !e.is_nan()).count();
+        if count == 0 {
             continue;
         }
-        let (through, power) = whitening_filter(&[residuals], lag_count(known));
+        let (through, power) = whitening_filter(&[residuals], lag_count(count));
         let covariances = filter_autocovariances(&through, power, residuals.len());
         if covariances[0].is_nan() || covariances[0] <= 0.0 {
             continue;
         }
-        let directions: Vec<&[f64]> = basis.iter().map(|row| &row[there.clone()]).collect();
+        let directions: Vec<&[f64]> = basis.iter().map(|row| &row[range.clone()]).collect();
         let own = multiply_toeplitz(&directions, &covariances);
-        let taken = own.iter().zip(&directions).map(|(w, row)| inner(w, row)).sum::<f64>() / covariances[0];
-        let left = (1.0 - taken / known as f64).max(MIN_RESIDUAL_NOISE_SHARE);
-        let rows: Vec<&[f64]> = answers.iter().map(|row| &row[there.clone()]).collect();
-        total.iter_mut().zip(quadratic_form(&rows, &covariances)).for_each(|(sum, more)| *sum += more / left);
+        let explained = own.iter().zip(&directions).map(|(w, row)| inner(w, row)).sum::<f64>() / covariances[0];
+        let remainder = (1.0 - explained / count as f64).max(MIN_RESIDUAL_NOISE_SHARE);
+        let rows: Vec<&[f64]> = answers.iter().map(|row| &row[range.clone()]).collect();
+        total.iter_mut().zip(quadratic_form(&rows, &covariances)).for_each(|(sum, more)| *sum += more / remainder);
     }
     total
 }
@@ -210,14 +211,14 @@ pub fn long_run_covariance(jacobian: &[Vec<f64>], series: &[Vec<f64>]) -> Result
     let mut total = vec![0.0; jacobian.len() * jacobian.len()];
     let mut at = 0;
     for residuals in series {
-        let there = at..at + residuals.len();
-        at = there.end;
+        let range = at..at + residuals.len();
+        at = range.end;
         if residuals.is_empty() {
             continue;
         }
         let score = |(slope, e): (&f64, &f64)| if e.is_nan() { 0.0 } else { slope * e };
         let scores: Vec<Vec<f64>> =
-            jacobian.iter().map(|row| row[there.clone()].iter().zip(residuals).map(score).collect()).collect();
+            jacobian.iter().map(|row| row[range.clone()].iter().zip(residuals).map(score).collect()).collect();
         let rows: Vec<&[f64]> = scores.iter().map(Vec::as_slice).collect();
         let window = lag_count(residuals.len());
         let reach = window.min(residuals.len().saturating_sub(1));

@@ -48,9 +48,9 @@ impl OutputScale {
     #[must_use]
     pub fn from_runs(runs: &[Vec<f64>]) -> Self {
         let variance = |samples: &Vec<f64>| {
-            let known: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
-            let middle = mean(&known);
-            mean(&known.iter().map(|v| (v - middle) * (v - middle)).collect::<Vec<_>>())
+            let finite: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
+            let middle = mean(&finite);
+            mean(&finite.iter().map(|v| (v - middle) * (v - middle)).collect::<Vec<_>>())
         };
         let size = mean(&runs.iter().map(variance).collect::<Vec<_>>()).sqrt();
         Self::from_deviation(size, runs)
@@ -170,10 +170,11 @@ impl<'a> FitProblem<'a> {
         let floor = mean(&self.sizes.iter().map(share).collect::<Vec<_>>());
         let weights: Vec<f64> = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
         let shared = std::cell::RefCell::new(pace);
-        let told =
-            |done, of| shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, done, of);
+        let listener =
+            |count, of| shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, count, of);
         let Self { source, starts, stop, .. } = *self;
-        let course = MultistartContext { source, starts, stop, weights: &weights, floor, threads, told: Some(&told) };
+        let course =
+            MultistartContext { source, starts, stop, weights: &weights, floor, threads, told: Some(&listener) };
         let run = match &self.free.problem {
             problem if !problem.derived.is_empty() => run_nonlinear_multistart,
             problem if !problem.frictions.is_empty() => run_friction_multistart,
@@ -274,10 +275,10 @@ pub fn fit(
     sought: FitProblem<'_>,
     outset: Initialization,
     settings: Settings,
-    told: &ProgressListener<'_>,
+    listener: &ProgressListener<'_>,
 ) -> Result<Option<JointFit>> {
     let free = sought.free;
-    let mut pace = FitProgress::new(told);
+    let mut pace = FitProgress::new(listener);
     let (reached, contenders) = match outset {
         Initialization::WarmStart { values, noise, pulses_per_sample: every, candidates: raced } => {
             let start = sought.start(&values, GIVEN_START_ORIGIN)?;
@@ -288,11 +289,11 @@ pub fn fit(
             return finish_fit(free, best, grid, raced, settings).map(Some);
         }
         Initialization::InitialGuess(values) => (Vec::new(), vec![sought.start(&values, GIVEN_START_ORIGIN)?]),
-        Initialization::Multistart { known, candidates: raced } => {
+        Initialization::Multistart { known: guesses, candidates: raced } => {
             let reached =
                 if let Some(raced) = raced { raced } else { sought.run_multistart(settings.threads, &mut pace)? };
             let mut contenders = select_survivors(&reached);
-            for values in &known {
+            for values in &guesses {
                 contenders.push(sought.start(values, GIVEN_START_ORIGIN)?);
             }
             (reached, contenders)
@@ -322,9 +323,9 @@ pub fn fit(
     pace.advance_to(0.65)?;
     let (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
     pace.advance_to(0.75)?;
-    let found = finish_fit(free, best, grid, reached, settings)?;
+    let final_fit = finish_fit(free, best, grid, reached, settings)?;
     pace.advance_to(1.0)?;
-    Ok(Some(found))
+    Ok(Some(final_fit))
 }
 
 /// Origin label of a given initial guess.
@@ -364,14 +365,14 @@ fn select_on_part(sought: FitProblem<'_>, contenders: &[Candidate], sampling: Sa
     let whole = sought.equally_weighted_grid(sampling)?;
     if let Some(intervals) = leading_part(sought.free, sought.source, SELECTION_INTERVALS)? {
         let part = sought.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling })?;
-        let found = select_best_candidate(sought.free, contenders, &part).and_then(|best| {
+        let winner = select_best_candidate(sought.free, contenders, &part).and_then(|best| {
             let place = &best.result.iterate;
             let problem = sought.free.problem_at(place, true, &[]);
             Ok(best.with_result(whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?))
         });
         // The simulation may be finite on the first part only.
-        if !matches!(&found, Err(error) if *error != Error::Interrupted) {
-            return found;
+        if !matches!(&winner, Err(error) if *error != Error::Interrupted) {
+            return winner;
         }
     }
     select_best_candidate(sought.free, contenders, &whole)

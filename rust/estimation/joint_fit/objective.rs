@@ -198,14 +198,16 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// [`Error::Interrupted`].
     pub fn is_refinement_significant(&self, place: &Iterate, finer: &Self) -> Result<bool> {
-        let (Some(here), Some(there)) = (self.evaluate(place)?, finer.evaluate(place)?) else {
+        let (Some(evaluation), Some(finer_evaluation)) = (self.evaluate(place)?, finer.evaluate(place)?) else {
             // The simulation is finite on one grid only: the difference is significant.
             return Ok(true);
         };
-        let moved: Vec<f64> = there.residuals.iter().zip(&here.residuals).map(|(a, b)| (a - b).powi(2)).collect();
-        let left = mean(&there.residuals.iter().map(|e| e * e).collect::<Vec<_>>()).max(1.0);
+        let changes: Vec<f64> =
+            finer_evaluation.residuals.iter().zip(&evaluation.residuals).map(|(a, b)| (a - b).powi(2)).collect();
+        let mean_square = mean(&finer_evaluation.residuals.iter().map(|e| e * e).collect::<Vec<_>>()).max(1.0);
         // Overflow of the squares means that the simulation diverges on one of the grids.
-        Ok(!left.is_finite() || mean(&moved) > MAX_DISCRETIZATION_NOISE_RATIO * MAX_DISCRETIZATION_NOISE_RATIO * left)
+        Ok(!mean_square.is_finite()
+            || mean(&changes) > MAX_DISCRETIZATION_NOISE_RATIO * MAX_DISCRETIZATION_NOISE_RATIO * mean_square)
     }
 
     /// Indices of results, sorted by the larger of their costs on their own grid and on this finer one.
@@ -217,8 +219,9 @@ impl<'a> Objective<'a> {
     /// [`Error::Interrupted`].
     pub fn rank_results(&self, attempts: &[&OptimizationResult]) -> Result<Vec<usize>> {
         let worse = |attempt: &&OptimizationResult| {
-            let there = self.evaluate(&attempt.iterate)?;
-            Ok(there.map_or(f64::INFINITY, |there| attempt.cost_per_residual().max(there.cost_per_residual())))
+            let evaluation = self.evaluate(&attempt.iterate)?;
+            Ok(evaluation
+                .map_or(f64::INFINITY, |evaluation| attempt.cost_per_residual().max(evaluation.cost_per_residual())))
         };
         let costs: Vec<f64> = attempts.iter().map(worse).collect::<Result<_>>()?;
         let any = costs.iter().any(|cost| cost.is_finite());
@@ -237,7 +240,7 @@ impl<'a> Objective<'a> {
     /// [`Error::Interrupted`].
     pub fn evaluate(&self, place: &Iterate) -> Result<Option<OptimizationResult>> {
         match self.minimize(place, 0) {
-            Ok(found) => Ok(Some(found)),
+            Ok(evaluation) => Ok(Some(evaluation)),
             Err(Error::Interrupted) => Err(Error::Interrupted),
             Err(_) => Ok(None),
         }

@@ -121,9 +121,9 @@ impl ParameterSet {
     /// Problem with coordinates for an optimization from `start`.
     ///
     /// Nonzero coefficients use logarithms unless `plain` or there are non-linear terms, whose initial guesses may have
-    /// wrong signs. The parameters with the indices `held` are fixed at their values.
+    /// wrong signs. The parameters with the indices `fixed` are fixed at their values.
     #[must_use]
-    pub fn problem_at(&self, start: &Iterate, plain: bool, held: &[usize]) -> Problem {
+    pub fn problem_at(&self, start: &Iterate, plain: bool, fixed: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
         let named = self.structure.coefficient_names();
         let plain = plain || !problem.derived.is_empty();
@@ -138,7 +138,7 @@ impl ParameterSet {
             };
         }
         let (orders, coefficients) = (self.orders.len(), self.coefficients.len());
-        for &number in held {
+        for &number in fixed {
             match number.checked_sub(orders) {
                 None => problem.model.order_bounds[number] = (start.point.orders[number], start.point.orders[number]),
                 Some(j) if j < coefficients => problem.model.coordinates[j] = Coordinate::Fixed,
@@ -172,13 +172,13 @@ impl ParameterSet {
                 return value;
             }
             let least = self.ratio_lower_bound(name);
-            let said = self.products.iter().filter(|law| law.factors.contains(name)).filter_map(|law| {
+            let ratios = self.products.iter().filter(|law| law.factors.contains(name)).filter_map(|law| {
                 let others = law.factors.iter().filter(|factor| *factor != name);
                 let product: f64 = others.filter_map(|factor| estimated.get(factor)).product();
                 (product != 0.0).then(|| law.sign * estimated.get(&law.name).copied().unwrap_or(f64::NAN) / product)
             });
             let usable: Vec<f64> =
-                said.filter(|v| v.is_finite() && *v > least + MIN_RATIO_EXCESS && *v < MAX_RATIO).collect();
+                ratios.filter(|v| v.is_finite() && *v > least + MIN_RATIO_EXCESS && *v < MAX_RATIO).collect();
             if usable.is_empty() {
                 least + DEFAULT_RATIO_EXCESS
             } else {
@@ -289,10 +289,10 @@ impl TimeScaling {
     }
 
     /// Relative decrease of parameter i with a step of the orders, at a constant value in the unit.
-    fn relative_decrease(&self, i: usize, moved: &[f64]) -> f64 {
+    fn relative_decrease(&self, i: usize, step: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => {
-                moved[..self.orders].iter().enumerate().map(|(k, by)| self.unit.relative_decrease(j, k) * by).sum()
+                step[..self.orders].iter().enumerate().map(|(k, by)| self.unit.relative_decrease(j, k) * by).sum()
             }
             _ => 0.0,
         }
@@ -312,9 +312,9 @@ impl TimeScaling {
 
     /// Convert a small step in the unit to a step of the parameters at the given values.
     #[must_use]
-    pub fn step(&self, values: &[f64], moved: &[f64]) -> Vec<f64> {
+    pub fn step(&self, values: &[f64], changes: &[f64]) -> Vec<f64> {
         let factors = self.factors(values);
-        let of = |(i, value): (usize, &f64)| moved[i] / factors[i] - value * self.relative_decrease(i, moved);
+        let of = |(i, value): (usize, &f64)| changes[i] / factors[i] - value * self.relative_decrease(i, changes);
         values.iter().enumerate().map(of).collect()
     }
 
@@ -322,7 +322,7 @@ impl TimeScaling {
     #[must_use]
     pub fn standard_errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
         let (n, factors) = (values.len(), self.factors(values));
-        let seen: Vec<bool> = (0..n).map(|i| covariance[i * n + i].is_finite()).collect();
+        let is_finite: Vec<bool> = (0..n).map(|i| covariance[i * n + i].is_finite()).collect();
         let of = |i: usize| {
             let mut row = vec![0.0; n];
             row[i] = factors[i];
@@ -331,12 +331,12 @@ impl TimeScaling {
                 one[k] = 1.0;
                 *by += factors[i] * values[i] * self.relative_decrease(i, &one);
             }
-            if row.iter().zip(&seen).any(|(by, seen)| !seen && *by != 0.0) {
+            if row.iter().zip(&is_finite).any(|(by, is_finite)| !is_finite && *by != 0.0) {
                 return f64::INFINITY;
             }
             let mut variance = 0.0;
-            for j in (0..n).filter(|&j| seen[j]) {
-                for k in (0..n).filter(|&k| seen[k]) {
+            for j in (0..n).filter(|&j| is_finite[j]) {
+                for k in (0..n).filter(|&k| is_finite[k]) {
                     variance += row[j] * covariance[j * n + k] * row[k];
                 }
             }
@@ -381,8 +381,8 @@ mod tests {
         let back = minutes.to_unscaled(&scaled);
         assert!(back.iter().zip(values).all(|(a, b)| (a - b).abs() <= 1e-12 * b.abs()));
         let tiny = [1e-7, -2e-7, 3e-7, 4e-7, -5e-7, 6e-7, 7e-7];
-        let moved: Vec<f64> = values.iter().zip(tiny).map(|(v, by)| v + by).collect();
-        let change: Vec<f64> = minutes.to_scaled(&moved).iter().zip(&scaled).map(|(a, b)| a - b).collect();
+        let shifted: Vec<f64> = values.iter().zip(tiny).map(|(v, by)| v + by).collect();
+        let change: Vec<f64> = minutes.to_scaled(&shifted).iter().zip(&scaled).map(|(a, b)| a - b).collect();
         let step = minutes.step(&values, &change);
         assert!(step.iter().zip(tiny).all(|(a, b)| (a - b).abs() < 1e-9));
         // Slopes by differences give the errors of independent parameters.

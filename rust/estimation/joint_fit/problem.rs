@@ -124,15 +124,15 @@ impl Problem {
         stop: &Stop,
     ) -> Result<OptimizationResult> {
         if self.is_linear() {
-            let found = fit_until(&self.model, experiments, &start.point, settings, steady, stop)?;
+            let optimum = fit_until(&self.model, experiments, &start.point, settings, steady, stop)?;
             return Ok(OptimizationResult {
-                iterate: Iterate { point: found.point, states: Vec::new() },
-                cost: found.cost,
-                residuals: found.residuals,
-                jacobian: found.jacobian,
-                initial: found.initial,
-                evaluations: found.evaluations,
-                status: found.status,
+                iterate: Iterate { point: optimum.point, states: Vec::new() },
+                cost: optimum.cost,
+                residuals: optimum.residuals,
+                jacobian: optimum.jacobian,
+                initial: optimum.initial,
+                evaluations: optimum.evaluations,
+                status: optimum.status,
             });
         }
         let filtered = nonlinear::filtered_outputs(experiments);
@@ -140,16 +140,17 @@ impl Problem {
         let start = Start { orders, coefficients, inputs, states };
         let (model, derived, frictions) = (self.model.clone(), self.derived.clone(), self.frictions.clone());
         let model = NonlinearModel { model, derived, frictions, filtered };
-        let found = nonlinear::fit(&model, experiments, &start, settings, stop)?;
-        let point = ParameterPoint { orders: found.orders, coefficients: found.coefficients, inputs: found.inputs };
+        let optimum = nonlinear::fit(&model, experiments, &start, settings, stop)?;
+        let point =
+            ParameterPoint { orders: optimum.orders, coefficients: optimum.coefficients, inputs: optimum.inputs };
         Ok(OptimizationResult {
-            initial: found.states.iter().map(|states| vec![states.clone()]).collect(),
-            iterate: Iterate { point, states: found.states },
-            cost: found.cost,
-            residuals: found.residuals,
-            jacobian: found.jacobian,
-            evaluations: found.evaluations,
-            status: found.status,
+            initial: optimum.states.iter().map(|states| vec![states.clone()]).collect(),
+            iterate: Iterate { point, states: optimum.states },
+            cost: optimum.cost,
+            residuals: optimum.residuals,
+            jacobian: optimum.jacobian,
+            evaluations: optimum.evaluations,
+            status: optimum.status,
         })
     }
 }
@@ -268,8 +269,8 @@ impl Problem {
                 break;
             }
             more.iter().for_each(|&i| active[i] = true);
-            let kept = constraints.iter().zip(&active).filter(|(_, active)| **active);
-            let normals: Vec<Vec<f64>> = kept.map(|(c, _)| c.normal.clone()).collect();
+            let active_constraints = constraints.iter().zip(&active).filter(|(_, active)| **active);
+            let normals: Vec<Vec<f64>> = active_constraints.map(|(c, _)| c.normal.clone()).collect();
             let dense::SingularValues { left: basis, values: sizes, .. } = dense::singular_values(&normals)
                 .ok_or_else(|| Error::Internal { what: "constraints of orders without a basis".into() })?;
             let whole = step.clone();
@@ -300,14 +301,14 @@ impl Problem {
         let size = self.size();
         let wide = |weights: &dyn Fn(usize) -> f64| (0..size).map(weights).collect::<Vec<_>>();
         let of = |order: &AffineOrder, k: usize| order.weights.get(k).copied().unwrap_or(0.0);
-        let mut found = Vec::new();
+        let mut limits = Vec::new();
         for (i, (low, high)) in self.bounds().into_iter().enumerate() {
             let along = |sign: f64| wide(&|k| if k == i { sign } else { 0.0 });
             if low.is_finite() {
-                found.push(Constraint { normal: along(1.0), offset: -low, margin: 0.0 });
+                limits.push(Constraint { normal: along(1.0), offset: -low, margin: 0.0 });
             }
             if high.is_finite() {
-                found.push(Constraint { normal: along(-1.0), offset: high, margin: 0.0 });
+                limits.push(Constraint { normal: along(-1.0), offset: high, margin: 0.0 });
             }
         }
         for equation in &self.model.equations {
@@ -316,18 +317,18 @@ impl Problem {
                 let own = *signal == equation.output;
                 // Derivatives of an output in expressions are integrals of everything but the output's own terms.
                 let above = if own { 0.0 } else { derivative };
-                found.push(Constraint {
+                limits.push(Constraint {
                     normal: wide(&|k| of(&equation.order, k) - of(order, k)),
                     offset: equation.order.constant - order.constant - above,
                     margin: if own { MIN_INTEGRATION_ORDER } else { ORDER_ROUNDING_TOLERANCE },
                 });
                 if own {
-                    found.push(Constraint { normal: wide(&|k| of(order, k)), offset: order.constant, margin: 0.0 });
+                    limits.push(Constraint { normal: wide(&|k| of(order, k)), offset: order.constant, margin: 0.0 });
                 }
             }
         }
-        found.retain(|c| c.normal.iter().any(|v| *v != 0.0));
-        found
+        limits.retain(|c| c.normal.iter().any(|v| *v != 0.0));
+        limits
     }
 }
 

@@ -20,8 +20,8 @@ pub struct FitProgress<'a> {
 impl<'a> FitProgress<'a> {
     /// Progress 0, with a callback.
     #[must_use]
-    pub fn new(told: &'a ProgressListener<'a>) -> Self {
-        Self { told, reached: 0.0, said: None, begun: 0.0, last: 0.0 }
+    pub fn new(listener: &'a ProgressListener<'a>) -> Self {
+        Self { told: listener, reached: 0.0, said: None, begun: 0.0, last: 0.0 }
     }
 
     /// Advance to a share of the whole.
@@ -32,7 +32,7 @@ impl<'a> FitProgress<'a> {
     pub fn advance_to(&mut self, share: f64) -> Result<()> {
         self.reached = self.reached.max(share.min(1.0));
         let parts = (PROGRESS_PARTS as f64 * self.reached).round_ties_even() as usize;
-        if self.said.is_some_and(|said| parts <= said) {
+        if self.said.is_some_and(|reported| parts <= reported) {
             return Ok(());
         }
         self.said = Some(parts);
@@ -45,8 +45,8 @@ impl<'a> FitProgress<'a> {
     /// # Errors
     /// As [`FitProgress::advance_to`].
     #[allow(clippy::cast_precision_loss)]
-    pub fn advance_within(&mut self, share: f64, sweep: f64, done: usize, of: usize) -> Result<()> {
-        let fraction = done as f64 / of.max(1) as f64;
+    pub fn advance_within(&mut self, share: f64, sweep: f64, count: usize, of: usize) -> Result<()> {
+        let fraction = count as f64 / of.max(1) as f64;
         if fraction < self.last {
             self.begun = self.reached;
         }
@@ -63,16 +63,16 @@ mod tests {
     #[test]
     fn progress_is_monotone_and_sweeps_share_the_rest() {
         let heard = RefCell::new(Vec::new());
-        let told = |done: usize, of: usize| {
-            heard.borrow_mut().push((done, of));
+        let listener = |count: usize, of: usize| {
+            heard.borrow_mut().push((count, of));
             Ok(())
         };
-        let mut pace = FitProgress::new(&told);
-        for (done, of) in [(0, 4), (2, 4), (4, 4), (0, 2), (1, 2), (1, 2)] {
-            assert_eq!(pace.advance_within(0.5, 0.3, done, of), Ok(()));
+        let mut pace = FitProgress::new(&listener);
+        for (count, of) in [(0, 4), (2, 4), (4, 4), (0, 2), (1, 2), (1, 2)] {
+            assert_eq!(pace.advance_within(0.5, 0.3, count, of), Ok(()));
         }
         assert_eq!((pace.advance_to(0.5), pace.advance_to(0.2)), (Ok(()), Ok(())));
-        let parts: Vec<usize> = heard.borrow().iter().map(|(done, _)| *done).collect();
+        let parts: Vec<usize> = heard.borrow().iter().map(|(count, _)| *count).collect();
         assert_eq!(parts, [0, 75, 150, 202, 500]);
     }
 }

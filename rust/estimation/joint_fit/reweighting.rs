@@ -42,9 +42,10 @@ impl RobustSummary {
     pub fn from_result(grid: &Objective<'_>, attempt: &OptimizationResult) -> Self {
         let mut counted = Self { reduced_weight_count: 0, outliers: 0, samples: 0 };
         for (residuals, level) in grid.residuals_by_output(attempt).iter().zip(grid.residual_scales(attempt)) {
-            let beyond = |most: f64| residuals.iter().filter(|e| (*e / level.max(MIN_DEVIATION)).abs() > most).count();
-            counted.reduced_weight_count += beyond(HUBER_THRESHOLD);
-            counted.outliers += beyond(OUTLIER_DEVIATIONS);
+            let count_beyond =
+                |most: f64| residuals.iter().filter(|e| (*e / level.max(MIN_DEVIATION)).abs() > most).count();
+            counted.reduced_weight_count += count_beyond(HUBER_THRESHOLD);
+            counted.outliers += count_beyond(OUTLIER_DEVIATIONS);
             counted.samples += residuals.len();
         }
         counted
@@ -98,8 +99,8 @@ pub fn fit_reweighted<'a>(
         } else {
             grid.residual_root_mean_squares(&attempt)
         };
-        if let Some(beyond) = levels.iter().position(|level| !level.is_finite()) {
-            return Err(Error::Beyond { output: grid.problem.outputs[beyond].clone() });
+        if let Some(output) = levels.iter().position(|level| !level.is_finite()) {
+            return Err(Error::Beyond { output: grid.problem.outputs[output].clone() });
         }
         let still = levels.iter().all(|level| (level - 1.0).abs() < NOISE_LEVEL_TOLERANCE);
         let shares = (loss == Loss::Huber).then(|| huber_weights(&grid, &attempt, &levels));

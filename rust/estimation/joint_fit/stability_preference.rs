@@ -53,15 +53,18 @@ pub fn prefer_stable<'a>(
     if !is_unstable(free, &best) {
         return Ok((best, grid, None));
     }
-    let held = grid.with_stability_constraint();
-    let mut ends = StableSearch { free, grid: held.clone() }.stable_optima(&best, reached)?;
+    let constrained = grid.with_stability_constraint();
+    let mut ends = StableSearch { free, grid: constrained.clone() }.stable_optima(&best, reached)?;
     let unit = grid.time_scaling();
     for one in known_orders(free) {
         // A stable optimum with one order fixed is a candidate for the full equation.
-        let there = stable_with_fixed_order(&one, free, &held, |runner| one.restrict(runner, &unit), &best, reached)?;
-        if let Some(there) = there {
-            let there = one.embed(&there, free);
-            ends.extend(ignore_failure(StableSearch { free, grid: held.clone() }.minimize_stable(&there))?);
+        let stable_result =
+            stable_with_fixed_order(&one, free, &constrained, |runner| one.restrict(runner, &unit), &best, reached)?;
+        if let Some(stable_result) = stable_result {
+            let stable_result = one.embed(&stable_result, free);
+            ends.extend(ignore_failure(
+                StableSearch { free, grid: constrained.clone() }.minimize_stable(&stable_result),
+            )?);
         }
     }
     if ends.is_empty() {
@@ -75,7 +78,7 @@ pub fn prefer_stable<'a>(
             }),
         ));
     }
-    let other = StableSearch { free, grid: held.clone() }.select_optimum(&ends)?;
+    let other = StableSearch { free, grid: constrained.clone() }.select_optimum(&ends)?;
     let excess = if best.cost_per_residual() > 0.0 {
         (other.cost_per_residual() / best.cost_per_residual()).sqrt() - 1.0
     } else {
@@ -91,7 +94,7 @@ pub fn prefer_stable<'a>(
     let at_limit = !other.result.has_converged();
     Ok((
         other,
-        held,
+        constrained,
         Some(StabilityComparison { keeps_unstable: false, residual_excess: excess, at_stability_limit: at_limit }),
     ))
 }
@@ -100,13 +103,13 @@ pub fn prefer_stable<'a>(
 fn stable_with_fixed_order(
     one: &FixedOrderProblem,
     free: &ParameterSet,
-    held: &Objective<'_>,
+    constrained: &Objective<'_>,
     without: impl Fn(&Candidate) -> Candidate,
     best: &Candidate,
     reached: &[Candidate],
 ) -> Result<Option<Candidate>> {
     debug_assert!(one.order < free.orders.len());
-    let narrow = StableSearch { free: &one.free, grid: held.with_problem(&one.free.problem) };
+    let narrow = StableSearch { free: &one.free, grid: constrained.with_problem(&one.free.problem) };
     let inside = narrow.stable_optima(&without(best), &reached.iter().map(without).collect::<Vec<_>>())?;
     if inside.is_empty() {
         return Ok(None);
@@ -115,10 +118,10 @@ fn stable_with_fixed_order(
 }
 
 /// Convert any error except [`Error::Interrupted`] to None.
-fn ignore_failure<T>(found: Result<T>) -> Result<Option<T>> {
-    match found {
+fn ignore_failure<T>(outcome: Result<T>) -> Result<Option<T>> {
+    match outcome {
         Err(Error::Interrupted) => Err(Error::Interrupted),
-        found => Ok(found.ok()),
+        outcome => Ok(outcome.ok()),
     }
 }
 
@@ -194,10 +197,10 @@ struct StableSearch<'f, 'g> {
 }
 
 impl StableSearch<'_, '_> {
-    fn minimize(&self, start: &Candidate, held: &[usize]) -> Result<Candidate> {
+    fn minimize(&self, start: &Candidate, fixed: &[usize]) -> Result<Candidate> {
         let place = &start.result.iterate;
         Ok(start.with_result(self.grid.minimize_in(
-            &self.free.problem_at(place, true, held),
+            &self.free.problem_at(place, true, fixed),
             place,
             EVALUATIONS_PER_CANDIDATE,
         )?))
@@ -235,8 +238,8 @@ impl StableSearch<'_, '_> {
         let status = end.result.status;
         let mut best = end.clone();
         for k in autoregressive_indices(self.free) {
-            let there = ignore_failure(self.minimize(&end, &[self.free.orders.len() + k]))?;
-            best = there.filter(|there| there.cost_per_residual() < best.cost_per_residual()).unwrap_or(best);
+            let optimum = ignore_failure(self.minimize(&end, &[self.free.orders.len() + k]))?;
+            best = optimum.filter(|optimum| optimum.cost_per_residual() < best.cost_per_residual()).unwrap_or(best);
         }
         // With a fixed coefficient it converged in fewer parameters than the fit has.
         best.result.status = status;

@@ -81,7 +81,7 @@ pub fn refine_step<'a>(
         let (finer, fine) = match fit_reweighted(&start, half.clone(), loss) {
             // The extrapolated start may have no finite simulation.
             Err(error) if error != Error::Interrupted => fit_reweighted(&best.iterate, half, loss)?,
-            found => found?,
+            fit => fit?,
         };
         let rose =
             negative_log_likelihood(&finer, &fine) > negative_log_likelihood(&best, &grid) + MAX_LOG_RESIDUAL_INCREASE;
@@ -90,27 +90,27 @@ pub fn refine_step<'a>(
             let freed = best_alternative(&finer, &fine, others, loss)?;
             // The other survivors are tried once.
             others = &[];
-            if let Some((other, there)) = freed {
+            if let Some((other, freed_grid)) = freed {
                 // The two grids have different optima, so they cannot be extrapolated.
                 (before, spread) = (None, None);
                 estimate = other.values();
-                (best, grid) = (other, there);
+                (best, grid) = (other, freed_grid);
                 continue;
             }
         }
         std::mem::swap(&mut grid, &mut fine);
-        let (there, here) = (finer.values(), best.values());
-        let found = covariance(&finer, &grid)?;
+        let (freed_grid, own_values) = (finer.values(), best.values());
+        let fit = covariance(&finer, &grid)?;
         // The scheme is of second order: Richardson extrapolation of two grids gives the limit, a third grid confirms
         // it. Optimizations that did not converge cannot be extrapolated.
-        let mut limit = there.clone();
+        let mut limit = freed_grid.clone();
         if finer.has_converged() && best.has_converged() {
-            limit = extrapolate(&grid, &clock, &there, &here, 3.0)?;
+            limit = extrapolate(&grid, &clock, &freed_grid, &own_values, 3.0)?;
         }
-        still = is_within_errors(&clock, &limit, &estimate, (&there, &found))
-            || is_within_errors(&clock, &there, &here, (&there, &found));
+        still = is_within_errors(&clock, &limit, &estimate, (&freed_grid, &fit))
+            || is_within_errors(&clock, &freed_grid, &own_values, (&freed_grid, &fit));
         estimate = limit;
-        (before, best, spread) = (Some(best), finer, Some(found));
+        (before, best, spread) = (Some(best), finer, Some(fit));
     }
     let spread = spread.map_or_else(|| covariance(&best, &grid), Ok)?;
     let estimate = select_limit_or_optimum(&best, &grid, estimate, &clock, still)?;
@@ -131,15 +131,15 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
         return Ok(None);
     }
     let clock = grid.time_scaling();
-    let (mut place, mut here, mut coarse) = (best.clone(), grid.clone(), grid.clone());
+    let (mut place, mut own_grid, mut coarse) = (best.clone(), grid.clone(), grid.clone());
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         let fine = coarse.finer()?;
         for correction in 0..MAX_CORRECTIONS {
             let Some(shifts) = limit_shifts(&place.iterate, grid, &coarse, &fine)? else { return Ok(None) };
-            let corrected = grid.with_weights(here.weights.clone())?.with_residual_shifts(&shifts);
+            let corrected = grid.with_weights(own_grid.weights.clone())?.with_residual_shifts(&shifts);
             let (next, next_grid) = match fit_reweighted(&place.iterate, corrected, loss) {
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
-                Ok(found) if found.0.has_converged() => found,
+                Ok(fit) if fit.0.has_converged() => fit,
                 _ => return Ok(None),
             };
             let spread = covariance(&next, &next_grid)?;
@@ -151,7 +151,7 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
                 let grid = next_grid;
                 return Ok(Some(Optimum { attempt, grid, estimate, step_converged: true, covariance: spread }));
             }
-            (place, here) = (next, next_grid);
+            (place, own_grid) = (next, next_grid);
             if is_still {
                 break;
             }
@@ -173,8 +173,8 @@ fn limit_shifts(
     let (mut power, mut noise) = (0.0, 0.0);
     // The scheme is of second order.
     for (objective, share) in [(fine, 4.0 / 3.0), (coarse, -1.0 / 3.0), (grid, -1.0)] {
-        let Some(found) = objective.evaluate(place)? else { return Ok(None) };
-        let residuals = objective.residuals(&found);
+        let Some(evaluation) = objective.evaluate(place)? else { return Ok(None) };
+        let residuals = objective.residuals(&evaluation);
         if shifts.is_empty() {
             shifts = residuals.iter().map(|run| run.iter().map(|e| vec![0.0; e.len()]).collect()).collect();
         }
@@ -250,8 +250,8 @@ fn extrapolate(
     share: f64,
 ) -> Result<Vec<f64>> {
     let (fine, coarse) = (clock.to_scaled(fine), clock.to_scaled(coarse));
-    let ahead: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
-    Ok(clock.to_unscaled(&grid.problem.last_feasible_point(&fine, &ahead)?))
+    let target: Vec<f64> = fine.iter().zip(&coarse).map(|(f, c)| f + (f - c) / share).collect();
+    Ok(clock.to_unscaled(&grid.problem.last_feasible_point(&fine, &target)?))
 }
 
 /// Start on half the step: the optimum is expected to move a quarter as far as at the last halving.
@@ -283,14 +283,14 @@ pub fn best_alternative<'a>(
 ) -> Result<Option<(OptimizationResult, Objective<'a>)>> {
     let (mut best, mut least) = (None, negative_log_likelihood(stuck, grid));
     for other in others {
-        let there = match fit_reweighted(other, grid.clone(), loss) {
+        let outcome = match fit_reweighted(other, grid.clone(), loss) {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Err(_) => continue,
-            Ok(there) => there,
+            Ok(outcome) => outcome,
         };
-        let level = negative_log_likelihood(&there.0, &there.1);
-        if level < least && !(grid.requires_stability && grid.problem.is_unstable(&there.0.iterate.point)) {
-            (best, least) = (Some(there), level);
+        let level = negative_log_likelihood(&outcome.0, &outcome.1);
+        if level < least && !(grid.requires_stability && grid.problem.is_unstable(&outcome.0.iterate.point)) {
+            (best, least) = (Some(outcome), level);
         }
     }
     Ok(best)
@@ -316,10 +316,11 @@ fn select_limit_or_optimum(
     clock: &TimeScaling,
     settled: bool,
 ) -> Result<Vec<f64>> {
-    let here = best.values();
-    let moved: Vec<f64> = clock.to_scaled(&limit).iter().zip(clock.to_scaled(&here)).map(|(a, b)| a - b).collect();
+    let own_values = best.values();
+    let shift: Vec<f64> =
+        clock.to_scaled(&limit).iter().zip(clock.to_scaled(&own_values)).map(|(a, b)| a - b).collect();
     let mut way = vec![0.0; best.residuals.len()];
-    for (by, column) in clock.step(&here, &moved).iter().zip(&best.jacobian) {
+    for (by, column) in clock.step(&own_values, &shift).iter().zip(&best.jacobian) {
         way.iter_mut().zip(column).for_each(|(sum, slope)| *sum += by * slope);
     }
     let length = |row: &[f64]| inner(row, row).sqrt();
@@ -327,10 +328,10 @@ fn select_limit_or_optimum(
         // Both have the same residuals.
         return Ok(limit);
     }
-    let ahead = best.iterate_at(&limit);
-    if settled && let Some(there) = grid.evaluate(&ahead)? {
-        let told = best.residuals.iter().zip(&way).map(|(e, w)| e + w);
-        let bent: Vec<f64> = there.residuals.iter().zip(told).map(|(e, told)| e - told).collect();
+    let limit_iterate = best.iterate_at(&limit);
+    if settled && let Some(evaluation) = grid.evaluate(&limit_iterate)? {
+        let predicted = best.residuals.iter().zip(&way).map(|(e, w)| e + w);
+        let bent: Vec<f64> = evaluation.residuals.iter().zip(predicted).map(|(e, predicted)| e - predicted).collect();
         if length(&bent) <= MAX_CHANGE_STANDARD_ERRORS * length(&way) {
             return Ok(limit);
         }
@@ -342,10 +343,10 @@ fn select_limit_or_optimum(
         Err(_) => return Ok(limit),
     };
     let mut costs = [f64::INFINITY; 2];
-    for (cost, place) in costs.iter_mut().zip([&ahead, &best.iterate]) {
-        if let Some(there) = finer.evaluate(place)? {
-            *cost = there.cost;
+    for (cost, place) in costs.iter_mut().zip([&limit_iterate, &best.iterate]) {
+        if let Some(evaluation) = finer.evaluate(place)? {
+            *cost = evaluation.cost;
         }
     }
-    Ok(if costs[0] <= costs[1] { limit } else { here })
+    Ok(if costs[0] <= costs[1] { limit } else { own_values })
 }

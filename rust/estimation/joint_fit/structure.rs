@@ -344,8 +344,8 @@ impl ParametricStructure {
 
 /// Each name once, in order of appearance.
 pub(super) fn unique<'a>(names: impl Iterator<Item = &'a String>) -> Vec<String> {
-    let mut seen = BTreeSet::new();
-    names.filter(|name| seen.insert(*name)).cloned().collect()
+    let mut names_so_far = BTreeSet::new();
+    names.filter(|name| names_so_far.insert(*name)).cloned().collect()
 }
 
 /// Order of a derivative: a number, or an affine function of free orders.
@@ -401,8 +401,8 @@ impl Order {
     /// Substitute values for some free orders.
     #[must_use]
     pub fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
-        let known = self.weights.iter().filter_map(|(name, weight)| values.get(name).map(|value| weight * value));
-        let constant = tidy(self.constant + known.sum::<f64>());
+        let weighted = self.weights.iter().filter_map(|(name, weight)| values.get(name).map(|value| weight * value));
+        let constant = tidy(self.constant + weighted.sum::<f64>());
         let weights = self.weights.iter().filter(|(name, _)| !values.contains_key(name)).cloned().collect();
         Self { constant, weights }
     }

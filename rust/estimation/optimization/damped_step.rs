@@ -106,7 +106,7 @@ impl LinearizedProblem {
         for (k, multiplier) in self.active_constraints() {
             gradient.iter_mut().zip(&self.constraints[k].0).for_each(|(g, n)| *g += multiplier * n);
         }
-        gradient.iter().zip(&self.is_fixed).filter(|(_, held)| !**held).fold(0.0, |a, (g, _)| a.max(g.abs()))
+        gradient.iter().zip(&self.is_fixed).filter(|(_, is_fixed)| !**is_fixed).fold(0.0, |a, (g, _)| a.max(g.abs()))
     }
 
     /// True if a linear inequality constrains the steps.
@@ -129,8 +129,8 @@ impl LinearizedProblem {
     /// the cost.
     pub(crate) fn damped_step_and_decrease(&self, damping: f64) -> (Vec<f64>, f64) {
         let step = self
-            .step_within_bounds(|held| {
-                Some(triangular_damped_step(&self.r, held, self.eliminated_count, damping, &self.constraints))
+            .step_within_bounds(|is_fixed| {
+                Some(triangular_damped_step(&self.r, is_fixed, self.eliminated_count, damping, &self.constraints))
             })
             .unwrap_or_default();
         let falls = self.predicted_decrease(&step, 0);
@@ -139,7 +139,7 @@ impl LinearizedProblem {
 
     /// Step with secant curvature over the parameters that are not eliminated; None if the model has no minimum.
     pub(crate) fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
-        let step = self.step_within_bounds(|held| self.minimize_with_curvature(held, damping, curvature))?;
+        let step = self.step_within_bounds(|is_fixed| self.minimize_with_curvature(is_fixed, damping, curvature))?;
         let falls = self.predicted_decrease(&step, self.eliminated_count) - self.curvature_change(&step, curvature);
         Some((step, falls))
     }
@@ -151,15 +151,15 @@ impl LinearizedProblem {
 
     /// Step of the free parameters within bounds, by an active-set iteration.
     fn step_within_bounds(&self, step_of: impl Fn(&[bool]) -> Option<Vec<f64>>) -> Option<Vec<f64>> {
-        let mut held = self.is_fixed.clone();
+        let mut is_fixed = self.is_fixed.clone();
         let mut step = loop {
-            let step = step_of(&held)?;
+            let step = step_of(&is_fixed)?;
             let out = (0..step.len()).find(|&i| {
                 let (down, up) = self.distance_to_bounds[i];
-                !held[i] && ((step[i] < 0.0 && down <= 0.0) || (step[i] > 0.0 && up <= 0.0))
+                !is_fixed[i] && ((step[i] < 0.0 && down <= 0.0) || (step[i] > 0.0 && up <= 0.0))
             });
             match out {
-                Some(i) => held[i] = true,
+                Some(i) => is_fixed[i] = true,
                 None => break step,
             }
         };
@@ -173,10 +173,10 @@ impl LinearizedProblem {
     pub(crate) fn predicted_decrease(&self, step: &[f64], first: usize) -> f64 {
         let k = step.len();
         let image = |i: usize| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>();
-        let (moved, along) = (first..k)
+        let (quadratic, along) = (first..k)
             .map(|i| (image(i), self.r[i * (k + 1) + k]))
             .fold((0.0, 0.0), |(a, b), (v, e)| (a + v * v, b + v * e));
-        (-2.0 * along - moved) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
+        (-2.0 * along - quadratic) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
     /// Product JᵀJ s in coordinates, by parameter, with the eliminated parameters projected out.
@@ -210,9 +210,9 @@ impl LinearizedProblem {
     }
 
     /// Minimize the quadratic model with secant curvature and damping; None if it is not positive definite.
-    fn minimize_with_curvature(&self, held: &[bool], damping: f64, curvature: &Curvature) -> Option<Vec<f64>> {
-        let k = held.len();
-        let free: Vec<usize> = (self.eliminated_count..k).filter(|&i| !held[i]).collect();
+    fn minimize_with_curvature(&self, is_fixed: &[bool], damping: f64, curvature: &Curvature) -> Option<Vec<f64>> {
+        let k = is_fixed.len();
+        let free: Vec<usize> = (self.eliminated_count..k).filter(|&i| !is_fixed[i]).collect();
         let count = free.len();
         let product = |i: usize, j: usize| {
             let last = i.min(j);
@@ -249,12 +249,12 @@ impl LinearizedProblem {
 /// Eliminated parameters have the smallest damping. Constraints hold normal · s ≤ room.
 fn triangular_damped_step(
     r: &[f64],
-    held: &[bool],
+    is_fixed: &[bool],
     projected: usize,
     damping: f64,
     constraints: &[(Vec<f64>, f64)],
 ) -> Vec<f64> {
-    let (k, free) = (held.len(), (0..held.len()).filter(|&j| !held[j]).collect::<Vec<_>>());
+    let (k, free) = (is_fixed.len(), (0..is_fixed.len()).filter(|&j| !is_fixed[j]).collect::<Vec<_>>());
     if free.is_empty() {
         return vec![0.0; k];
     }
@@ -317,8 +317,8 @@ fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(V
     for (column, weight) in columns.iter().zip(&weights) {
         rest.iter_mut().zip(column).for_each(|(v, c)| *v += weight * c);
     }
-    let moved: Vec<f64> = rhs.iter().zip(&rest).map(|(b, v)| b - size * v / rest[k]).collect();
-    back_substitute(r, stride, &moved)
+    let shifted: Vec<f64> = rhs.iter().zip(&rest).map(|(b, v)| b - size * v / rest[k]).collect();
+    back_substitute(r, stride, &shifted)
 }
 
 /// Nonlinear least-squares problem.
@@ -456,7 +456,7 @@ impl Curvature {
     /// Update the matrix by a step: `change` of the gradient, and `columns`, the part of it due to JᵀJ.
     pub(crate) fn update(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
-        let wanted: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
+        let target: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
         let scale = dot(change, step);
         let size = dot(step, step).sqrt() * dot(change, change).sqrt();
         if !(scale.is_finite() && scale.abs() > 1e-6 * size && size > 0.0) {
@@ -464,9 +464,9 @@ impl Curvature {
         }
         // Sizing: earlier updates must not exceed the curvature observed along this step.
         let before = self.quadratic_form(step);
-        let sizing = if before == 0.0 { 1.0 } else { (dot(step, &wanted) / before).abs().min(1.0) };
+        let sizing = if before == 0.0 { 1.0 } else { (dot(step, &target) / before).abs().min(1.0) };
         self.matrix.iter_mut().for_each(|v| *v *= sizing);
-        let missing: Vec<f64> = wanted.iter().zip(self.times(step)).map(|(w, s)| w - s).collect();
+        let missing: Vec<f64> = target.iter().zip(self.times(step)).map(|(w, s)| w - s).collect();
         let twice = dot(&missing, step) / (scale * scale);
         for i in 0..self.count {
             for j in 0..self.count {

@@ -146,11 +146,11 @@ pub fn minimize<P: LeastSquaresProblem>(
         if let Some(status) = ended {
             return Ok(at.into_minimum(search.evaluations, status));
         }
-        let left = if problem.allows_extrapolation() { settings.evaluations - search.evaluations } else { 0 };
-        if let Some(leap) = valley.propose_step(left) {
-            if let Some(there) = search.evaluate_extrapolation(&at, &leap)? {
+        let remaining = if problem.allows_extrapolation() { settings.evaluations - search.evaluations } else { 0 };
+        if let Some(leap) = valley.propose_step(remaining) {
+            if let Some(iterate) = search.evaluate_extrapolation(&at, &leap)? {
                 let from = at.cost;
-                valley.begin_trial(std::mem::replace(&mut at, there), from, search.evaluations);
+                valley.begin_trial(std::mem::replace(&mut at, iterate), from, search.evaluations);
                 search.reset_progress();
             } else {
                 valley.reject_trial();
@@ -226,12 +226,12 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
     fn evaluate_extrapolation(&mut self, from: &SearchState<P>, leap: &[f64]) -> Result<Option<SearchState<P>>> {
         let next = self.problem.apply_step(&from.point, leap).0;
         self.evaluations += 1;
-        let made = self.start(next).and_then(|mut there| {
-            there.jacobian = self.checked_jacobian(&there.point, &there.evaluation)?;
-            Ok(there)
+        let outcome = self.start(next).and_then(|mut iterate| {
+            iterate.jacobian = self.checked_jacobian(&iterate.point, &iterate.evaluation)?;
+            Ok(iterate)
         });
-        match made {
-            Ok(there) if there.cost.is_finite() && (there.trusted || !from.trusted) => Ok(Some(there)),
+        match outcome {
+            Ok(iterate) if iterate.cost.is_finite() && (iterate.trusted || !from.trusted) => Ok(Some(iterate)),
             Ok(_) => Ok(None),
             Err(error) if error.ends_simulation() => Ok(None),
             Err(error) => Err(error),
@@ -255,10 +255,10 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
                 self.corners,
             );
             if at.curvature.is_for(at.jacobian.len()) {
-                if let Some((taken, gradient)) = at.before.take() {
+                if let Some((step, gradient)) = at.before.take() {
                     let now = linear.gradient_by_parameter();
                     let change: Vec<f64> = now.iter().zip(&gradient).map(|(a, b)| a - b).collect();
-                    at.curvature.update(&taken, &change, &linear.columns_along(&taken));
+                    at.curvature.update(&step, &change, &linear.columns_along(&step));
                 }
             } else {
                 at.curvature = Curvature::new(at.jacobian.len());
@@ -300,8 +300,8 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             let first = if curved.is_some() { linear.eliminated_count } else { 0 };
             let (step, falls) = curved.unwrap_or_else(|| linear.damped_step_and_decrease(at.damping));
             let steps = linear.to_coordinates(&step);
-            let (next, moved) = problem.apply_step(&at.point, &steps);
-            if moved <= settings.tolerance || at.damping > MAX_DAMPING {
+            let (next, change) = problem.apply_step(&at.point, &steps);
+            if change <= settings.tolerance || at.damping > MAX_DAMPING {
                 // No step decreases the cost: converged, at rounding level, at the domain limit or at a kink.
                 return Ok(if level || slope <= RELATIVE_ROUNDING_ERROR * problem.signal_norm(&at.evaluation) {
                     Some(Advance::Ended(Status::Converged))
@@ -319,26 +319,26 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             self.evaluations += 1;
             let trusts = problem.is_admissible(&next);
             // A step that does not decrease the cost or overflows is shortened.
-            let tried = problem.evaluate(&next).and_then(|found| {
-                let reached = cost(problem.residuals(&found));
+            let trial = problem.evaluate(&next).and_then(|trial_evaluation| {
+                let reached = cost(problem.residuals(&trial_evaluation));
                 if !reached.is_finite() || (at.trusted && !trusts) {
                     return Err(Error::Diverged { what: "step".into(), index: 0 });
                 }
                 if reached >= at.cost {
                     return Ok(None);
                 }
-                let settled = problem.point_of_evaluation(&found, next.clone());
-                Ok(Some((self.checked_jacobian(&settled, &found)?, found, reached, settled)))
+                let settled = problem.point_of_evaluation(&trial_evaluation, next.clone());
+                Ok(Some((self.checked_jacobian(&settled, &trial_evaluation)?, trial_evaluation, reached, settled)))
             });
-            match tried {
-                Ok(Some((slopes, found, reached, next))) => {
+            match trial {
+                Ok(Some((slopes, trial_evaluation, reached, next))) => {
                     self.gain = (at.cost - reached) / at.cost.max(f64::MIN_POSITIVE);
                     (at.point, at.evaluation, at.cost, at.jacobian, at.trusted) =
-                        (next, found, reached, slopes, trusts);
-                    let told = linear.predicted_decrease(&step, first);
+                        (next, trial_evaluation, reached, slopes, trusts);
+                    let predicted = linear.predicted_decrease(&step, first);
                     if !linear.is_constrained() {
-                        let with = told - linear.curvature_change(&step, &at.curvature);
-                        at.curvature.select_model(told, with, self.gain);
+                        let with = predicted - linear.curvature_change(&step, &at.curvature);
+                        at.curvature.select_model(predicted, with, self.gain);
                     }
                     at.before = Some((steps.clone(), linear.gradient_by_parameter()));
                     if self.gain >= ACCEPTABLE_GAIN_RATIO * falls {

@@ -43,31 +43,31 @@ impl<P> Evaluation<P> {
     ) -> Result<()> {
         if !linear.is_empty() {
             let mut sides: Vec<LinearSide<'_>> = Vec::with_capacity(residuals.len());
-            for (left, part) in residuals.iter().zip(&self.parts) {
+            for (residual, part) in residuals.iter().zip(&self.parts) {
                 let (basis, effects) = of(part);
-                sides.push((left, basis, effects.iter().map(Vec::as_slice).collect()));
+                sides.push((residual, basis, effects.iter().map(Vec::as_slice).collect()));
             }
             let moves = solve_linear_steps(&sides)?;
             linear.iter().zip(&moves).for_each(|(&j, by)| self.point.coefficients[j] += by);
-            for (left, part) in residuals.iter_mut().zip(&self.parts) {
+            for (residual, part) in residuals.iter_mut().zip(&self.parts) {
                 for (effect, by) in of(part).1.iter().zip(&moves) {
-                    left.iter_mut().zip(effect).for_each(|(e, v)| *e -= by * v);
+                    residual.iter_mut().zip(effect).for_each(|(e, v)| *e -= by * v);
                 }
             }
         }
-        for (mut left, columns) in residuals.into_iter().zip(columns) {
+        for (mut residual, columns) in residuals.into_iter().zip(columns) {
             let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
             if !columns.is_empty() {
                 let (places, columns): (Vec<_>, Vec<_>) = columns.into_iter().unzip();
-                let (values, _) = least_squares::solve(&columns, &left, 0)?;
+                let (values, _) = least_squares::solve(&columns, &residual, 0)?;
                 for ((place, column), x) in places.iter().zip(&columns).zip(&values) {
                     if let Some(i) = place {
                         initial[*i].push(*x);
                     }
-                    left.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
+                    residual.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
                 }
             }
-            self.residuals.extend(left);
+            self.residuals.extend(residual);
             self.initial.push(initial);
         }
         Ok(())

@@ -81,7 +81,7 @@ impl EvaluationCache {
         let mut places: Vec<(usize, Rc<RefCell<GridCache>>)> = Vec::with_capacity(experiments.len());
         for k in longest {
             let grid = match grids.iter().find(|grid| grid.borrow().accepts(&experiments[k])) {
-                Some(known) => known.clone(),
+                Some(cached) => cached.clone(),
                 None => {
                     let record = &experiments[k].record;
                     let bare = Record::from_rows(
@@ -137,33 +137,33 @@ impl EvaluationCache {
     /// Operator of a term of integration order `eta`.
     pub(crate) fn operator(&self, place: (usize, usize), eta: f64, free: bool) -> Rc<Operator> {
         let mut grid = self.grid.borrow_mut();
-        if let Some(known) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
-            return known.clone();
+        if let Some(cached) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
+            return cached.clone();
         }
         let (m, step) = (grid.bare.m(), grid.bare.step());
         // Terms of the same order share an operator.
         let alike = grid.operators.values().find(|o| o.matches_order(eta, free)).cloned();
-        let made = alike.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
-        grid.operators.insert(place, made.clone());
-        made
+        let new_operator = alike.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
+        grid.operators.insert(place, new_operator.clone());
+        new_operator
     }
 
-    /// Inverse of the equations with these bits of autoregressive terms, computed by `made` if not cached.
+    /// Inverse of the equations with these bits of autoregressive terms, computed by `compute` if not cached.
     ///
     /// # Errors
-    /// Those of `made`.
+    /// Those of `compute`.
     pub(crate) fn system_inverse(
         &self,
         bits: Vec<u64>,
-        made: impl FnOnce() -> Result<SystemInverse>,
+        compute: impl FnOnce() -> Result<SystemInverse>,
     ) -> Result<Rc<SystemInverse>> {
-        let known = self.grid.borrow().solved.as_ref().filter(|(known, _)| *known == bits).map(|(_, s)| s.clone());
-        match known {
+        let cached = self.grid.borrow().solved.as_ref().filter(|(cached, _)| *cached == bits).map(|(_, s)| s.clone());
+        match cached {
             Some(solved) => Ok(solved),
             None => {
                 // Free the memory of the old inverse before computing the new one.
                 self.grid.borrow_mut().solved = None;
-                let solved = Rc::new(made()?);
+                let solved = Rc::new(compute()?);
                 if self.is_shared() {
                     self.grid.borrow_mut().solved = Some((bits, solved.clone()));
                 }
@@ -189,8 +189,8 @@ impl EvaluationCache {
             return self.spectrum(series);
         }
         let total = self.total;
-        let made = || Rc::new(Kernel::with_length(series, total));
-        self.input_spectra.entry((signal, eta < 0.0)).or_insert_with(made).clone()
+        let spectrum = || Rc::new(Kernel::with_length(series, total));
+        self.input_spectra.entry((signal, eta < 0.0)).or_insert_with(spectrum).clone()
     }
 
     /// Spectrum of a series, for products of [`SPECTRUM_FACTORS`] series.
@@ -207,12 +207,12 @@ impl EvaluationCache {
         {
             grid.powers.clear();
         }
-        if let Some(known) = grid.powers.get(&exponent.to_bits()) {
-            return known.clone();
+        if let Some(cached) = grid.powers.get(&exponent.to_bits()) {
+            return cached.clone();
         }
-        let made = Rc::new(InitialTerm::new(exponent, grid.bare.m(), grid.bare.step(), grid.filter.clone()));
-        grid.powers.insert(exponent.to_bits(), made.clone());
-        made
+        let term = Rc::new(InitialTerm::new(exponent, grid.bare.m(), grid.bare.step(), grid.filter.clone()));
+        grid.powers.insert(exponent.to_bits(), term.clone());
+        term
     }
 
     /// Filter a series that is no signal of the record.
@@ -227,11 +227,11 @@ impl EvaluationCache {
 
     /// Samples of the response of the sensor filter of an output to an impulse or its derivative, weighted.
     pub(crate) fn impulse_samples(&mut self, experiment: &Experiment, output: usize, exponent: f64) -> Vec<f64> {
-        let made = || {
+        let samples = || {
             let mut means = vec![vec![0.0; experiment.record.m()]; experiment.samples.len()];
             means[output] = experiment.record.initial_term(exponent);
             experiment.weighted_samples(&means)
         };
-        self.impulses.entry((output, exponent.to_bits())).or_insert_with(made).clone()
+        self.impulses.entry((output, exponent.to_bits())).or_insert_with(samples).clone()
     }
 }

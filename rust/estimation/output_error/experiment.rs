@@ -274,7 +274,7 @@ impl Experiment {
                 .compared_values(values)
                 .iter()
                 .zip(self.samples_of_pulses(self.record.signal(signal)))
-                .map(|(v, told)| v - told)
+                .map(|(v, point)| v - point)
                 .collect(),
             None => vec![0.0; self.compared_count()],
         }

@@ -224,27 +224,27 @@ fn step_within_bounds(
     deltas: &[f64],
 ) -> (ParameterPoint, f64) {
     let mut next = point.clone();
-    let mut moved: f64 = 0.0;
+    let mut change: f64 = 0.0;
     let (orders, rest) = deltas.split_at(point.orders.len());
     let (coefficients, inputs) = rest.split_at(point.coefficients.len());
     for ((order, &(low, high)), delta) in next.orders.iter_mut().zip(&model.order_bounds).zip(orders) {
         let before = *order;
         *order = (before + delta).clamp(low, high);
-        moved = moved.max((*order - before).abs());
+        change = change.max((*order - before).abs());
     }
     for (j, (&coordinate, &delta)) in model.coordinates.iter().zip(coefficients).enumerate() {
         let before = clock.factor(j, &point.orders) * point.coefficients[j];
         let value = coordinate.shift(before, delta);
         next.coefficients[j] = value / clock.factor(j, &next.orders);
-        moved = moved.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
+        change = change.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
     }
     for ((value, FreeInput { bounds: (low, high), .. }), delta) in next.inputs.iter_mut().zip(&model.inputs).zip(inputs)
     {
         let before = *value;
         *value = (before + delta).clamp(*low, *high);
-        moved = moved.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+        change = change.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
     }
-    (next, moved)
+    (next, change)
 }
 
 /// Fit a model to experiments by output error from an initial guess, by Levenberg–Marquardt.
@@ -366,16 +366,16 @@ pub fn fit_until(
         caches: shelves,
         stop,
     };
-    let found = minimize(&problem, point, settings)?;
+    let optimum = minimize(&problem, point, settings)?;
     Ok(OutputErrorFit {
-        point: found.point,
-        cost: found.cost,
-        residuals: found.evaluation.residuals().to_vec(),
-        jacobian: found.jacobian,
-        initial: found.evaluation.initial_terms().0.to_vec(),
-        exponents: found.evaluation.initial_terms().1.to_vec(),
-        evaluations: found.evaluations,
-        status: found.status,
+        point: optimum.point,
+        cost: optimum.cost,
+        residuals: optimum.evaluation.residuals().to_vec(),
+        jacobian: optimum.jacobian,
+        initial: optimum.evaluation.initial_terms().0.to_vec(),
+        exponents: optimum.evaluation.initial_terms().1.to_vec(),
+        evaluations: optimum.evaluations,
+        status: optimum.status,
     })
 }
 

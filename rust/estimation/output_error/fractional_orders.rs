@@ -68,7 +68,7 @@ struct Column {
 impl Terms {
     fn of(model: &FreeModel, i: usize, point: &ParameterPoint) -> Result<Self> {
         let structure = &model.structures(&point.orders)[i];
-        let mut found = Self { etas: Vec::new(), places: Vec::new(), coefficients: Vec::new(), inputs: Vec::new() };
+        let mut terms = Self { etas: Vec::new(), places: Vec::new(), coefficients: Vec::new(), inputs: Vec::new() };
         for (k, term) in structure.terms.iter().enumerate() {
             let eta = structure.order - term.order;
             let own = model.output_index(i, term.signal).is_some();
@@ -76,23 +76,23 @@ impl Terms {
                 // This is reported as divergence, so that the optimization shortens its step.
                 return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
             }
-            let known = found.etas.iter().position(|e| e.to_bits() == eta.to_bits());
-            found.places.push(known.unwrap_or(found.etas.len()));
-            if known.is_none() {
-                found.etas.push(eta);
+            let position = terms.etas.iter().position(|e| e.to_bits() == eta.to_bits());
+            terms.places.push(position.unwrap_or(terms.etas.len()));
+            if position.is_none() {
+                terms.etas.push(eta);
             }
-            found.coefficients.push(model.equations[i].terms[k].2.at(&point.coefficients));
-            found.inputs.push((!own).then_some(term.signal));
+            terms.coefficients.push(model.equations[i].terms[k].2.at(&point.coefficients));
+            terms.inputs.push((!own).then_some(term.signal));
         }
-        Ok(found)
+        Ok(terms)
     }
 
     /// Distinct inputs.
     fn signals(&self) -> Vec<usize> {
-        let mut found: Vec<usize> = self.inputs.iter().flatten().copied().collect();
-        found.sort_unstable();
-        found.dedup();
-        found
+        let mut signal_indices: Vec<usize> = self.inputs.iter().flatten().copied().collect();
+        signal_indices.sort_unstable();
+        signal_indices.dedup();
+        signal_indices
     }
 
     /// Σ weight s^−η over the terms of an input, or over those of the output itself.
@@ -146,7 +146,7 @@ impl FractionalOrders {
     /// True if a model has exact samples on every experiment: stable equations without coupling, inputs that are held
     /// and have no free parameter, and uniform samples without a sensor filter.
     pub(crate) fn accepts(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> bool {
-        let held = |experiment: &Experiment| {
+        let is_suitable = |experiment: &Experiment| {
             experiment.record.m() >= MIN_EXACT_PULSES
                 && experiment.nonuniform.is_none()
                 && experiment.filter.is_none()
@@ -162,7 +162,7 @@ impl FractionalOrders {
         };
         (!model.coupled || model.equations.len() == 1)
             && model.inputs.is_empty()
-            && experiments.iter().all(held)
+            && experiments.iter().all(is_suitable)
             && !model.is_unstable(point)
     }
 
@@ -171,12 +171,12 @@ impl FractionalOrders {
         if !Self::accepts(model, experiments, point) {
             return None;
         }
-        let mut known: HashMap<(usize, u64), Rc<StarredTransform>> = HashMap::new();
+        let mut transforms: HashMap<(usize, u64), Rc<StarredTransform>> = HashMap::new();
         let run = |experiment: &Experiment| {
             let record = &experiment.record;
             let (m, step) = (record.m(), record.step());
-            let made = || Rc::new(StarredTransform::new(m, step));
-            let transform = known.entry((m, step.to_bits())).or_insert_with(made).clone();
+            let make_transform = || Rc::new(StarredTransform::new(m, step));
+            let transform = transforms.entry((m, step.to_bits())).or_insert_with(make_transform).clone();
             let terms = model.equations.iter().enumerate().flat_map(|(i, e)| e.terms.iter().map(move |t| (i, t.0)));
             let inputs = terms.filter(|&(i, signal)| model.output_index(i, signal).is_none());
             let spectrum = |signal: usize| {
@@ -210,22 +210,22 @@ impl FractionalOrders {
         let (mut residuals, mut columns) = (Vec::new(), Vec::new());
         for (run, experiment) in self.runs.iter().zip(experiments) {
             out.exponents = structures.iter().enumerate().map(|(i, s)| model.exponents(experiment, i, s)).collect();
-            let mut left = experiment.measured_samples();
-            out.size = out.size.hypot(left.iter().map(|v| v * v).sum::<f64>().sqrt());
+            let mut remainders = experiment.measured_samples();
+            out.size = out.size.hypot(remainders.iter().map(|v| v * v).sum::<f64>().sqrt());
             let direct = Feedthrough::of(model, experiment, &structures, point, &[])?;
             let mut simulation = SampledSimulation { basis: Vec::new(), effects: Vec::new() };
             let mut initial = Vec::new();
-            let size = left.len();
+            let size = remainders.len();
             simulation.effects.resize(linear.len(), vec![0.0; size]);
             for i in 0..structures.len() {
                 let terms = Terms::of(model, i, point)?;
-                let mut asked = vec![terms.coefficients.clone()];
-                asked.extend(linear.iter().map(|&j| {
+                let mut weight_sets = vec![terms.coefficients.clone()];
+                weight_sets.extend(linear.iter().map(|&j| {
                     let slope = |k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, j);
                     (0..terms.places.len()).map(slope).collect()
                 }));
-                let (sums, units) = run.responses(experiment, &terms, &asked, &out.exponents[i]);
-                let targets = std::iter::once(&mut left).chain(&mut simulation.effects);
+                let (sums, units) = run.responses(experiment, &terms, &weight_sets, &out.exponents[i]);
+                let targets = std::iter::once(&mut remainders).chain(&mut simulation.effects);
                 for (place, (target, samples)) in targets.zip(sums).enumerate() {
                     let sign = if place == 0 { -1.0 } else { 1.0 };
                     add_weighted(experiment, i, sign, &samples, target);
@@ -238,12 +238,12 @@ impl FractionalOrders {
                 }
             }
             if let Some(direct) = &direct {
-                left.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
+                remainders.iter_mut().zip(direct.weighted_correction(experiment)).for_each(|(e, v)| *e -= v);
                 for (&j, effect) in linear.iter().zip(&mut simulation.effects) {
                     add_feedthrough_derivative(model, experiment, direct, point, point.orders.len() + j, effect);
                 }
             }
-            if let Some(index) = left.iter().position(|e| !e.is_finite()) {
+            if let Some(index) = remainders.iter().position(|e| !e.is_finite()) {
                 return Err(Error::Diverged { what: "free run".into(), index });
             }
             for i in 0..if model.initial.has_level() { structures.len() } else { 0 } {
@@ -252,7 +252,7 @@ impl FractionalOrders {
                 extend_orthonormal(&mut simulation.basis, column.clone(), RANK_TOLERANCE);
                 initial.push((None, column));
             }
-            residuals.push(left);
+            residuals.push(remainders);
             columns.push(initial);
             out.parts.push(simulation);
         }
@@ -284,18 +284,19 @@ impl FractionalOrders {
                 let terms = Terms::of(model, i, point)?;
                 let exponents = model.exponents(experiment, i, structure);
                 let initial = InitialTerms::new(&exponents, &at.initial[index][i]);
-                let asked: Vec<(Slopes, Vec<f64>)> = open
+                let requests: Vec<(Slopes, Vec<f64>)> = open
                     .iter()
                     .map(|&p| {
-                        let moved = if p < orders {
+                        let initial_slopes = if p < orders {
                             initial_exponent_slopes(model, (i, p), &point.orders, initial.terms.len(), experiment)
                         } else {
                             None
                         };
-                        (term_slopes(model, i, point, p), moved.unwrap_or_default())
+                        (term_slopes(model, i, point, p), initial_slopes.unwrap_or_default())
                     })
                     .collect();
-                for (&parameter, samples) in open.iter().zip(run.sensitivities(experiment, &terms, &initial, &asked)) {
+                for (&parameter, samples) in open.iter().zip(run.sensitivities(experiment, &terms, &initial, &requests))
+                {
                     add_weighted(experiment, i, 1.0, &samples, &mut columns[parameter]);
                 }
             }
@@ -337,17 +338,17 @@ fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: u
 }
 
 impl Run {
-    /// Samples of an equation from rest, once for each list in `asked` of weights that replace its coefficients, and
+    /// Samples of an equation from rest, once for each list in `weight_sets` of weights that replace its coefficients, and
     /// samples of its response to each initial term t^e with e in `exponents`.
     fn responses(
         &self,
         experiment: &Experiment,
         terms: &Terms,
-        asked: &[Vec<f64>],
+        weight_sets: &[Vec<f64>],
         exponents: &[f64],
     ) -> (Vec<Vec<f64>>, Vec<Vec<f64>>) {
         let mut functions: Vec<(usize, Column)> = Vec::new();
-        for (place, weights) in asked.iter().enumerate() {
+        for (place, weights) in weight_sets.iter().enumerate() {
             for input in terms.signals() {
                 let acts = |k: usize| terms.inputs[k] == Some(input) && weights[k] != 0.0;
                 if (0..weights.len()).any(acts) {
@@ -361,10 +362,10 @@ impl Run {
         let units: Vec<f64> = exponents.iter().map(|e| libm::tgamma(e + 1.0)).collect();
         let spectra = self.transform.spectra(&starts, |logarithm, values| {
             let response = terms.powers(logarithm, &mut powers);
-            let held = response * integration(logarithm, 1.0);
+            let hold_response = response * integration(logarithm, 1.0);
             let (driven, free) = values.split_at_mut(functions.len());
             for (value, (_, c)) in driven.iter_mut().zip(&functions) {
-                *value = terms.sum(Some(c.input), &powers, |k| c.weights[k].into()) * held;
+                *value = terms.sum(Some(c.input), &powers, |k| c.weights[k].into()) * hold_response;
             }
             for ((value, unit), e) in free.iter_mut().zip(&units).zip(exponents) {
                 *value = response * integration(logarithm, e + 1.0) * unit;
@@ -372,7 +373,7 @@ impl Run {
         });
         let mut spectra = spectra.into_iter();
         let sources = functions.iter().map(|(place, c)| (*place, Some(c.input)));
-        let driven = self.columns(experiment, asked.len(), sources.zip(spectra.by_ref()));
+        let driven = self.columns(experiment, weight_sets.len(), sources.zip(spectra.by_ref()));
         let free = spectra.map(|spectrum| self.compared_samples(experiment, spectrum)).collect();
         (driven, free)
     }
@@ -383,41 +384,41 @@ impl Run {
         experiment: &Experiment,
         terms: &Terms,
         initial: &InitialTerms,
-        asked: &[(Slopes, Vec<f64>)],
+        requests: &[(Slopes, Vec<f64>)],
     ) -> Vec<Vec<f64>> {
         let mut functions: Vec<(usize, Option<usize>)> = Vec::new();
-        for (place, (slopes, moved)) in asked.iter().enumerate() {
+        for (place, (slopes, initial_slopes)) in requests.iter().enumerate() {
             let acts =
                 |input: Option<usize>| (0..slopes.len()).any(|k| terms.inputs[k] == input && slopes[k] != (0.0, 0.0));
             let inputs = terms.signals().into_iter().map(Some);
             functions.extend(inputs.filter(|&input| acts(None) || acts(input)).map(|input| (place, input)));
-            if !initial.terms.is_empty() && (acts(None) || moved.iter().any(|v| *v != 0.0)) {
+            if !initial.terms.is_empty() && (acts(None) || initial_slopes.iter().any(|v| *v != 0.0)) {
                 functions.push((place, None));
             }
         }
         let start = |&(place, input): &(usize, Option<usize>)| {
-            input.map_or(0.0, |input| terms.start(input, |k| asked[place].0[k].0))
+            input.map_or(0.0, |input| terms.start(input, |k| requests[place].0[k].0))
         };
         let starts: Vec<f64> = functions.iter().map(start).collect();
         let (mut powers, mut transforms) = (Vec::new(), Vec::new());
         let spectra = self.transform.spectra(&starts, |logarithm, values| {
             let response = terms.powers(logarithm, &mut powers);
-            let held = integration(logarithm, 1.0);
+            let hold_response = integration(logarithm, 1.0);
             let undriven = initial.transforms(logarithm, &mut transforms);
             for (value, &(place, input)) in values.iter_mut().zip(&functions) {
-                let (slopes, moved) = &asked[place];
+                let (slopes, initial_slopes) = &requests[place];
                 let weight = |k: usize| Bin::from(slopes[k].0) - logarithm * (terms.coefficients[k] * slopes[k].1);
                 let (driven, changed) = match input {
-                    None => (undriven, initial.slope(logarithm, &transforms, moved)),
+                    None => (undriven, initial.slope(logarithm, &transforms, initial_slopes)),
                     Some(_) => {
                         let sum = terms.sum(input, &powers, |k| terms.coefficients[k].into());
-                        (sum * held, terms.sum(input, &powers, weight) * held)
+                        (sum * hold_response, terms.sum(input, &powers, weight) * hold_response)
                     }
                 };
                 *value = (driven * response * terms.sum(None, &powers, weight) + changed) * response;
             }
         });
-        self.columns(experiment, asked.len(), functions.iter().copied().zip(spectra))
+        self.columns(experiment, requests.len(), functions.iter().copied().zip(spectra))
     }
 
     /// Return the compared samples of `count` columns, each the sum of the transforms of `functions` with its index.
@@ -486,12 +487,13 @@ mod tests {
     #[allow(clippy::cast_precision_loss)]
     fn experiment(pulses_per_sample: usize) -> Result<Experiment> {
         let rows = MIN_EXACT_PULSES + 2;
-        let held = |every: usize, seed: usize| -> Vec<f64> {
+        let hold_samples = |every: usize, seed: usize| -> Vec<f64> {
             (0..rows).map(|k| ((k / every * 7919 + seed) % 11) as f64 / 5.0 - 1.0).collect()
         };
         let y = (0..rows).map(|k| (0.1 * k as f64).cos()).collect();
         let input = |name: &str, samples| Channel::new(name, samples, Role::Input(Intersample::Hold));
-        let channels = vec![Channel::new("y", y, Role::Output), input("u", held(9, 1)), input("v", held(23, 5))];
+        let channels =
+            vec![Channel::new("y", y, Role::Output), input("u", hold_samples(9, 1)), input("v", hold_samples(23, 5))];
         let run = Recording::new("run", STEP, None, channels, vec![0])?;
         run.experiment(Sampling { pulses_per_sample, ..Sampling::default() })?.with_weights(&[2.0], None)
     }
@@ -501,15 +503,15 @@ mod tests {
     }
 
     /// Return what these experiments allow, or an error.
-    fn require<T>(found: Option<T>) -> Result<T> {
-        found.ok_or_else(|| Error::Diverged { what: "experiments without exact samples".into(), index: 0 })
+    fn require<T>(value: Option<T>) -> Result<T> {
+        value.ok_or_else(|| Error::Diverged { what: "experiments without exact samples".into(), index: 0 })
     }
 
     /// Largest difference, relative to the largest value.
-    fn distance(found: &[f64], exact: &[f64]) -> f64 {
-        assert_eq!(found.len(), exact.len());
+    fn distance(actual: &[f64], exact: &[f64]) -> f64 {
+        assert_eq!(actual.len(), exact.len());
         let peak = exact.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
-        found.iter().zip(exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / peak
+        actual.iter().zip(exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / peak
     }
 
     #[test]
@@ -517,14 +519,14 @@ mod tests {
         let (experiments, at) = ([experiment(1)?], point(2.0));
         for initial in [Initial::Rest, Initial::Caputo] {
             let model = model((2.0, 2.0), 1.0, initial);
-            let found = require(FractionalOrders::of(&model, &experiments, &at))?;
+            let orders = require(FractionalOrders::of(&model, &experiments, &at))?;
             let states = require(IntegerOrders::of(&model, &experiments, &at))?;
-            let here = found.evaluate(&model, &experiments, &at, &[2, 3])?;
-            let there = states.evaluate(&model, &experiments, &at, &[2, 3])?;
-            assert!(distance(&here.residuals, &there.residuals) < 1e-8);
-            assert!(distance(&here.point.coefficients, &there.point.coefficients) < 1e-8);
-            let slopes = found.jacobian(&model, &experiments, &[2, 3], &here)?;
-            let exact = states.jacobian(&model, &experiments, &[2, 3], &there)?;
+            let samples = orders.evaluate(&model, &experiments, &at, &[2, 3])?;
+            let state_samples = states.evaluate(&model, &experiments, &at, &[2, 3])?;
+            assert!(distance(&samples.residuals, &state_samples.residuals) < 1e-8);
+            assert!(distance(&samples.point.coefficients, &state_samples.point.coefficients) < 1e-8);
+            let slopes = orders.jacobian(&model, &experiments, &[2, 3], &samples)?;
+            let exact = states.jacobian(&model, &experiments, &[2, 3], &state_samples)?;
             // The order is fixed in the states.
             slopes.iter().zip(&exact).skip(1).for_each(|(a, b)| assert!(distance(a, b) < 1e-7));
         }
@@ -534,19 +536,20 @@ mod tests {
     #[test]
     fn derivatives_are_limits_of_differences() -> Result<()> {
         let (experiments, at, model) = ([experiment(1)?], point(1.7), model((1.0, 3.0), 0.6, Initial::Rest));
-        let found = require(FractionalOrders::of(&model, &experiments, &at))?;
-        let here = found.evaluate(&model, &experiments, &at, &[])?;
-        let slopes = found.jacobian(&model, &experiments, &[], &here)?;
+        let orders = require(FractionalOrders::of(&model, &experiments, &at))?;
+        let evaluation = orders.evaluate(&model, &experiments, &at, &[])?;
+        let slopes = orders.jacobian(&model, &experiments, &[], &evaluation)?;
         for (parameter, slope) in slopes.iter().enumerate() {
-            let moved = |by: f64| -> Result<Vec<f64>> {
+            let shifted = |by: f64| -> Result<Vec<f64>> {
                 let mut at = at.clone();
                 match parameter.checked_sub(1) {
                     None => at.orders[0] += by,
                     Some(j) => at.coefficients[j] += by,
                 }
-                Ok(found.evaluate(&model, &experiments, &at, &[])?.residuals)
+                Ok(orders.evaluate(&model, &experiments, &at, &[])?.residuals)
             };
-            let differences: Vec<f64> = moved(1e-4)?.iter().zip(moved(-1e-4)?).map(|(a, b)| (a - b) / 2e-4).collect();
+            let differences: Vec<f64> =
+                shifted(1e-4)?.iter().zip(shifted(-1e-4)?).map(|(a, b)| (a - b) / 2e-4).collect();
             assert!(distance(slope, &differences) < 1e-5, "parameter {parameter}");
         }
         Ok(())
@@ -556,15 +559,15 @@ mod tests {
     fn pulses_have_the_same_limit() -> Result<()> {
         let (at, model) = (point(1.7), model((1.0, 3.0), 0.6, Initial::Caputo));
         let (experiments, fine) = ([experiment(1)?], [experiment(8)?]);
-        let found = require(FractionalOrders::of(&model, &experiments, &at))?;
-        let here = found.evaluate(&model, &experiments, &at, &[2, 3])?;
+        let orders = require(FractionalOrders::of(&model, &experiments, &at))?;
+        let evaluation = orders.evaluate(&model, &experiments, &at, &[2, 3])?;
         let mut caches = EvaluationCache::of(&fine, &Stop::default())?;
-        let there = model.evaluate(&fine, &mut caches, &at, &[2, 3])?;
-        assert!(distance(&here.residuals, &there.residuals) < 1e-4);
-        assert!(distance(&here.point.coefficients, &there.point.coefficients) < 1e-4);
-        assert!(distance(&here.initial[0][0], &there.initial[0][0]) < 1e-2);
-        let slopes = found.jacobian(&model, &experiments, &[2, 3], &here)?;
-        let pulses = model.jacobian(&fine, &mut caches, &[2, 3], &there)?;
+        let pulse_evaluation = model.evaluate(&fine, &mut caches, &at, &[2, 3])?;
+        assert!(distance(&evaluation.residuals, &pulse_evaluation.residuals) < 1e-4);
+        assert!(distance(&evaluation.point.coefficients, &pulse_evaluation.point.coefficients) < 1e-4);
+        assert!(distance(&evaluation.initial[0][0], &pulse_evaluation.initial[0][0]) < 1e-2);
+        let slopes = orders.jacobian(&model, &experiments, &[2, 3], &evaluation)?;
+        let pulses = model.jacobian(&fine, &mut caches, &[2, 3], &pulse_evaluation)?;
         slopes.iter().zip(&pulses).for_each(|(a, b)| assert!(distance(a, b) < 1e-3));
         Ok(())
     }

@@ -115,12 +115,12 @@ impl Companion {
     }
 
     /// Companion form for this pulse width, from a list of those so far.
-    pub(crate) fn of_width(known: &mut Vec<Rc<Self>>, own: &[f64], step: f64) -> Rc<Self> {
-        if let Some(found) = known.iter().find(|c| c.width.to_bits() == step.to_bits()) {
-            return found.clone();
+    pub(crate) fn of_width(cache: &mut Vec<Rc<Self>>, own: &[f64], step: f64) -> Rc<Self> {
+        if let Some(cached) = cache.iter().find(|c| c.width.to_bits() == step.to_bits()) {
+            return cached.clone();
         }
-        known.push(Rc::new(Self::new(own, step)));
-        known[known.len() - 1].clone()
+        cache.push(Rc::new(Self::new(own, step)));
+        cache[cache.len() - 1].clone()
     }
 
     /// scale^power.
@@ -179,8 +179,8 @@ impl Companion {
         behind: Option<(&[f64], f64)>,
     ) -> Option<Rc<Discretization>> {
         let key = (between, fraction.to_bits(), behind.map(|(read, direct)| (read.to_vec(), direct)));
-        if let Some(found) = self.known.borrow().iter().find(|d| d.key == key) {
-            return Some(found.clone());
+        if let Some(cached) = self.known.borrow().iter().find(|d| d.key == key) {
+            return Some(cached.clone());
         }
         let n = self.order;
         let total = if behind.is_some() { 2 * n } else { n };
@@ -208,9 +208,9 @@ impl Companion {
         };
         // Columns are contiguous, so that the states of a step are independent sums.
         let growth = (0..total * total).map(|k| interval.growth[k % total * total + k / total]).collect();
-        let made = Rc::new(Discretization { key, growth, gains });
-        self.known.borrow_mut().push(made.clone());
-        Some(made)
+        let gain_matrices = Rc::new(Discretization { key, growth, gains });
+        self.known.borrow_mut().push(gain_matrices.clone());
+        Some(gain_matrices)
     }
 }
 
@@ -315,13 +315,13 @@ impl IntegerOrders {
                 if !exponents.iter().all(|&e| integer(e).is_some_and(|e| e <= order + 1)) {
                     return None;
                 }
-                let known = |&(signal, _): &(usize, Vec<(usize, usize)>)| {
+                let is_known_input = |&(signal, _): &(usize, Vec<(usize, usize)>)| {
                     let Some(values) = experiment.point_values.get(signal) else { return false };
                     values.is_zero_order_hold || (values.values.is_some() && model.law_of(signal).is_none())
                 };
                 let plain =
                     experiment.nonuniform.is_none() && experiment.filter.is_none() && !experiment.record.is_filtered();
-                if !plain || !inputs.iter().all(known) {
+                if !plain || !inputs.iter().all(is_known_input) {
                     return None;
                 }
             }
@@ -367,15 +367,15 @@ impl IntegerOrders {
             out.exponents = structures.iter().enumerate().map(|(i, s)| model.exponents(experiment, i, s)).collect();
             let (simulation, initial) =
                 self.simulate(model, experiment, (point, linear), &out.exponents, &mut companions)?;
-            let mut left = experiment.measured_samples();
-            out.size = out.size.hypot(left.iter().map(|v| v * v).sum::<f64>().sqrt());
+            let mut remainders = experiment.measured_samples();
+            out.size = out.size.hypot(remainders.iter().map(|v| v * v).sum::<f64>().sqrt());
             let response = (0..self.equations.len()).flat_map(|i| simulation.response(self, model, i, point));
             let weights = (0..self.equations.len()).flat_map(|i| experiment.weights_of(i));
-            left.iter_mut().zip(response.zip(weights)).for_each(|(e, (v, w))| *e -= w * v);
-            if let Some(index) = left.iter().position(|e| !e.is_finite()) {
+            remainders.iter_mut().zip(response.zip(weights)).for_each(|(e, (v, w))| *e -= w * v);
+            if let Some(index) = remainders.iter().position(|e| !e.is_finite()) {
                 return Err(Error::Diverged { what: "free run".into(), index });
             }
-            residuals.push(left);
+            residuals.push(remainders);
             columns.push(initial);
             out.parts.push(simulation);
         }

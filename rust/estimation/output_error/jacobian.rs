@@ -75,24 +75,24 @@ impl FreeModel {
                             let slope = &part.input_means[input].1;
                             rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || shelf.spectrum(slope));
                         } else if let Some(j) = self.output_index(i, *signal) {
-                            let (response, known) = (&part.response[j], &mut responses[j]);
-                            let made = || known.get_or_insert_with(|| shelf.spectrum(response)).clone();
-                            rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), made);
+                            let (response, spectrum) = (&part.response[j], &mut responses[j]);
+                            let make_spectrum = || spectrum.get_or_insert_with(|| shelf.spectrum(response)).clone();
+                            rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), make_spectrum);
                         } else {
                             let series = || {
                                 Cow::Borrowed(self.input_means(record, (*signal, operator.eta()), &part.input_means))
                             };
-                            let made =
+                            let make_spectrum =
                                 || shelf.input_spectrum(self, experiment, (*signal, operator.eta()), &part.input_means);
-                            rights.add(i, weight, (operator, turns), series, made);
+                            rights.add(i, weight, (operator, turns), series, make_spectrum);
                         }
                     }
                     if parameter < orders.len()
-                        && let Some(moved) =
+                        && let Some(initial_slope) =
                             initial_term_derivative(self, (i, parameter), orders, &initial[i], (experiment, shelf))
                     {
-                        let series = || Cow::Owned(shelf.filter_series(&moved));
-                        rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
+                        let series = || Cow::Owned(shelf.filter_series(&initial_slope));
+                        rights.add_series(i, series, || shelf.filtered_spectrum(&initial_slope));
                     }
                 }
                 Ok(())
@@ -155,12 +155,12 @@ pub(crate) fn initial_exponent_slopes(
         return None;
     }
     let exponents = |shift: f64| {
-        let mut moved = orders.to_vec();
-        moved[parameter] += shift;
-        model.exponents(experiment, i, &model.structures(&moved)[i])
+        let mut shifted = orders.to_vec();
+        shifted[parameter] += shift;
+        model.exponents(experiment, i, &model.structures(&shifted)[i])
     };
-    let (below, here, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
-    if [&below, &here, &above].iter().any(|list| list.len() != count) {
+    let (below, own_exponents, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
+    if [&below, &own_exponents, &above].iter().any(|list| list.len() != count) {
         // The projection adapts in the next evaluation.
         return None;
     }

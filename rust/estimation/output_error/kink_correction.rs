@@ -136,7 +136,7 @@ impl KinkCorrection {
                 }
             }
         };
-        let moved = self.weighted_sum(model, experiment, direct, weight);
-        column.iter_mut().zip(moved).for_each(|(v, m)| *v += m);
+        let slopes = self.weighted_sum(model, experiment, direct, weight);
+        column.iter_mut().zip(slopes).for_each(|(v, m)| *v += m);
     }
 }

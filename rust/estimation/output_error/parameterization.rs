@@ -343,7 +343,7 @@ impl InputLaw {
                 remedy: "an input acts after it is given, and alike on both sides of 0".into(),
             });
         }
-        let beyond = |v: f64| if v.abs() > value { v.signum() } else { 0.0 };
+        let excess = |v: f64| if v.abs() > value { v.signum() } else { 0.0 };
         Ok(match self {
             Self::Delay => {
                 let steps = value / step;
@@ -352,11 +352,11 @@ impl InputLaw {
                 let slope = near.iter().zip(&far).map(|(near, far)| (far - near) / step).collect();
                 (delay_samples(means, steps, before)?, slope)
             }
-            Self::Saturation => means.iter().map(|&v| (v.clamp(-value, value), beyond(v))).unzip(),
+            Self::Saturation => means.iter().map(|&v| (v.clamp(-value, value), excess(v))).unzip(),
             Self::DeadZone => means
                 .iter()
                 .map(|&v| {
-                    let side = beyond(v);
+                    let side = excess(v);
                     (if side == 0.0 { 0.0 } else { v - value * side }, -side)
                 })
                 .unzip(),
@@ -472,13 +472,13 @@ fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
     }
     let mut pivots = Vec::new();
     for j in 0..count {
-        let done = pivots.len();
-        let Some(at) = (done..rows.len()).find(|&i| rows[i].0[j].abs() > EXPONENT_TOLERANCE) else { continue };
-        rows.swap(done, at);
-        let pivot = rows[done].clone();
+        let pivot_count = pivots.len();
+        let Some(at) = (pivot_count..rows.len()).find(|&i| rows[i].0[j].abs() > EXPONENT_TOLERANCE) else { continue };
+        rows.swap(pivot_count, at);
+        let pivot = rows[pivot_count].clone();
         for (i, (often, power)) in rows.iter_mut().enumerate() {
             // The pivot row is divided by the pivot.
-            let by = if i == done { 1.0 - 1.0 / pivot.0[j] } else { often[j] / pivot.0[j] };
+            let by = if i == pivot_count { 1.0 - 1.0 / pivot.0[j] } else { often[j] / pivot.0[j] };
             often.iter_mut().zip(&pivot.0).for_each(|(v, p)| *v -= by * p);
             power.iter_mut().zip(&pivot.1).for_each(|(v, p)| *v -= by * p);
         }
@@ -488,10 +488,10 @@ fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
         return None;
     }
     // Coefficients not determined by the products have no unit.
-    let mut found: Vec<_> = (0..count).map(|j| is_scaled(model, j).then(|| (0.0, vec![0.0; orders]))).collect();
+    let mut powers: Vec<_> = (0..count).map(|j| is_scaled(model, j).then(|| (0.0, vec![0.0; orders]))).collect();
     for ((_, mut power), j) in rows.into_iter().zip(pivots) {
         let constant = power.remove(0);
-        found[j] = Some((constant, power));
+        powers[j] = Some((constant, power));
     }
-    Some(found)
+    Some(powers)
 }

@@ -100,7 +100,7 @@ impl FreeModel {
         let operators = self.term_operators(experiment, shelf, structures)?;
         out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
         let has_level = self.initial.has_level();
-        let asked = has_level || out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
+        let needs_terms = has_level || out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
         let (response, solved) = self.rest_response(experiment, shelf, &operators, point, &acted)?;
         shelf.stop.check()?;
         let mut residuals = experiment.measured_samples();
@@ -115,15 +115,15 @@ impl FreeModel {
         }
         let corners = KinkCorrection::of(self, experiment, structures);
         if let Some(corners) = &corners {
-            let there = corners.weighted_correction(self, experiment, point, direct.as_ref());
-            residuals.iter_mut().zip(there).for_each(|(e, v)| *e -= v);
+            let correction = corners.weighted_correction(self, experiment, point, direct.as_ref());
+            residuals.iter_mut().zip(correction).for_each(|(e, v)| *e -= v);
         }
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
         let mut free = Vec::new();
         let mut basis = Vec::new();
-        if asked {
+        if needs_terms {
             let terms: Vec<(usize, f64)> =
                 out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
             let beside = |i: usize, e: f64| experiment.affects_only_filter(self.equations[i].output, e);
@@ -181,10 +181,11 @@ impl FreeModel {
             let mut row = Vec::with_capacity(structure.terms.len());
             for (k, term) in structure.terms.iter().enumerate() {
                 let eta = structure.order - term.order;
-                let held = experiment.point_values.get(term.signal).is_some_and(|instant| instant.is_zero_order_hold);
+                let is_hold =
+                    experiment.point_values.get(term.signal).is_some_and(|instant| instant.is_zero_order_hold);
                 let least = if term.signal == structure.output {
                     MIN_INTEGRATION_ORDER
-                } else if held {
+                } else if is_hold {
                     // The derivative of a jump is infinite.
                     0.0
                 } else {
@@ -348,18 +349,18 @@ impl FreeModel {
     /// Indices of the coefficients that occur alone and only in terms of external inputs.
     pub(crate) fn linear_coefficients(&self) -> Vec<usize> {
         let stands = |j: usize| {
-            let mut found = false;
+            let mut is_free = false;
             for (i, equation) in self.equations.iter().enumerate() {
                 for (signal, _, monomial) in &equation.terms {
                     if monomial.powers.iter().any(|&(k, _)| k == j) {
                         if monomial.powers != [(j, 1)] || self.output_index(i, *signal).is_some() {
                             return false;
                         }
-                        found = true;
+                        is_free = true;
                     }
                 }
             }
-            found
+            is_free
         };
         let moves = |j: usize| matches!(self.coordinates[j], Coordinate::Plain | Coordinate::Logarithm);
         (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
@@ -401,11 +402,11 @@ impl FreeModel {
             |place, means| {
                 let parameter = point.orders.len() + coefficients[place];
                 let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
-                let found = part.parameter_effect(parameter, means, (self, experiment, point))?;
-                if let Some(index) = found.samples.iter().position(|v| !v.is_finite()) {
+                let effect = part.parameter_effect(parameter, means, (self, experiment, point))?;
+                if let Some(index) = effect.samples.iter().position(|v| !v.is_finite()) {
                     return Err(Error::Diverged { what: "free run".into(), index });
                 }
-                driven.push(found);
+                driven.push(effect);
                 Ok(())
             },
         )?;

@@ -43,12 +43,12 @@ pub fn is_unstable(alpha: f64, own: &[(f64, f64)]) -> bool {
     let (first, last) = (ends(low).fold(f64::INFINITY, f64::min), ends(high).fold(f64::NEG_INFINITY, f64::max));
     let steps = ((last - first) / MAX_LOG_FREQUENCY_STEP).ceil().clamp(1.0, 1e6);
     let mut turned = 0.0;
-    let mut here = (first, curve_point(&powers, first));
+    let mut start = (first, curve_point(&powers, first));
     for k in 1..=steps as usize {
         let next = first + (last - first) * k as f64 / steps;
-        let there = (next, curve_point(&powers, next));
-        turned += angle_change(&powers, here, there);
-        here = there;
+        let next_point = (next, curve_point(&powers, next));
+        turned += angle_change(&powers, start, next_point);
+        start = next_point;
     }
     0.5 * (high.1 - low.1) - turned / PI > MIN_UNSTABLE_ZERO_COUNT
 }
@@ -90,8 +90,8 @@ fn angle_change(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, 
         // The curve passes through 0, so a zero lies on the axis: return a value that counts as unstable.
         return f64::NEG_INFINITY;
     }
-    let there = (middle, curve_point(powers, middle));
-    angle_change(powers, from, there) + angle_change(powers, there, to)
+    let midpoint = (middle, curve_point(powers, middle));
+    angle_change(powers, from, midpoint) + angle_change(powers, midpoint, to)
 }
 
 #[cfg(test)]

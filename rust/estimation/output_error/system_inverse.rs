@@ -63,8 +63,8 @@ impl<'a> RightHandSides<'a> {
     ) -> Option<Vec<Vec<f64>>> {
         let Self::Spectra(rights) = self else { return None };
         let of_row = |row: &Vec<Kernel>| {
-            let moved = row.iter().zip(rights).filter(|(_, (used, _))| *used);
-            moved.for_each(|(entry, (_, right))| target.add_product(right, entry));
+            let used_pairs = row.iter().zip(rights).filter(|(_, (used, _))| *used);
+            used_pairs.for_each(|(entry, (_, right))| target.add_product(right, entry));
             let mut means = vec![0.0; m];
             target.take(&mut means, buffers);
             means
@@ -193,7 +193,7 @@ impl SystemInverse {
         let open: Vec<(usize, f64)> =
             terms.iter().filter(|t| !self.initial_responses.borrow().contains_key(&key(t))).copied().collect();
         let powers: Vec<Rc<InitialTerm>> = open.iter().map(|&(_, e)| power(e)).collect();
-        let mut made = HashMap::new();
+        let mut computed = HashMap::new();
         self.inverse()?.solve_each(
             (n, m),
             open.len(),
@@ -203,32 +203,33 @@ impl SystemInverse {
                 Ok(())
             },
             |place, means| {
-                made.insert(key(&open[place]), Rc::new(means.unwrap_or_default()));
+                computed.insert(key(&open[place]), Rc::new(means.unwrap_or_default()));
                 Ok(())
             },
         )?;
-        let mut kept = self.initial_responses.borrow_mut();
-        let answers = terms.iter().filter_map(|t| kept.get(&key(t)).or_else(|| made.get(&key(t))).cloned()).collect();
+        let mut cache = self.initial_responses.borrow_mut();
+        let answers =
+            terms.iter().filter_map(|t| cache.get(&key(t)).or_else(|| computed.get(&key(t))).cloned()).collect();
         if keep {
-            kept.extend(made);
+            cache.extend(computed);
         }
         Ok(answers)
     }
 }
 
 impl Inverse {
-    /// Solve for `count` right-hand sides: `given` fills each one, `taken` receives the pulse means of the outputs.
+    /// Solve for `count` right-hand sides: `fill` fills each one, `receive` receives the pulse means of the outputs.
     ///
     /// The means are None for a zero right-hand side.
     ///
     /// # Errors
-    /// Those of `given` and `taken`.
+    /// Those of `fill` and `receive`.
     pub(crate) fn solve_each<'a>(
         &self,
         (n, m): (usize, usize),
         count: usize,
-        mut given: impl FnMut(usize, &mut RightHandSides<'a>) -> Result<()>,
-        mut taken: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
+        mut fill: impl FnMut(usize, &mut RightHandSides<'a>) -> Result<()>,
+        mut receive: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
     ) -> Result<()> {
         match self {
             Self::Spectra { rows, total } => {
@@ -237,8 +238,8 @@ impl Inverse {
                 let mut target = SumOfProducts::with_length(*total);
                 let mut buffers = Buffers::default();
                 for place in 0..count {
-                    given(place, &mut rights)?;
-                    taken(place, rights.apply_inverse(rows, m, &mut target, &mut buffers))?;
+                    fill(place, &mut rights)?;
+                    receive(place, rights.apply_inverse(rows, m, &mut target, &mut buffers))?;
                     rights.clear();
                 }
             }
@@ -247,13 +248,13 @@ impl Inverse {
                     let mut lists = Vec::with_capacity(RIGHT_SIDE_LANES);
                     for place in first..(first + RIGHT_SIDE_LANES).min(count) {
                         let mut rights = RightHandSides::Sums(Vec::new());
-                        given(place, &mut rights)?;
+                        fill(place, &mut rights)?;
                         lists.push(rights);
                     }
                     let sources: Vec<Vec<Source>> = lists.iter().map(RightHandSides::sources).collect();
                     for (place, (means, rights)) in (first..).zip(recursion.solve(m, &sources)?.into_iter().zip(&lists))
                     {
-                        taken(place, rights.is_nonzero().then_some(means))?;
+                        receive(place, rights.is_nonzero().then_some(means))?;
                     }
                 }
             }
@@ -303,10 +304,10 @@ impl Operator {
         }
         // d/dη of 1/F(−η) is F′(−η)/F(−η)².
         let (_, turned) = kernel_with_derivative(-self.eta, self.m, self.step);
-        let (mut product, made) = (Kernel::with_length(&turned, total), self.spectrum(false));
-        product.multiply(&made);
+        let (mut product, spectrum) = (Kernel::with_length(&turned, total), self.spectrum(false));
+        product.multiply(&spectrum);
         let mut slope = vec![0.0; self.m];
-        product.times(&made, &mut slope, &mut Buffers::default());
+        product.times(&spectrum, &mut slope, &mut Buffers::default());
         Kernel::with_length(&slope, total)
     }
 
@@ -335,13 +336,13 @@ impl Operator {
 
     /// Spectrum of the kernel, or of its derivative, for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
-        let made = || {
+        let compute = || {
             Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), SPECTRUM_FACTORS * self.m) })
         };
         if self.m > MAX_CACHED_PULSES {
-            return made();
+            return compute();
         }
-        self.spectra[usize::from(slope)].get_or_init(made).clone()
+        self.spectra[usize::from(slope)].get_or_init(compute).clone()
     }
 }
 
@@ -398,11 +399,12 @@ impl InitialTerm {
 
     /// Spectrum of the pulse means, for a product with one more series.
     pub(crate) fn spectrum(&self) -> Rc<Kernel> {
-        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), SPECTRUM_FACTORS * self.raw.len()));
+        let compute =
+            || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), SPECTRUM_FACTORS * self.raw.len()));
         if self.raw.len() > MAX_CACHED_PULSES {
-            return made();
+            return compute();
         }
-        self.spectrum.get_or_init(made).clone()
+        self.spectrum.get_or_init(compute).clone()
     }
 }
 

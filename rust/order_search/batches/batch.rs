@@ -73,11 +73,11 @@ impl<'a> BatchEvaluation<'a> {
     pub(super) fn evaluate_batch(
         &mut self,
         bounds: (u64, u64),
-        kept: &mut TopRows,
+        top_rows: &mut TopRows,
         mut place: BatchPosition,
     ) -> Result<bool> {
         let (start, end) = bounds;
-        let (limit, resumed) = (kept.limit, place.end > 0);
+        let (limit, resumed) = (top_rows.limit, place.end > 0);
         let (catalogue, control) = (self.catalogue, self.control);
         let parts: Vec<(Vec<OpenCandidate>, Vec<u64>, u64)> = self.pool.install(|| {
             self.chunks(start, end, limit)
@@ -89,17 +89,17 @@ impl<'a> BatchEvaluation<'a> {
                         return Default::default();
                     }
                     let boxes = slab.as_ref().zip(self.boxes);
-                    let found = boxes
+                    let boxes_outcome = boxes
                         .and_then(|(slab, boxes)| screen_slice(catalogue, boxes, slab, (lo, hi), limit))
                         .unwrap_or_else(|| {
                             let (open, singular) = screen(catalogue, lo, hi, limit);
                             (open, singular, 0)
                         });
-                    let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
+                    let closed = hi - lo - (boxes_outcome.0.len() + boxes_outcome.1.len()) as u64;
                     if !resumed {
-                        control.count(closed + found.1.len() as u64, closed);
+                        control.count(closed + boxes_outcome.1.len() as u64, closed);
                     }
-                    found
+                    boxes_outcome
                 })
                 .collect()
         });
@@ -107,8 +107,8 @@ impl<'a> BatchEvaluation<'a> {
         let mut open: Vec<OpenCandidate> = Vec::new();
         let mut singular: Vec<u64> = Vec::new();
         let mut boxed = 0;
-        for (found, failed, excluded) in parts {
-            open.extend(found);
+        for (boxes_outcome, failed, excluded) in parts {
+            open.extend(boxes_outcome);
             singular.extend(failed);
             boxed += excluded;
         }
@@ -127,7 +127,7 @@ impl<'a> BatchEvaluation<'a> {
                 .failures
                 .extend(singular.into_iter().take(MAX_LISTED_FAILURES).map(|index| (index, Failure::Singular)));
         }
-        self.simulate_open(&open, kept, place, true).map(|()| true)
+        self.simulate_open(&open, top_rows, place, true).map(|()| true)
     }
 
     /// Whether boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates on trial slices.
@@ -136,7 +136,7 @@ impl<'a> BatchEvaluation<'a> {
         let (catalogue, control) = (self.catalogue, self.control);
         let order = low_discrepancy_order(catalogue.lattice.count());
         let places: Vec<u64> = (0..TRIAL_SLICES.min(catalogue.lattice.count())).map(order).collect();
-        let found: Vec<(u64, u64)> = self.pool.install(|| {
+        let counts: Vec<(u64, u64)> = self.pool.install(|| {
             places
                 .into_par_iter()
                 .with_max_len(1)
@@ -149,7 +149,7 @@ impl<'a> BatchEvaluation<'a> {
                 .collect()
         });
         self.check_stop()?;
-        let (all, boxed) = found.iter().fold((0, 0), |sums, found| (sums.0 + found.0, sums.1 + found.1));
+        let (all, boxed) = counts.iter().fold((0, 0), |sums, counts| (sums.0 + counts.0, sums.1 + counts.1));
         Ok(boxed * MAX_CANDIDATES_PER_EXCLUSION > all)
     }
 
@@ -177,12 +177,12 @@ impl<'a> BatchEvaluation<'a> {
         chunks
     }
 
-    /// Simulate open candidates in this order, starting at a position. Rows are added to `kept`, and counts and
+    /// Simulate open candidates in this order, starting at a position. Rows are added to `top_rows`, and counts and
     /// checkpoints are updated if `counted`.
     pub(super) fn simulate_open(
         &mut self,
         open: &[OpenCandidate],
-        kept: &mut TopRows,
+        top_rows: &mut TopRows,
         mut place: BatchPosition,
         counted: bool,
     ) -> Result<()> {
@@ -199,35 +199,35 @@ impl<'a> BatchEvaluation<'a> {
         if place.end == 0 {
             place.size = first;
             place.end = batch(place.size) as u64;
-            place.limit = kept.limit;
+            place.limit = top_rows.limit;
         }
         loop {
             let limit = place.limit;
-            kept.limit = limit;
+            top_rows.limit = limit;
             while place.evaluated_count < place.end {
                 let (start, end) = (batch(place.evaluated_count), batch(place.end));
                 let end = end.min(start.saturating_add(piece));
                 let rows = self.simulate_chunk(&open[start..end], limit, counted)?;
                 place.evaluated_count = end as u64;
                 if saving {
-                    kept.insert_rows(rows.iter().cloned());
+                    top_rows.insert_rows(rows.iter().cloned());
                     self.result.failures.sort_unstable();
                     self.result.failures.truncate(MAX_LISTED_FAILURES);
-                    let rows = rows.into_iter().filter(|row| kept.contains(row)).collect();
+                    let rows = rows.into_iter().filter(|row| top_rows.contains(row)).collect();
                     let part = Part { rows, counts: self.result.counts, failures: self.result.failures.clone() };
                     let anew = std::mem::take(&mut self.replaces_previous);
                     self.control.save(Checkpoint { place, replaces_previous: anew, part });
                 } else {
-                    kept.insert_rows(rows.into_iter());
+                    top_rows.insert_rows(rows.into_iter());
                 }
             }
-            kept.lower_limit(options.pruning);
+            top_rows.lower_limit(options.pruning);
             if batch(place.end) == open.len() {
                 return Ok(());
             }
             place.size = place.size.saturating_mul(2).min(largest);
             place.end = batch(place.end.saturating_add(place.size)) as u64;
-            place.limit = kept.limit;
+            place.limit = top_rows.limit;
         }
     }
 

@@ -109,34 +109,43 @@ impl<'a> BatchEvaluator<'a> {
         }
         let pay = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&catalogue);
         let closely = uses_close_bounds(count, options);
-        let InitialIncumbent { mut kept, mut tried, needs_close_bounds: hard, selected_vectors: which } =
-            BatchEvaluation::new(&catalogue, None, pool, control).find_incumbent(pay, closely)?;
+        let InitialIncumbent {
+            kept: mut top_rows,
+            tried: mut evaluated,
+            needs_close_bounds: hard,
+            selected_vectors: which,
+        } = BatchEvaluation::new(&catalogue, None, pool, control).find_incumbent(pay, closely)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&which));
         }
         // The Gram matrix determines squared equation errors completely.
-        if pay && catalogue.problem.residual_sums.is_none() && kept.limit < f64::INFINITY {
+        if pay && catalogue.problem.residual_sums.is_none() && top_rows.limit < f64::INFINITY {
             let (adapted, bytes) = catalogue.problem.empty_tailored_vectors();
             catalogue.problem.tailored_vectors = Some(adapted);
             for time in 0.. {
-                let best = kept.rows.first().map(|row| row.index);
-                let GeneratedVectors { vectors, open: left, is_worth_repeating: again } =
-                    BatchEvaluation::new(&catalogue, None, pool, control)
-                        .generate_tailored_vectors(kept.limit, time, best)?;
+                let best = top_rows.rows.first().map(|row| row.index);
+                let GeneratedVectors { vectors, open: candidates, is_worth_repeating: again } = BatchEvaluation::new(
+                    &catalogue, None, pool, control,
+                )
+                .generate_tailored_vectors(top_rows.limit, time, best)?;
                 catalogue.spare_bytes =
                     catalogue.spare_bytes.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
                 if let Some(adapted) = &mut catalogue.problem.tailored_vectors {
                     adapted.vectors.extend(vectors);
                 }
                 // Candidates that no vector excludes are likely to be good.
-                BatchEvaluation::new(&catalogue, None, pool, control).refine_from(&left, &mut kept, &mut tried)?;
+                BatchEvaluation::new(&catalogue, None, pool, control).refine_from(
+                    &candidates,
+                    &mut top_rows,
+                    &mut evaluated,
+                )?;
                 if !again {
                     break;
                 }
             }
         }
-        let limit = kept.limit;
+        let limit = top_rows.limit;
         if hard {
             let spare = catalogue.spare_bytes;
             catalogue.spare_bytes -= pool.install(|| catalogue.problem.add_unstable_zeros(spare));
@@ -207,7 +216,7 @@ impl<'a> BatchEvaluator<'a> {
         let count = lattice.count();
         let (all, length) =
             (batch_count(count, options), batch_size(count, options, algorithm_version(count, options)));
-        let begun = from.is_none();
+        let is_first = from.is_none();
         let from = from.unwrap_or_else(|| Checkpoint {
             place: BatchPosition::start(first),
             replaces_previous: true,
@@ -233,28 +242,28 @@ impl<'a> BatchEvaluator<'a> {
         let mut hunt = BatchEvaluation::new(&self.catalogue, self.boxes.as_ref(), pool, control);
         let Checkpoint { mut place, part, .. } = from;
         control.total.store(count, Ordering::Relaxed);
-        let known = part.counts.processed_count();
-        control.count(known, 0);
+        let processed = part.counts.processed_count();
+        control.count(processed, 0);
         hunt.result = part;
-        hunt.replaces_previous = begun;
+        hunt.replaces_previous = is_first;
         while place.batch < last {
             let start = order(place.batch) * length;
             let bounds = (start, count.min(start + length));
             let own = |row: &Row| bounds.0 <= row.index && row.index < bounds.1;
-            let mut kept = TopRows::new(options.top, self.limit);
+            let mut top_rows = TopRows::new(options.top, self.limit);
             let seeds = seed.iter().map(|&(index, score)| Row { index, score, coefficients: vec![], initial: vec![] });
-            kept.insert_rows(seeds);
-            kept.lower_limit(options.pruning);
-            kept.insert_rows(hunt.result.rows.iter().filter(|row| own(row)).cloned());
+            top_rows.insert_rows(seeds);
+            top_rows.lower_limit(options.pruning);
+            top_rows.insert_rows(hunt.result.rows.iter().filter(|row| own(row)).cloned());
             hunt.result.rows.retain(|row| !own(row));
-            if !hunt.evaluate_batch(bounds, &mut kept, place)? {
+            if !hunt.evaluate_batch(bounds, &mut top_rows, place)? {
                 // Its candidates would be evaluated twice or never, so the foreign result is discarded.
-                control.done.fetch_sub(known, Ordering::Relaxed);
+                control.done.fetch_sub(processed, Ordering::Relaxed);
                 (hunt.result, hunt.replaces_previous, place) = (Part::default(), true, BatchPosition::start(first));
                 continue;
             }
             let part = Part {
-                rows: kept.rows.into_iter().filter(own).collect(),
+                rows: top_rows.rows.into_iter().filter(own).collect(),
                 counts: Counts { candidates: bounds.1 - bounds.0, ..Counts::default() },
                 failures: Vec::new(),
             };
@@ -271,15 +280,17 @@ impl<'a> BatchEvaluator<'a> {
         if part.rows.iter().any(other) || part.failures.iter().any(|failure| failure.0 >= count) {
             return Err(mismatch_error("a checkpoint holds rows of another search".into()));
         }
-        let done = part.counts.processed_count();
+        let processed = part.counts.processed_count();
         if part.counts.excluded_by_box > part.counts.excluded_by_bound {
             let Counts { excluded_by_box: boxed, excluded_by_bound: bounded, .. } = part.counts;
             return Err(mismatch_error(format!(
                 "a checkpoint has {boxed} candidates in boxes among {bounded} excluded ones"
             )));
         }
-        if done > count || part.counts.candidates > count {
-            return Err(mismatch_error(format!("a checkpoint accounts for {done} candidates, but there are {count}")));
+        if processed > count || part.counts.candidates > count {
+            return Err(mismatch_error(format!(
+                "a checkpoint accounts for {processed} candidates, but there are {count}"
+            )));
         }
         Ok(())
     }

@@ -52,7 +52,7 @@ impl BatchEvaluation<'_> {
         let refined = problem.refines();
         let indices: Vec<u64> =
             (0..count.min(if refined { RANKED_CANDIDATES } else { INITIAL_SAMPLE_CANDIDATES })).map(order).collect();
-        let found: Vec<Option<(OpenCandidate, Vec<f64>)>> = self.pool.install(|| {
+        let candidates: Vec<Option<(OpenCandidate, Vec<f64>)>> = self.pool.install(|| {
             indices
                 .par_iter()
                 .map(|&index| {
@@ -88,57 +88,57 @@ impl BatchEvaluation<'_> {
                 .collect()
         });
         self.check_stop()?;
-        let found: Vec<(OpenCandidate, Vec<f64>)> = found.into_iter().flatten().collect();
-        let mut likely: Vec<OpenCandidate> = found.iter().map(|(open, _)| *open).collect();
+        let candidates: Vec<(OpenCandidate, Vec<f64>)> = candidates.into_iter().flatten().collect();
+        let mut likely: Vec<OpenCandidate> = candidates.iter().map(|(open, _)| *open).collect();
         sort_by_guess(&mut likely);
         let keep = catalogue.options.top;
         likely.truncate(keep.max(16).saturating_mul(4));
-        let mut kept = TopRows::new(keep, f64::INFINITY);
-        self.simulate_open(&likely, &mut kept, BatchPosition::start(0), false)?;
-        let mut tried: HashSet<u64> = likely.iter().map(|open| open.index).collect();
+        let mut top_rows = TopRows::new(keep, f64::INFINITY);
+        self.simulate_open(&likely, &mut top_rows, BatchPosition::start(0), false)?;
+        let mut evaluated: HashSet<u64> = likely.iter().map(|open| open.index).collect();
         let many = |limit: f64| {
-            let waiting = found.iter().filter(|(_, each)| !each.iter().any(|bound| *bound > limit)).count();
-            waiting * HARD_SEARCH_OPEN_RATIO >= found.len()
+            let waiting = candidates.iter().filter(|(_, each)| !each.iter().any(|bound| *bound > limit)).count();
+            waiting * HARD_SEARCH_OPEN_RATIO >= candidates.len()
         };
         let mut hard = false;
         if thorough {
-            self.refine_incumbent(&mut kept, &mut tried)?;
-            hard = closely && many(kept.limit);
-        } else if closely && kept.rows.first().is_some_and(|best| many(best.score)) {
+            self.refine_incumbent(&mut top_rows, &mut evaluated)?;
+            hard = closely && many(top_rows.limit);
+        } else if closely && top_rows.rows.first().is_some_and(|best| many(best.score)) {
             // In a small sample the best score is near the final limit. The worst row of the table is not.
-            self.refine_incumbent(&mut kept, &mut tried)?;
-            hard = many(kept.limit);
+            self.refine_incumbent(&mut top_rows, &mut evaluated)?;
+            hard = many(top_rows.limit);
         }
-        let limit = kept.limit;
+        let limit = top_rows.limit;
         // Without initial coefficients all test vectors are used.
         let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
-            let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
+            let each: Vec<Vec<f64>> = candidates.into_iter().map(|(_, each)| each).collect();
             select_test_vectors(&each, MAX_SEARCH_VECTORS.min(bound.len()), limit)
         });
-        Ok(InitialIncumbent { kept, tried, needs_close_bounds: hard, selected_vectors: which })
+        Ok(InitialIncumbent { kept: top_rows, tried: evaluated, needs_close_bounds: hard, selected_vectors: which })
     }
 }
 
 /// Select the test vectors that together exclude most of a sample, in greedy order.
-fn select_test_vectors(each: &[Vec<f64>], wanted: usize, limit: f64) -> Vec<usize> {
+fn select_test_vectors(each: &[Vec<f64>], most: usize, limit: f64) -> Vec<usize> {
     let mut open: Vec<bool> = vec![true; each.len()];
-    let mut chosen: Vec<usize> = Vec::new();
+    let mut selection: Vec<usize> = Vec::new();
     // Among vectors with equal exclusions, the one with the larger bounds is preferred.
     let gain = |j: usize, open: &[bool]| -> (usize, f64) {
         let values = each.iter().zip(open).filter(|(_, open)| **open).map(|(e, _)| e[j]);
         values.fold((0, 0.0), |(n, sum), v| (n + usize::from(v > limit), sum + v / (v + limit).max(f64::MIN_POSITIVE)))
     };
     let count = each.first().map_or(0, Vec::len);
-    while chosen.len() < wanted.min(count) {
+    while selection.len() < most.min(count) {
         let best = (0..count)
-            .filter(|j| !chosen.contains(j))
+            .filter(|j| !selection.contains(j))
             .map(|j| (gain(j, &open), j))
             .max_by(|a, b| a.0 .0.cmp(&b.0 .0).then(a.0 .1.total_cmp(&b.0 .1)).then(b.1.cmp(&a.1)));
         let Some((_, j)) = best else { break };
         each.iter().zip(&mut open).filter(|(e, _)| e[j] > limit).for_each(|(_, open)| *open = false);
-        chosen.push(j);
+        selection.push(j);
     }
-    chosen
+    selection
 }
 
 /// Rows whose neighbors are evaluated.
@@ -154,44 +154,45 @@ const MAX_OPEN_EVALUATIONS: usize = 512;
 
 impl BatchEvaluation<'_> {
     /// Refine the incumbent from the best rows, and from open candidates sampled over the whole grid.
-    pub(super) fn refine_incumbent(&mut self, kept: &mut TopRows, tried: &mut HashSet<u64>) -> Result<()> {
-        self.search_neighbors(kept, tried)?;
-        let hard = self.sample_unexcluded(kept)?;
-        self.refine_from(&hard, kept, tried)
+    pub(super) fn refine_incumbent(&mut self, top_rows: &mut TopRows, evaluated: &mut HashSet<u64>) -> Result<()> {
+        self.search_neighbors(top_rows, evaluated)?;
+        let hard = self.sample_unexcluded(top_rows)?;
+        self.refine_from(&hard, top_rows, evaluated)
     }
 
     /// Evaluate these candidates, then search around the best rows.
     pub(super) fn refine_from(
         &mut self,
         open: &[OpenCandidate],
-        kept: &mut TopRows,
-        tried: &mut HashSet<u64>,
+        top_rows: &mut TopRows,
+        evaluated: &mut HashSet<u64>,
     ) -> Result<()> {
-        let anew: Vec<OpenCandidate> = open.iter().filter(|open| tried.insert(open.index)).copied().collect();
-        self.simulate_open(&anew, kept, BatchPosition::start(0), false)?;
-        self.search_neighbors(kept, tried)
+        let anew: Vec<OpenCandidate> = open.iter().filter(|open| evaluated.insert(open.index)).copied().collect();
+        self.simulate_open(&anew, top_rows, BatchPosition::start(0), false)?;
+        self.search_neighbors(top_rows, evaluated)
     }
 
     /// Evaluate neighbors of the best rows, distant ones first, until none improves them.
-    pub(super) fn search_neighbors(&mut self, kept: &mut TopRows, tried: &mut HashSet<u64>) -> Result<()> {
+    pub(super) fn search_neighbors(&mut self, top_rows: &mut TopRows, evaluated: &mut HashSet<u64>) -> Result<()> {
         let lattice = &*self.catalogue.lattice;
         let longest = lattice.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
         let longest = longest.chain([lattice.blocks().len()]).max().unwrap_or(1);
         let mut stride = (longest / 8).max(1).next_power_of_two();
-        let first = tried.len();
+        let first = evaluated.len();
         while stride > 0 {
-            let best =
-                |kept: &TopRows| kept.rows.iter().take(LOCAL_SEARCH_ROWS).map(|row| row.index).collect::<Vec<u64>>();
-            let before = best(kept);
+            let best = |top_rows: &TopRows| {
+                top_rows.rows.iter().take(LOCAL_SEARCH_ROWS).map(|row| row.index).collect::<Vec<u64>>()
+            };
+            let before = best(top_rows);
             let mut around: Vec<u64> = before.iter().flat_map(|&index| self.grid_neighbors(index, stride)).collect();
-            around.retain(|&index| tried.insert(index));
+            around.retain(|&index| evaluated.insert(index));
             let open: Vec<OpenCandidate> =
                 around.iter().map(|&index| OpenCandidate { index, bound: 0.0, guess: 0.0 }).collect();
-            self.simulate_open(&open, kept, BatchPosition::start(0), false)?;
-            if best(kept) == before {
+            self.simulate_open(&open, top_rows, BatchPosition::start(0), false)?;
+            if best(top_rows) == before {
                 stride /= 2;
             }
-            if tried.len() - first > MAX_NEIGHBOR_EVALUATIONS {
+            if evaluated.len() - first > MAX_NEIGHBOR_EVALUATIONS {
                 break;
             }
         }
@@ -202,16 +203,16 @@ impl BatchEvaluation<'_> {
     fn grid_neighbors(&self, index: u64, stride: usize) -> Vec<u64> {
         let lattice = &*self.catalogue.lattice;
         let cursor = Cursor::at(lattice, index);
-        let mut here = vec![0; lattice.width()];
-        cursor.each(0, |term, digit| here[term] = digit);
+        let mut digits = vec![0; lattice.width()];
+        cursor.each(0, |term, digit| digits[term] = digit);
         let mut lengths = vec![0; lattice.width()];
         for group in lattice.groups() {
             group.terms.iter().zip(&group.axes).for_each(|(&term, axis)| lengths[term] = axis.len());
         }
         // The order of the equation comes last.
-        here.push(cursor.block());
+        digits.push(cursor.block());
         lengths.push(lattice.blocks().len());
-        let vary: Vec<usize> = (0..here.len()).filter(|&i| lengths[i] > 1).collect();
+        let vary: Vec<usize> = (0..digits.len()).filter(|&i| lengths[i] > 1).collect();
         let whole = u32::try_from(vary.len())
             .ok()
             .and_then(|n| 3_usize.checked_pow(n))
@@ -230,8 +231,8 @@ impl BatchEvaluation<'_> {
                 .flat_map(|(i, j)| (0..9).map(move |way| vec![(i, way % 3), (j, if i == j { 0 } else { way / 3 })]))
                 .collect(),
         };
-        let there = |moves: Vec<(usize, usize)>| {
-            let mut place = here.clone();
+        let neighbor = |moves: Vec<(usize, usize)>| {
+            let mut place = digits.clone();
             for (i, way) in moves {
                 place[i] = match way {
                     0 => place[i],
@@ -242,20 +243,20 @@ impl BatchEvaluation<'_> {
             let block = place.pop()?;
             Cursor::find(lattice, block, &place)
         };
-        moves.into_iter().filter_map(there).collect()
+        moves.into_iter().filter_map(neighbor).collect()
     }
 
     /// Sample of candidates that no bound excludes, the most promising first.
-    fn sample_unexcluded(&mut self, kept: &TopRows) -> Result<Vec<OpenCandidate>> {
+    fn sample_unexcluded(&mut self, top_rows: &TopRows) -> Result<Vec<OpenCandidate>> {
         let catalogue = self.catalogue;
         if catalogue.problem.residual_sums.is_none() {
-            return Ok(self.sample_open(kept.limit, 0)?.0);
+            return Ok(self.sample_open(top_rows.limit, 0)?.0);
         }
         let (count, (stretches, length)) = (catalogue.lattice.count(), SAMPLE_BLOCKS_AND_LENGTH);
         let order = low_discrepancy_order(count.div_ceil(length));
         let starts: Vec<u64> = (0..stretches.min(count.div_ceil(length))).map(|i| order(i) * length).collect();
         let mut hard: Vec<OpenCandidate> = self.pool.install(|| {
-            starts.par_iter().flat_map(|&at| screen(catalogue, at, count.min(at + length), kept.limit).0).collect()
+            starts.par_iter().flat_map(|&at| screen(catalogue, at, count.min(at + length), top_rows.limit).0).collect()
         });
         self.check_stop()?;
         sort_by_guess(&mut hard);

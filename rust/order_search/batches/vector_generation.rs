@@ -56,16 +56,16 @@ impl BatchEvaluation<'_> {
         let share = if time == 0 { 0 } else { count / TAILORED_SAMPLE_RATIO };
         let most = MIN_TAILORED_SAMPLE.max(share).div_ceil(TAILORED_SAMPLE_BLOCK).min(stretches);
         let order = low_discrepancy_order(stretches);
-        let (mut open, mut seen, mut candidates) = (Vec::new(), 0, 0);
-        while seen < most && open.len() < OPEN_SAMPLE_CANDIDATES {
-            let next = most.min(seen + BLOCKS_PER_SCREENING);
+        let (mut open, mut position, mut candidates) = (Vec::new(), 0, 0);
+        while position < most && open.len() < OPEN_SAMPLE_CANDIDATES {
+            let next = most.min(position + BLOCKS_PER_SCREENING);
             let starts: Vec<u64> =
-                (seen..next).map(|i| order((time * most + i) % stretches) * TAILORED_SAMPLE_BLOCK).collect();
+                (position..next).map(|i| order((time * most + i) % stretches) * TAILORED_SAMPLE_BLOCK).collect();
             candidates += starts.iter().map(|&at| count.min(at + TAILORED_SAMPLE_BLOCK) - at).sum::<u64>();
-            let found = |&at: &u64| screen(catalogue, at, count.min(at + TAILORED_SAMPLE_BLOCK), limit).0;
-            open.extend(self.pool.install(|| starts.par_iter().flat_map(found).collect::<Vec<OpenCandidate>>()));
+            let screened = |&at: &u64| screen(catalogue, at, count.min(at + TAILORED_SAMPLE_BLOCK), limit).0;
+            open.extend(self.pool.install(|| starts.par_iter().flat_map(screened).collect::<Vec<OpenCandidate>>()));
             self.check_stop()?;
-            seen = next;
+            position = next;
         }
         sort_by_guess(&mut open);
         #[allow(clippy::cast_precision_loss)]
@@ -87,8 +87,8 @@ impl BatchEvaluation<'_> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
         let (mut one, bytes) = problem.empty_tailored_vectors();
-        let known = problem.tailored_vectors.as_ref().map_or(0, |adapted| adapted.vectors.len() as u64);
-        let room = catalogue.spare_bytes.min(MAX_TAILORED_BYTES.saturating_sub(known * bytes)) / bytes.max(1);
+        let vector_count = problem.tailored_vectors.as_ref().map_or(0, |adapted| adapted.vectors.len() as u64);
+        let room = catalogue.spare_bytes.min(MAX_TAILORED_BYTES.saturating_sub(vector_count * bytes)) / bytes.max(1);
         let room = usize::try_from(room).unwrap_or(MAX_TRIAL_VECTORS).min(MAX_TRIAL_VECTORS);
         if room == 0 {
             return Ok(GeneratedVectors::default());
@@ -106,10 +106,10 @@ impl BatchEvaluation<'_> {
             positions
         };
         let some = subsample(&open, room);
-        let tried = best.into_iter().chain(some.iter().map(|open| open.index)).take(room);
+        let indices = best.into_iter().chain(some.iter().map(|open| open.index)).take(room);
         let places: Vec<Vec<usize>> = open.iter().map(|open| columns(open.index)).collect();
         let mut excluded: Vec<(TailoredVector, Vec<bool>)> = Vec::new();
-        for index in tried {
+        for index in indices {
             one.vectors.extend(self.pool.install(|| problem.tailor_vector(&one, &columns(index))));
             let out = self.pool.install(|| {
                 places.par_iter().map(|columns| problem.excluded_by_tailored(&one, columns, limit)).collect()
@@ -117,29 +117,31 @@ impl BatchEvaluation<'_> {
             excluded.extend(one.vectors.pop().map(|vector| (vector, out)));
             self.check_stop()?;
         }
-        let (mut left, mut made) = (vec![true; open.len()], Vec::new());
-        let gain = |out: &[bool], left: &[bool]| out.iter().zip(left).filter(|(out, left)| **out && **left).count();
+        let (mut is_open, mut new_vectors) = (vec![true; open.len()], Vec::new());
+        let gain = |out: &[bool], is_open: &[bool]| {
+            out.iter().zip(is_open).filter(|(out, is_open)| **out && **is_open).count()
+        };
         let mut next = best.map(|_| 0);
-        while made.len() < MAX_SELECTED_VECTORS {
-            let gains = excluded.iter().map(|(_, out)| gain(out, &left)).enumerate();
+        while new_vectors.len() < MAX_SELECTED_VECTORS {
+            let gains = excluded.iter().map(|(_, out)| gain(out, &is_open)).enumerate();
             let most = gains.max_by(|a, b| a.1.cmp(&b.1).then(b.0.cmp(&a.0)));
-            let chosen = next.take().filter(|_| !excluded.is_empty());
-            let Some(chosen) =
-                chosen.or(most.filter(|(_, most)| all(*most) >= MIN_VECTOR_EXCLUSIONS).map(|(at, _)| at))
+            let candidate = next.take().filter(|_| !excluded.is_empty());
+            let Some(candidate) =
+                candidate.or(most.filter(|(_, most)| all(*most) >= MIN_VECTOR_EXCLUSIONS).map(|(at, _)| at))
             else {
                 break;
             };
-            let (vector, out) = excluded.swap_remove(chosen);
-            made.push(vector);
-            left.iter_mut().zip(&out).for_each(|(left, out)| *left &= !out);
+            let (vector, out) = excluded.swap_remove(candidate);
+            new_vectors.push(vector);
+            is_open.iter_mut().zip(&out).for_each(|(is_open, out)| *is_open &= !out);
         }
-        let left: Vec<OpenCandidate> =
-            open.into_iter().zip(left).filter_map(|(open, left)| left.then_some(open)).collect();
+        let is_open: Vec<OpenCandidate> =
+            open.into_iter().zip(is_open).filter_map(|(open, is_open)| is_open.then_some(open)).collect();
         // The vectors were selected on this sample, so they leave more of other candidates open.
         let again = time + 1 < MAX_GENERATION_PASSES
-            && !made.is_empty()
-            && all(SELECTION_BIAS_FACTOR * left.len()) >= MIN_OPEN_CANDIDATES;
-        Ok(GeneratedVectors { vectors: made, open: left, is_worth_repeating: again })
+            && !new_vectors.is_empty()
+            && all(SELECTION_BIAS_FACTOR * is_open.len()) >= MIN_OPEN_CANDIDATES;
+        Ok(GeneratedVectors { vectors: new_vectors, open: is_open, is_worth_repeating: again })
     }
 }
 
@@ -183,26 +185,26 @@ impl BatchEvaluation<'_> {
         let bytes = groups.keys().map(|own| tangents.bytes(own.len())).max().unwrap_or(1);
         let room = self.catalogue.spare_bytes.min(MAX_LINEARIZED_BYTES) / bytes / (groups.len() as u64).max(1);
         let room = usize::try_from(room).unwrap_or(MAX_LINEARIZED_VECTORS).min(MAX_LINEARIZED_VECTORS);
-        let made: Vec<(Vec<usize>, Vec<LinearizedVector>)> = self.pool.install(|| {
+        let new_vectors: Vec<(Vec<usize>, Vec<LinearizedVector>)> = self.pool.install(|| {
             groups
                 .into_iter()
                 .collect::<Vec<_>>()
                 .into_par_iter()
                 .with_max_len(1)
                 .map(|(own, open)| {
-                    let made = if self.is_stopped() {
+                    let new_vectors = if self.is_stopped() {
                         Vec::new()
                     } else {
                         self.generate_for_own_columns(&tangents, &own, open, weight, limit, room)
                     };
-                    (own, made)
+                    (own, new_vectors)
                 })
                 .collect()
         });
         self.check_stop()?;
-        for (own, made) in made {
-            if !made.is_empty() {
-                tangents.add(own, made);
+        for (own, new_vectors) in new_vectors {
+            if !new_vectors.is_empty() {
+                tangents.add(own, new_vectors);
             }
         }
         Ok((tangents.len() > 0).then_some(tangents))
@@ -216,12 +218,12 @@ impl BatchEvaluation<'_> {
         let count = lattice.count();
         let stretches = count.div_ceil(LINEARIZED_SAMPLE_BLOCK);
         let order = low_discrepancy_order(stretches);
-        let wanted = (count / LINEARIZED_SAMPLE_RATIO)
+        let sample_count = (count / LINEARIZED_SAMPLE_RATIO)
             .min(MAX_LINEARIZED_SAMPLE)
             .div_ceil(LINEARIZED_SAMPLE_BLOCK)
             .clamp(1, stretches);
         let open: Vec<SolvedCandidate> = self.pool.install(|| {
-            (0..wanted)
+            (0..sample_count)
                 .into_par_iter()
                 .flat_map_iter(|i| {
                     let at = order(i) * LINEARIZED_SAMPLE_BLOCK;
@@ -240,7 +242,7 @@ impl BatchEvaluation<'_> {
                 .collect()
         });
         self.check_stop()?;
-        Ok((open, count as f64 / (wanted * LINEARIZED_SAMPLE_BLOCK) as f64))
+        Ok((open, count as f64 / (sample_count * LINEARIZED_SAMPLE_BLOCK) as f64))
     }
 
     /// Generate vectors for candidates with the same own columns. The first is built at the median of the first
@@ -255,32 +257,32 @@ impl BatchEvaluation<'_> {
         room: usize,
     ) -> Vec<LinearizedVector> {
         let problem = &self.catalogue.problem;
-        let first = |known: &SolvedCandidate| known.0.iter().position(|p| *p == own[0]).map_or(0.0, |i| known.1[i]);
+        let first = |solved: &SolvedCandidate| solved.0.iter().position(|p| *p == own[0]).map_or(0.0, |i| solved.1[i]);
         open.sort_by(|a, b| first(a).total_cmp(&first(b)).then_with(|| a.0.cmp(&b.0)));
-        let (mut made, mut vain) = (Vec::new(), 0);
+        let (mut new_vectors, mut vain) = (Vec::new(), 0);
         let mut parts = vec![open];
         #[allow(clippy::cast_precision_loss)]
         let many = |count: usize| count as f64 * weight >= MIN_LINEARIZED_EXCLUSIONS;
         while let Some(mut part) = parts.pop() {
-            if !many(part.len()) || made.len() >= room || vain >= MAX_FAILED_VECTORS {
+            if !many(part.len()) || new_vectors.len() >= room || vain >= MAX_FAILED_VECTORS {
                 continue;
             }
             let middle = part.remove(part.len() / 2);
             let at = first(&middle);
             let mut gained = false;
             if let Some(tangent) = problem.linearize_vector(tangents, &middle.0, &middle.1, limit) {
-                let left: Vec<SolvedCandidate> = problem.not_excluded_by(tangents, &tangent, &part, limit);
-                gained = many(part.len() + 1 - left.len());
+                let remaining: Vec<SolvedCandidate> = problem.not_excluded_by(tangents, &tangent, &part, limit);
+                gained = many(part.len() + 1 - remaining.len());
                 if gained {
-                    made.push(tangent);
-                    part = left;
+                    new_vectors.push(tangent);
+                    part = remaining;
                 }
             }
             vain += usize::from(!gained);
-            let above = part.split_off(part.partition_point(|known| first(known) < at));
+            let above = part.split_off(part.partition_point(|solved| first(solved) < at));
             parts.push(above);
             parts.push(part);
         }
-        made
+        new_vectors
     }
 }

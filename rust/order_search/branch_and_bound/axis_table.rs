@@ -86,20 +86,20 @@ impl RemainingColumns<'_> {
         let inverse = self.normal.inverse()[column];
         let [re, im] = &probes.products[column * probes.groups + group];
         let row = probes.rows[column];
-        let (mut seen, mut rest) = ([ZERO_LANES; 4], ZERO_LANES);
+        let (mut products, mut rest) = ([ZERO_LANES; 4], ZERO_LANES);
         for n in 0..LANE_COUNT {
-            seen[0][n] = re[n] * inverse;
-            seen[1][n] = im[n] * inverse;
+            products[0][n] = re[n] * inverse;
+            products[1][n] = im[n] * inverse;
         }
         if row != NO_INDEX {
             let [a, b, c, _] = &probes.effects[row * probes.groups + group];
             for n in 0..LANE_COUNT {
-                seen[2][n] = a[n] * inverse;
-                seen[3][n] = b[n] * inverse;
+                products[2][n] = a[n] * inverse;
+                products[3][n] = b[n] * inverse;
                 rest[n] = c[n] * inverse;
             }
         }
-        (seen, rest)
+        (products, rest)
     }
 }
 
@@ -133,13 +133,13 @@ impl AxisTable {
                 *g = normal.product(s, column);
             }
             others.solve(shared, raw);
-            let left = 1.0 - shared.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
+            let remainder = 1.0 - shared.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
             let sum = 1.0 + raw.iter().map(|a| a.abs()).sum::<f64>();
             // This also rejects NaN.
-            if left.is_nan() || left <= 1e3 * others.rounding * others.trace * sum * sum {
+            if remainder.is_nan() || remainder <= 1e3 * others.rounding * others.trace * sum * sum {
                 return None;
             }
-            scale[i] = 1.0 / left.sqrt();
+            scale[i] = 1.0 / remainder.sqrt();
             let along: f64 = raw.iter().zip(others.columns).map(|(a, &s)| a * normal.rhs()[s]).sum();
             target[i] = (normal.rhs()[column] - along) * scale[i];
             for (m, a) in mixed[i * k..(i + 1) * k].iter_mut().zip(raw.iter()) {
@@ -147,7 +147,7 @@ impl AxisTable {
             }
         }
         let groups: usize = others.test_vectors.iter().map(|p| p.groups).sum();
-        let mut seen = Vec::with_capacity(n * groups);
+        let mut responses = Vec::with_capacity(n * groups);
         let mut rests = Vec::with_capacity(n * groups);
         let mut sound = ZERO_LANES;
         let mut paired = Vec::new();
@@ -167,27 +167,27 @@ impl AxisTable {
             .collect();
         for (i, &column) in columns.iter().enumerate() {
             for (at, (r, g)) in vector_groups(others.test_vectors).enumerate() {
-                let (mut here, mut rest) = others.vector_products(r, g, column);
+                let (mut column_products, mut rest) = others.vector_products(r, g, column);
                 for (s, along) in along.iter().enumerate() {
                     let a = raw[i * k + s];
-                    for (here, along) in here.iter_mut().zip(&along[at]) {
+                    for (column_products, along) in column_products.iter_mut().zip(&along[at]) {
                         for n in 0..LANE_COUNT {
-                            here[n] -= a * along[n];
+                            column_products[n] -= a * along[n];
                         }
                     }
                 }
-                for here in &mut here {
-                    here.iter_mut().for_each(|v| *v *= scale[i]);
+                for column_products in &mut column_products {
+                    column_products.iter_mut().for_each(|v| *v *= scale[i]);
                 }
                 let mut way = others.distance_to_partner(r, g, column);
                 rest.iter_mut().for_each(|v| *v *= scale[i]);
                 way.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
-                for values in here.iter().chain([&rest, &way]) {
+                for values in column_products.iter().chain([&rest, &way]) {
                     for n in 0..LANE_COUNT {
                         sound[n] += 0.0 * values[n];
                     }
                 }
-                seen.push(here);
+                responses.push(column_products);
                 rests.push([rest, way]);
             }
         }
@@ -196,7 +196,7 @@ impl AxisTable {
             return None;
         }
         let mut side =
-            Self { columns, scale, target, shared, mixed, paired, vector_products: seen, levels: Vec::new() };
+            Self { columns, scale, target, shared, mixed, paired, vector_products: responses, levels: Vec::new() };
         side.build(k, groups, &rests);
         Some(side)
     }

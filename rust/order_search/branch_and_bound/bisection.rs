@@ -138,7 +138,7 @@ impl simd::SimdKernel for SliceScreening<'_> {
         let ready = build_slice_tables(catalogue, boxes, slab, &others, rows.clone())?;
         let start = slab.lo + rows.start as u64 * len;
         let mut screen = Screen::<LANE_COUNT>::new(columns.len());
-        let (mut found, mut waiting) = ((Vec::new(), Vec::new()), [(0, 0, 0); LANE_COUNT]);
+        let (mut screened, mut waiting) = ((Vec::new(), Vec::new()), [(0, 0, 0); LANE_COUNT]);
         let (mut count, mut boxed) = (0, hi - lo);
         let lengths = [rows.len(), slab.len];
         let coarse = lengths.map(|n| INITIAL_BOX_LEVEL.min(n.next_power_of_two().trailing_zeros() as usize));
@@ -182,7 +182,7 @@ impl simd::SimdKernel for SliceScreening<'_> {
                                     &columns,
                                     &waiting[..count],
                                     limit,
-                                    &mut found,
+                                    &mut screened,
                                 );
                                 count = 0;
                             }
@@ -192,9 +192,9 @@ impl simd::SimdKernel for SliceScreening<'_> {
             }
         }
         if count > 0 {
-            screen.screen_slice_candidates(catalogue, slab, &columns, &waiting[..count], limit, &mut found);
+            screen.screen_slice_candidates(catalogue, slab, &columns, &waiting[..count], limit, &mut screened);
         }
-        let (open, singular) = found;
+        let (open, singular) = screened;
         Some((open, singular, boxed))
     }
 }
@@ -292,7 +292,7 @@ pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, in
         let ready = build_slice_tables(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
         let mut strip = RowCoefficients::default();
         ready.compute_coefficients(&mut strip, 0..slab.rows.len());
-        let mut found = Vec::new();
+        let mut bounds = Vec::new();
         let levels = [0, 1].map(|side: usize| ready.sides[side].levels.len());
         for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
             for at in 0..ready.sides[0].levels[a].coefficient_sums.len() {
@@ -301,7 +301,7 @@ pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, in
                     let ((u0, u1), (v0, v1)) = (both[0].ends(slab.rows.len()), both[1].ends(slab.len));
                     let cell = ready.box_quantities(&strip, both);
                     let bound = cell.map_or(0.0, |cell| ready.bound(both, &cell, f64::INFINITY));
-                    found.push(BoxBound {
+                    bounds.push(BoxBound {
                         first: slab.lo + (u0 * slab.len + v0) as u64,
                         rows: (u1 - u0 + 1) as u64,
                         values: (v1 - v0 + 1) as u64,
@@ -311,7 +311,7 @@ pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, in
                 }
             }
         }
-        Some(found)
+        Some(bounds)
     })
 }
 
@@ -406,10 +406,10 @@ mod tests {
     fn relative_deviations(whole: &CornerValues, one: &CornerValues, place: (f64, f64)) -> [Wide; 2] {
         let corners = |of: &dyn Fn(usize) -> f64| interpolate_bilinear(std::array::from_fn(of), place);
         let apart = |part: usize, n: usize| one.values[0][part][n] - corners(&|c| whole.values[c][part][n]);
-        let seen = |n: usize| apart(0, n).hypot(apart(1, n)) / whole.remainders[0][n];
+        let ratio = |n: usize| apart(0, n).hypot(apart(1, n)) / whole.remainders[0][n];
         let more = |n: usize| (one.slack[0][n] - corners(&|c| whole.slack[c][n])).max(0.0);
         let size = |n: usize| (apart(2, n).hypot(apart(3, n)) + more(n)) / whole.remainders[1][n];
-        [std::array::from_fn(seen), std::array::from_fn(size)]
+        [std::array::from_fn(ratio), std::array::from_fn(size)]
     }
 
     #[test]
@@ -418,7 +418,7 @@ mod tests {
         for case in 0..40 {
             let (record, lattice) = problem(case)?;
             let options = Options { norm: [Norm::L1, Norm::L2][case as usize / 4 % 2], ..Options::default() };
-            let found = with_slice(&[record], &lattice, &options, u64::from(case) * 7, |catalogue, boxes, slab| {
+            let bounds = with_slice(&[record], &lattice, &options, u64::from(case) * 7, |catalogue, boxes, slab| {
                 let columns = first_columns(catalogue, slab);
                 let (others, inverse) = factor_remaining_columns(catalogue, slab, &columns)?;
                 let others = boxes.remaining_columns(catalogue, &others, &inverse)?;
@@ -426,7 +426,7 @@ mod tests {
                 let mut strip = RowCoefficients::default();
                 ready.compute_coefficients(&mut strip, 0..slab.rows.len());
                 let groups = others.test_vectors.first().map_or(0, |p: &TestVectors| p.groups);
-                let held =
+                let deviation_bound =
                     |both: [Interval; 2], cell: &BoxQuantities, group: usize, together: Option<Option<usize>>| {
                         let moduli = ready.moduli(both, cell);
                         let together = together.unwrap_or_else(|| ready.joint_partner(both, cell, &moduli, group));
@@ -442,14 +442,14 @@ mod tests {
                         let ends = [both[0].ends(slab.rows.len()), both[1].ends(slab.len)];
                         let Some(cell) = ready.box_quantities(&strip, both) else { continue };
                         for group in (0..groups).filter(|_| a + b > 0) {
-                            let (whole, together) = held(both, &cell, group, None);
+                            let (whole, together) = deviation_bound(both, &cell, group, None);
                             let mut nearest = [0.0_f64; 2];
                             for (i, j) in
                                 (ends[0].0..=ends[0].1).flat_map(|i| (ends[1].0..=ends[1].1).map(move |j| (i, j)))
                             {
                                 let alone = [Interval { level: 0, at: i }, Interval { level: 0, at: j }];
                                 let Some(cell) = ready.box_quantities(&strip, alone) else { continue };
-                                let (one, _) = held(alone, &cell, group, Some(together));
+                                let (one, _) = deviation_bound(alone, &cell, group, Some(together));
                                 let place = |x: usize, (from, to): (usize, usize)| {
                                     2.0 * (x - from) as f64 / (to - from).max(1) as f64 - 1.0
                                 };
@@ -466,10 +466,10 @@ mod tests {
                 }
                 Some(most)
             })?;
-            if found.is_empty() {
+            if bounds.is_empty() {
                 return Err(Error::Internal { what: format!("nothing was proved of case {case}") });
             }
-            nearest.extend(found);
+            nearest.extend(bounds);
         }
         for (part, name) in ["the projection", "the divisor"].into_iter().enumerate() {
             let most = nearest.iter().map(|near| near[part]).fold(0.0, f64::max);

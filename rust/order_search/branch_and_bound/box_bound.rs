@@ -57,10 +57,10 @@ impl SearchConstants {
             .map(|(r, g)| {
                 let mut tops = [ZERO_LANES; 2];
                 for p in 0..width {
-                    let (seen, _) = others.vector_products(r, g, p);
+                    let (products, _) = others.vector_products(r, g, p);
                     for half in 0..2 {
                         for n in 0..LANE_COUNT {
-                            tops[half][n] = tops[half][n].max(seen[2 * half][n].hypot(seen[2 * half + 1][n]));
+                            tops[half][n] = tops[half][n].max(products[2 * half][n].hypot(products[2 * half + 1][n]));
                         }
                     }
                 }
@@ -204,17 +204,17 @@ impl<'a> SliceTables<'a> {
         let (mut base, mut rests) = (Vec::new(), Vec::new());
         for (r, g) in vector_groups(others.test_vectors) {
             let probes = &others.test_vectors[r];
-            let mut here = [probes.target[g][0], probes.target[g][1], probes.size[g], ZERO_LANES];
+            let mut slice_products = [probes.target[g][0], probes.target[g][1], probes.size[g], ZERO_LANES];
             for (c, &s) in base_coefficients.iter().zip(others.columns) {
-                let (seen, rest) = others.vector_products(r, g, s);
-                for (here, seen) in here.iter_mut().zip(&seen) {
+                let (products, rest) = others.vector_products(r, g, s);
+                for (slice_products, products) in slice_products.iter_mut().zip(&products) {
                     for n in 0..LANE_COUNT {
-                        here[n] -= c * seen[n];
+                        slice_products[n] -= c * products[n];
                     }
                 }
                 rests.push(rest);
             }
-            base.push(here);
+            base.push(slice_products);
         }
         let explained: f64 = base_coefficients.iter().zip(&rhs).map(|(c, g)| c * g).sum();
         let of = |side: &AxisTable| {
@@ -239,8 +239,8 @@ impl<'a> SliceTables<'a> {
         let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
         let [u, v] = &self.sides;
         (strip.start, strip.len) = (rows.start, len);
-        let RowCoefficients { plus, minus, independence: left, product, .. } = strip;
-        for all in [&mut *plus, minus, left] {
+        let RowCoefficients { plus, minus, independence: independence, product, .. } = strip;
+        for all in [&mut *plus, minus, independence] {
             all.resize(rows.len() * len, 0.0);
         }
         product.resize((k + 1) * len, 0.0);
@@ -261,7 +261,7 @@ impl<'a> SliceTables<'a> {
                 }
             }
             let at = at * len..(at + 1) * len;
-            let (plus, minus, left) = (&mut plus[at.clone()], &mut minus[at.clone()], &mut left[at]);
+            let (plus, minus, independence) = (&mut plus[at.clone()], &mut minus[at.clone()], &mut independence[at]);
             let (scales, targets) = (&v.scale[..len], &v.target[..len]);
             for j in 0..len {
                 let (b, z) = (product[j] * scales[j], targets[j]);
@@ -269,7 +269,7 @@ impl<'a> SliceTables<'a> {
                 let both = above * below;
                 let sound = both > COLLINEARITY_TOLERANCE;
                 let half = if sound { 0.5 / both } else { 0.0 };
-                left[j] = if sound { both } else { 0.0 };
+                independence[j] = if sound { both } else { 0.0 };
                 plus[j] = (y + z) * below * half;
                 minus[j] = (y - z) * above * half;
             }
@@ -292,16 +292,16 @@ impl<'a> SliceTables<'a> {
             ps[c] = halves[0][c] + halves[1][c];
             qs[c] = halves[0][c] - halves[1][c];
         }
-        let (off, left, explained) = if self.common.ranks_equation_error {
-            let (left, explained) = strip.max_explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
-            ([0.0; 2], left, explained)
+        let (off, independence, explained) = if self.common.ranks_equation_error {
+            let (independence, explained) = strip.max_explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
+            ([0.0; 2], independence, explained)
         } else {
-            let (off, left) = strip.bilinear_deviation([(u0, u1), (v0, v1)], halves.map(bilinear));
-            (off, left, 0.0)
+            let (off, independence) = strip.bilinear_deviation([(u0, u1), (v0, v1)], halves.map(bilinear));
+            (off, independence, 0.0)
         };
-        let left = left - 2.0 * self.others.rounding * self.others.trace * sums * sums;
+        let independence = independence - 2.0 * self.others.rounding * self.others.trace * sums * sums;
         // NaN proves nothing.
-        if left.is_nan() || left <= 0.0 {
+        if independence.is_nan() || independence <= 0.0 {
             return None;
         }
         let largest = |x: &[f64; 4]| x.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
@@ -309,13 +309,13 @@ impl<'a> SliceTables<'a> {
         let (p, q, p_most, q_most) = (bilinear(ps), bilinear(qs), largest(&ps) + both, largest(&qs) + both);
 
         // Moduli of the coefficients and their rounding-error bounds.
-        let trace = self.others.trace + sums * sums / left;
+        let trace = self.others.trace + sums * sums / independence;
         let all = self.common.weighted_size
             + self.base_coefficients.iter().map(|c| c.abs()).sum::<f64>()
             + p_most * pu.sum
             + q_most * pv.sum;
         let terms = to_f64(self.others.columns.len() + 2);
-        let lost = ELIMINATION_ERROR * terms * terms * trace * all;
+        let rounding = ELIMINATION_ERROR * terms * terms * trace * all;
         let bends = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
         Some(BoxQuantities {
             at,
@@ -327,7 +327,7 @@ impl<'a> SliceTables<'a> {
             mixed_slopes: bends,
             explained,
             all,
-            rounding: lost,
+            rounding: rounding,
         })
     }
 
@@ -378,10 +378,10 @@ impl<'a> SliceTables<'a> {
                 let mut bounds = [f64::MAX; LANE_COUNT];
                 for (value, slack) in values.iter().zip(&slack) {
                     for n in 0..LANE_COUNT {
-                        let seen = value[0][n] * along[0][n] + value[1][n] * along[1][n] - rough[0][n];
+                        let response = value[0][n] * along[0][n] + value[1][n] * along[1][n] - rough[0][n];
                         let size = (value[2][n] * value[2][n] + value[3][n] * value[3][n]).sqrt();
                         // A hair more, for the rounding of the divisor and of the score itself.
-                        let bound = seen / ((size + slack[n] + rough[1][n]) * (1.0 + probes.unit));
+                        let bound = response / ((size + slack[n] + rough[1][n]) * (1.0 + probes.unit));
                         // Neither NaN nor an overflow proves anything.
                         let bound = if bound > 0.0 && bound < f64::MAX { bound } else { 0.0 };
                         bounds[n] = if bound < bounds[n] { bound } else { bounds[n] };
@@ -407,7 +407,7 @@ impl<'a> SliceTables<'a> {
     pub(super) fn moduli(&self, [su, sv]: [Interval; 2], cell: &BoxQuantities) -> Moduli {
         let k = self.others.columns.len();
         let [u, v] = &self.sides;
-        let BoxQuantities { at, wide: [wu, wv], ps, qs, rounding: lost, .. } = *cell;
+        let BoxQuantities { at, wide: [wu, wv], ps, qs, rounding: rounding, .. } = *cell;
         let ((u0, v0), (u1, v1)) = (at[0], at[3]);
         let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
         let (mut others, mut rests) = ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);
@@ -418,7 +418,7 @@ impl<'a> SliceTables<'a> {
             }
             let a = LinearApproximation::new(u.mixed[u0 * k + s], u.mixed[u1 * k + s], wu * lu.mixed[su.at * k + s]);
             let b = LinearApproximation::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
-            rests[s] = cell.remainder([a, b]) + lost;
+            rests[s] = cell.remainder([a, b]) + rounding;
         }
         let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
         if let Some(partner) = self.partner() {
@@ -432,7 +432,7 @@ impl<'a> SliceTables<'a> {
             };
             let a = LinearApproximation::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
             let b = LinearApproximation::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
-            sums_rest = cell.remainder([a, b]) + lost * self.common.ratio;
+            sums_rest = cell.remainder([a, b]) + rounding * self.common.ratio;
         }
         Moduli { others, rests, sums, sums_rest }
     }
@@ -488,7 +488,7 @@ impl<'a> SliceTables<'a> {
             bilinear_deviation: off,
             mixed_slopes: bends,
             all,
-            rounding: lost,
+            rounding: rounding_error,
             ..
         } = *cell;
         let both = off[0] + off[1];
@@ -516,16 +516,17 @@ impl<'a> SliceTables<'a> {
                     + both * (sizes[2] + sizes[3])
                     + wu * bu[half][n] * p_most
                     + wv * bv[half][n] * q_most
-                    + lost * tops[half][n];
+                    + rounding_error * tops[half][n];
             }
         }
-        let rounding = self.others.test_vectors[record].target_rounding + (all + lost) * self.common.rounding[record];
+        let rounding =
+            self.others.test_vectors[record].target_rounding + (all + rounding_error) * self.common.rounding[record];
         rough[0].iter_mut().for_each(|rough| *rough += rounding);
         // Slack of the varying columns (their scale is at least 1), then of the remaining ones.
         let mut slack = [ZERO_LANES; 4];
         let part = if together.is_some() { 3 } else { 2 };
         for n in 0..LANE_COUNT {
-            rough[1][n] += (both + lost) * (bu[part][n] + bv[part][n]);
+            rough[1][n] += (both + rounding_error) * (bu[part][n] + bv[part][n]);
             for corner in 0..4 {
                 slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
             }
@@ -533,10 +534,10 @@ impl<'a> SliceTables<'a> {
         let rest_of = &self.rests[group * k..(group + 1) * k];
         for (s, rest) in rest_of.iter().enumerate() {
             let paired = together == Some(s);
-            let (sizes, beyond) =
+            let (sizes, norms) =
                 if paired { (&moduli.sums, moduli.sums_rest) } else { (&moduli.others[s], moduli.rests[s]) };
             for n in 0..LANE_COUNT {
-                rough[1][n] += beyond * rest[n];
+                rough[1][n] += norms * rest[n];
                 for corner in 0..4 {
                     slack[corner][n] += sizes[corner] * rest[n];
                 }
@@ -601,7 +602,7 @@ impl RowCoefficients {
         [(u0, u1), (v0, v1)]: [(usize, usize); 2],
         [plus, minus]: [[f64; 4]; 2],
     ) -> ([f64; 2], f64) {
-        let (mut far, mut left) = ([[0.0_f64; ROW_LANES]; 2], [f64::INFINITY; ROW_LANES]);
+        let (mut far, mut independence) = ([[0.0_f64; ROW_LANES]; 2], [f64::INFINITY; ROW_LANES]);
         let width = v1 - v0 + 1;
         let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / to_f64(b - a) } else { 0.0 });
         for row in 0..=u1 - u0 {
@@ -620,7 +621,7 @@ impl RowCoefficients {
                     let b = (minus[n] - (second + y * place[n])).abs();
                     far[0][n] = if a > far[0][n] { a } else { far[0][n] };
                     far[1][n] = if b > far[1][n] { b } else { far[1][n] };
-                    left[n] = if lefts[n] < left[n] { lefts[n] } else { left[n] };
+                    independence[n] = if lefts[n] < independence[n] { lefts[n] } else { independence[n] };
                     place[n] += LANE_OFFSETS[ROW_LANES - 1] + 1.0;
                 }
             }
@@ -629,34 +630,34 @@ impl RowCoefficients {
                 let b = (rest[1][n] - (second + y * place[n])).abs();
                 far[0][n] = if a > far[0][n] { a } else { far[0][n] };
                 far[1][n] = if b > far[1][n] { b } else { far[1][n] };
-                left[n] = if rest[2][n] < left[n] { rest[2][n] } else { left[n] };
+                independence[n] = if rest[2][n] < independence[n] { rest[2][n] } else { independence[n] };
             }
         }
         let most = |x: [f64; ROW_LANES]| x.into_iter().fold(0.0_f64, f64::max);
-        ([most(far[0]), most(far[1])], left.into_iter().fold(f64::INFINITY, f64::min))
+        ([most(far[0]), most(far[1])], independence.into_iter().fold(f64::INFINITY, f64::min))
     }
 
     /// Smallest 1 − B² over a box, and the largest part of ‖y‖² explained by û and v̂.
     #[inline(always)]
     pub(super) fn max_explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
-        let (mut left, mut most) = ([f64::INFINITY; ROW_LANES], [f64::NEG_INFINITY; ROW_LANES]);
+        let (mut independence, mut most) = ([f64::INFINITY; ROW_LANES], [f64::NEG_INFINITY; ROW_LANES]);
         let width = v1 - v0 + 1;
         for row in u0..u1 + 1 {
             let (y, start) = (y[row], self.at(row, v0));
-            let here = [&self.plus, &self.minus, &self.independence].map(|from| &from[start..start + width]);
+            let sums = [&self.plus, &self.minus, &self.independence].map(|from| &from[start..start + width]);
             let z = &z[v0..v0 + width];
             let mut at = 0;
             while at < width {
                 let lanes = ROW_LANES.min(width - at);
                 for n in 0..lanes {
-                    let explained = here[0][at + n] * (y + z[at + n]) + here[1][at + n] * (y - z[at + n]);
+                    let explained = sums[0][at + n] * (y + z[at + n]) + sums[1][at + n] * (y - z[at + n]);
                     most[n] = if explained > most[n] { explained } else { most[n] };
-                    left[n] = if here[2][at + n] < left[n] { here[2][at + n] } else { left[n] };
+                    independence[n] = if sums[2][at + n] < independence[n] { sums[2][at + n] } else { independence[n] };
                 }
                 at += lanes;
             }
         }
-        (left.into_iter().fold(f64::INFINITY, f64::min), most.into_iter().fold(f64::NEG_INFINITY, f64::max))
+        (independence.into_iter().fold(f64::INFINITY, f64::min), most.into_iter().fold(f64::NEG_INFINITY, f64::max))
     }
 }
 

@@ -136,8 +136,9 @@ impl NormalEquations {
             rhs[a] = rows.of(&normal.rhs);
             for (columns, fixed) in positions.iter().zip(&self.fixed) {
                 if let Some(value) = *fixed {
-                    let (size, known) = (columns.of(&normal.size), rows.with(columns, &normal.correlation, width));
-                    (0..L).for_each(|n| rhs[a][n] -= value * size[n] * known[n]);
+                    let (size, correlation) =
+                        (columns.of(&normal.size), rows.with(columns, &normal.correlation, width));
+                    (0..L).for_each(|n| rhs[a][n] -= value * size[n] * correlation[n]);
                 }
             }
         }
@@ -157,8 +158,8 @@ impl NormalEquations {
                 rhs[a] = [part.rhs[e]; L];
                 for (columns, fixed) in positions.iter().zip(&self.fixed) {
                     if let Some(value) = *fixed {
-                        let (size, known) = (columns.of(&part.size), columns.of(row));
-                        (0..L).for_each(|n| rhs[a][n] -= value * size[n] * known[n]);
+                        let (size, correlation) = (columns.of(&part.size), columns.of(row));
+                        (0..L).for_each(|n| rhs[a][n] -= value * size[n] * correlation[n]);
                     }
                 }
             }

@@ -340,11 +340,11 @@ impl Problem {
     pub(crate) fn not_excluded_by(
         &self,
         tangents: &LinearizedVectors,
-        made: &LinearizedVector,
+        linearized: &LinearizedVector,
         all: &[SolvedCandidate],
         limit: f64,
     ) -> Vec<SolvedCandidate> {
-        all.iter().filter(|(terms, c)| !tangents.vector_excludes(made, terms, c, limit)).cloned().collect()
+        all.iter().filter(|(terms, c)| !tangents.vector_excludes(linearized, terms, c, limit)).cloned().collect()
     }
 
     /// Build the test for unstable zeros if its tables fit into this memory \[bytes\]. Return the memory used. Runs on
@@ -418,7 +418,7 @@ impl Problem {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let Scratch {
             norm_cache: memory,
-            lookup: held,
+            lookup: lookup,
             infeasibility: reach,
             start,
             one,
@@ -467,7 +467,13 @@ impl Problem {
             return Verdict::Bounded(limit);
         }
         if let (Some(tangents), true) = (&self.linearized_vectors, limit < f64::INFINITY)
-            && simd::dispatch_simd(LinearizedVectorKernel { tangents, limit, terms: positions, coefficients, held })
+            && simd::dispatch_simd(LinearizedVectorKernel {
+                tangents,
+                limit,
+                terms: positions,
+                coefficients,
+                held: lookup,
+            })
         {
             return Verdict::Bounded(limit);
         }

@@ -194,8 +194,8 @@ impl<'a> CommonFactor<'a> {
         let mut excluded = [false; L];
         for n in 0..L {
             // This form of the condition lets NaN exclude nothing.
-            let known = (pivot[n] > 0.0) & ((self.trace + sum[n] * inverse[n]) * flat <= 1.0);
-            excluded[n] = known & (error[n] - slack * size[n] * size[n] > limit);
+            let is_sound = (pivot[n] > 0.0) & ((self.trace + sum[n] * inverse[n]) * flat <= 1.0);
+            excluded[n] = is_sound & (error[n] - slack * size[n] * size[n] > limit);
         }
         excluded
     }
@@ -232,7 +232,7 @@ mod tests {
     #[test]
     fn nothing_within_a_limit_is_excluded_however_alike_the_columns() {
         let state = &mut 5;
-        let (mut proved, mut kept, mut none) = (0, 0, 0);
+        let (mut proved, mut open_count, mut none) = (0, 0, 0);
         for case in 0..240_u32 {
             let (m, terms, along) = (30 + case as usize % 170, 1 + case as usize % 6, 3 + case as usize % 23);
             let share = libm::pow(10.0, -f64::from(case % 15) / 2.0);
@@ -270,10 +270,10 @@ mod tests {
                 assert_eq!(one, open, "one at a time");
                 open.clear();
                 shared.append_open::<8>(&changing, 0.5 * score, &mut open);
-                *(if open.contains(&n) { &mut kept } else { &mut proved }) += 1;
+                *(if open.contains(&n) { &mut open_count } else { &mut proved }) += 1;
             }
         }
-        println!("{proved} excluded at half their score, {kept} not; {none} stretches without a factor");
-        assert!(proved > 1000 && proved > kept && none > 10);
+        println!("{proved} excluded at half their score, {open_count} not; {none} stretches without a factor");
+        assert!(proved > 1000 && proved > open_count && none > 10);
     }
 }

@@ -91,31 +91,31 @@ pub struct Certificate {
 pub fn certify(
     records: &[Record],
     region: &Region,
-    asked: &CertificateOptions,
+    options: &CertificateOptions,
     control: &Control,
 ) -> Result<Certificate> {
     check_records(records, region.output, region.terms.iter().map(|t| t.signal))?;
     region.check()?;
-    if !(asked.tolerance > 0.0 && asked.tolerance < 1.0) {
+    if !(options.tolerance > 0.0 && options.tolerance < 1.0) {
         return Err(Error::OutOfRange {
             name: "within".into(),
-            value: asked.tolerance,
+            value: options.tolerance,
             range: "(0, 1)".into(),
             remedy: "0.05 asks for a proof that nothing is better by more than 5 %".into(),
         });
     }
-    if !(asked.max_coefficient >= 1.0 && asked.max_coefficient <= 1e9) {
+    if !(options.max_coefficient >= 1.0 && options.max_coefficient <= 1e9) {
         return Err(Error::OutOfRange {
             name: "largest".into(),
-            value: asked.max_coefficient,
+            value: options.max_coefficient,
             range: "[1, 1e9]".into(),
             remedy: "100 leaves out terms that cancel but for a hundredth".into(),
         });
     }
-    let pool = pool(asked.threads)?;
+    let pool = pool(options.threads)?;
     pool.install(|| {
-        let tables = GramTables::new(records, region, asked.memory, control)?;
-        CellBisection { tables, region, options: asked, control }.run(records)
+        let tables = GramTables::new(records, region, options.memory, control)?;
+        CellBisection { tables, region, options: options, control }.run(records)
     })
 }
 
@@ -142,8 +142,8 @@ impl CellBisection<'_> {
             self.options.max_cells.min(self.options.memory.saturating_sub(self.tables.bytes) / CELL_MEMORY_BYTES);
         // A good incumbent saves bisections.
         for cells in cells.chunks(CELLS_PER_PASS) {
-            let found = self.bounds(cells, 0.0)?;
-            self.update_best(records, (cells, &found), &mut best, &mut place)?;
+            let bounds = self.bounds(cells, 0.0)?;
+            self.update_best(records, (cells, &bounds), &mut best, &mut place)?;
         }
         self.polish(records, &mut best, &mut place)?;
         while !cells.is_empty() {
@@ -156,15 +156,15 @@ impl CellBisection<'_> {
             self.control.total.store(bounded + cells.len() as u64, Ordering::Relaxed);
             let mut next = Vec::new();
             for cells in cells.chunks(CELLS_PER_PASS) {
-                let found = self.bounds(cells, target(best))?;
+                let bounds = self.bounds(cells, target(best))?;
                 self.control.count(cells.len() as u64, 0);
-                self.update_best(records, (cells, &found), &mut best, &mut place)?;
+                self.update_best(records, (cells, &bounds), &mut best, &mut place)?;
                 let goal = target(best);
-                for (cell, found) in cells.iter().zip(&found) {
-                    let least = found.lower_bound.max(cell.inherited_bound);
+                for (cell, bounds) in cells.iter().zip(&bounds) {
+                    let least = bounds.lower_bound.max(cell.inherited_bound);
                     if least >= goal {
                         proved = proved.min(least);
-                    } else if let Some(halves) = self.halve_cell(cell, least, &found.costs) {
+                    } else if let Some(halves) = self.halve_cell(cell, least, &bounds.costs) {
                         next.extend(halves.into_iter().flatten());
                     } else {
                         open += 1;
@@ -193,26 +193,26 @@ impl CellBisection<'_> {
             let all = chunk.iter().take(if self.control.is_stopped() { 0 } else { CELLS_PER_TASK });
             all.map(|cell| self.bound(cell, goal)).collect()
         };
-        let found = cells.par_chunks(CELLS_PER_TASK).flat_map_iter(bounds).collect();
+        let cell_bounds = cells.par_chunks(CELLS_PER_TASK).flat_map_iter(bounds).collect();
         self.control.check_stop()?;
-        Ok(found)
+        Ok(cell_bounds)
     }
 
     /// Update the best orders from those near the best midpoints of some cells.
     fn update_best(
         &self,
         records: &[Record],
-        (cells, found): (&[Cell], &[CellBound]),
+        (cells, bounds): (&[Cell], &[CellBound]),
         best: &mut f64,
         place: &mut Vec<f64>,
     ) -> Result<()> {
-        let mut likely: Vec<usize> = (0..cells.len()).filter(|&n| found[n].midpoint_residual < *best).collect();
-        likely.sort_by(|&a, &b| found[a].midpoint_residual.total_cmp(&found[b].midpoint_residual).then(a.cmp(&b)));
+        let mut likely: Vec<usize> = (0..cells.len()).filter(|&n| bounds[n].midpoint_residual < *best).collect();
+        likely.sort_by(|&a, &b| bounds[a].midpoint_residual.total_cmp(&bounds[b].midpoint_residual).then(a.cmp(&b)));
         for n in likely.into_iter().take(MIDPOINTS_PER_PASS) {
-            let Some(there) = self.region.midpoint_orders(&self.cell_intervals(&cells[n])) else { continue };
-            let left = self.relative_residual(records, &there)?;
-            if left < *best {
-                (*best, *place) = (left, there);
+            let Some(orders) = self.region.midpoint_orders(&self.cell_intervals(&cells[n])) else { continue };
+            let residual = self.relative_residual(records, &orders)?;
+            if residual < *best {
+                (*best, *place) = (residual, orders);
             }
         }
         Ok(())
@@ -220,11 +220,12 @@ impl CellBisection<'_> {
 
     /// Bound of one cell. The subspace bound is added if the first one misses the goal.
     fn bound(&self, cell: &Cell, goal: f64) -> CellBound {
-        let mut found = self.tables.local(cell).bound();
-        if found.lower_bound.max(cell.inherited_bound) < goal {
-            found.lower_bound = found.lower_bound.max(self.tables.span(cell).bound(self.options.max_coefficient, goal));
+        let mut cell_bound = self.tables.local(cell).bound();
+        if cell_bound.lower_bound.max(cell.inherited_bound) < goal {
+            cell_bound.lower_bound =
+                cell_bound.lower_bound.max(self.tables.span(cell).bound(self.options.max_coefficient, goal));
         }
-        found
+        cell_bound
     }
 
     /// Relative squared residual at these orders of integration, computed without tables.
@@ -254,21 +255,23 @@ impl CellBisection<'_> {
             .flat_map(|(i, j)| ways.into_iter().flat_map(move |a| ways.into_iter().map(move |b| [(i, a), (j, b)])))
             .filter(|[(i, a), (j, b)]| *a != 0.0 && (i == j) == (*b == 0.0))
             .collect();
-        let (mut step, mut tried) = (cell_width(1), 0);
-        while step > cell_width(MAX_CELL_LEVEL) && tried < MAX_POLISH_EVALUATIONS {
+        let (mut step, mut evaluations) = (cell_width(1), 0);
+        while step > cell_width(MAX_CELL_LEVEL) && evaluations < MAX_POLISH_EVALUATIONS {
             let before = *best;
             for moves in &moves {
                 self.control.check_stop()?;
                 let Some((alpha, mut orders)) = self.region.orders(place) else { return Ok(()) };
                 orders.push(alpha);
                 moves.iter().for_each(|(term, way)| orders[*term] += way * step);
-                let Some(there) = self.region.of_orders(orders[k], &orders[..k]).filter(|there| there != place) else {
+                let Some(candidate) =
+                    self.region.of_orders(orders[k], &orders[..k]).filter(|candidate| candidate != place)
+                else {
                     continue;
                 };
-                tried += 1;
-                let left = self.relative_residual(records, &there)?;
-                if left < *best {
-                    (*best, *place) = (left, there);
+                evaluations += 1;
+                let residual = self.relative_residual(records, &candidate)?;
+                if residual < *best {
+                    (*best, *place) = (residual, candidate);
                 }
             }
             if *best >= before {

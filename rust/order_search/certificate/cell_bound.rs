@@ -70,17 +70,17 @@ impl CellProducts {
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn bound(&self) -> CellBound {
         let k = self.k;
-        let mut found = CellBound { lower_bound: 0.0, midpoint_residual: f64::INFINITY, costs: self.halves };
-        let Some(inverse) = inverse(self.products[0], k) else { return found };
+        let mut cell_bound = CellBound { lower_bound: 0.0, midpoint_residual: f64::INFINITY, costs: self.halves };
+        let Some(inverse) = inverse(self.products[0], k) else { return cell_bound };
         let trace: f64 = (0..k).map(|i| inverse[i][i]).sum();
         let terms = (k * k) as f64;
-        let lost = self.rounding * terms;
+        let rounding = self.rounding * terms;
         let elimination = 64.0 * f64::EPSILON * terms * terms * trace * trace;
         // This form of the condition also rejects NaN.
-        if !(trace * lost < INVERSE_TOLERANCE * INVERSE_TOLERANCE
+        if !(trace * rounding < INVERSE_TOLERANCE * INVERSE_TOLERANCE
             && elimination < INVERSE_TOLERANCE * INVERSE_TOLERANCE)
         {
-            return found;
+            return cell_bound;
         }
         let mut c = [0.0; MAX_TERMS];
         for i in 0..k {
@@ -95,9 +95,9 @@ impl CellProducts {
         let square = 1.0 - explained;
         let error = self.rounding * all * all;
         if !(square.is_finite() && square > error) {
-            return found;
+            return cell_bound;
         }
-        found.midpoint_residual = square;
+        cell_bound.midpoint_residual = square;
         let size = (square + error).sqrt();
         let (mut tau, mut gamma, mut a) = ([0.0; MAX_TERMS], [0.0; MAX_TERMS], [[0.0; MAX_TERMS]; MAX_TERMS]);
         for j in 0..k {
@@ -110,22 +110,22 @@ impl CellProducts {
                     let terms = (0..k).map(|l| inverse[i][l] * self.products[m][l][j]);
                     terms.fold((0.0, 0.0), |(sum, all), x| (sum + x, all + x.abs()))
                 };
-                let rounded = lost * trace;
+                let rounded = rounding * trace;
                 let within = taylor_sum(half, |m| {
                     let (sum, all) = part(m);
                     sum.abs() + rounded * (all + (1.0 + trace) * self.sizes[m][j])
                 });
-                let beyond = (inverse[i][i].max(0.0) * (1.0 + INVERSE_TOLERANCE)).sqrt() * self.rests[j];
-                a[i][j] = within + beyond;
+                let outer = (inverse[i][i].max(0.0) * (1.0 + INVERSE_TOLERANCE)).sqrt() * self.rests[j];
+                a[i][j] = within + outer;
             }
         }
         let costs = |j: usize| (0..k).map(|i| a[i][j]).sum::<f64>();
-        (0..k).for_each(|j| found.costs[j] = costs(j));
-        let Some(b) = dominating_vector(&a, &gamma, &tau, k) else { return found };
+        (0..k).for_each(|j| cell_bound.costs[j] = costs(j));
+        let Some(b) = dominating_vector(&a, &gamma, &tau, k) else { return cell_bound };
         let (mut first, mut second) = (0.0, 0.0);
         for i in 0..k {
             let cost = 2.0 * c[i].abs() * b[i];
-            found.costs[i] = cost;
+            cell_bound.costs[i] = cost;
             first += cost;
             for j in 0..k {
                 second += (b[i] + tau[i]) * inverse[i][j].abs() * (b[j] + tau[j]);
@@ -134,9 +134,9 @@ impl CellProducts {
         let least = (square - error - first - second * (1.0 + INVERSE_TOLERANCE)) * (1.0 - BOUND_MARGIN * BOUND_MARGIN);
         // Neither NaN nor an overflow proves anything.
         if least > 0.0 && least.is_finite() {
-            found.lower_bound = least;
+            cell_bound.lower_bound = least;
         }
-        found
+        cell_bound
     }
 }
 
@@ -173,7 +173,7 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
             matrix[i][j] = f64::from(u8::from(i == j)) - a[j][i];
         }
     }
-    let wanted = right;
+    let target = right;
     for i in 0..k {
         let pivot = matrix[i][i];
         if !(pivot > 0.0 && pivot.is_finite()) {
@@ -193,7 +193,7 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
     b[..k].iter_mut().for_each(|b| *b *= 1.0 + BOUND_MARGIN);
     // Accept the vector only if it satisfies the inequality.
     let proved =
-        |i: usize| (wanted[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * BOUND_MARGIN) <= b[i];
+        |i: usize| (target[i] + (0..k).map(|j| a[j][i] * b[j]).sum::<f64>()) * (1.0 + 1e-3 * BOUND_MARGIN) <= b[i];
     (0..k).all(proved).then_some(b)
 }
 

@@ -93,10 +93,10 @@ struct NodeLayout {
 fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
     let mut nodes = Vec::new();
     let mut ranges: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
-    let known = |(low, high): (f64, f64)| high - low < 1e-12;
+    let is_point = |(low, high): (f64, f64)| high - low < 1e-12;
     for (term, range) in region.terms.iter().enumerate() {
         let (low, high) = region.integrations(term);
-        if !known((low, high)) {
+        if !is_point((low, high)) {
             let all = ranges.entry(range.signal).or_insert((low, high));
             *all = (all.0.min(low), all.1.max(high));
         }
@@ -113,7 +113,7 @@ fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
     let mut terms = Vec::new();
     for (term, range) in region.terms.iter().enumerate() {
         let within = region.integrations(term);
-        if known(within) {
+        if is_point(within) {
             nodes.push((range.signal, within.1, 0.0));
             terms.push((None, nodes.len() - 1));
         } else {
@@ -155,7 +155,7 @@ impl GramTables {
         let batches: Vec<(usize, &[RegressorExpansion])> = (0..DERIVATIVE_PAIRS.len())
             .flat_map(|pair| curves.chunks(COLUMNS_PER_TASK).map(move |batch| (pair, batch)))
             .collect();
-        let made = parallel::map(
+        let pair_products = parallel::map(
             batches,
             || (),
             |(), (pair, batch)| {
@@ -171,7 +171,7 @@ impl GramTables {
         control.check_stop()?;
         let (mut products, mut along): ([Vec<f64>; DERIVATIVE_PAIRS.len()], [Vec<f64>; EXPANSION_COLUMNS]) =
             Default::default();
-        for (pair, inner, target) in made {
+        for (pair, inner, target) in pair_products {
             products[pair].extend(inner);
             along[DERIVATIVE_PAIRS[pair].1].extend(target.into_iter().map(|v| v / size));
         }
@@ -196,8 +196,8 @@ impl GramTables {
     /// Interval of a term's order of integration in a cell.
     pub(super) fn order_interval(&self, region: &Region, cell: &Cell, term: usize) -> (f64, f64) {
         if self.has_fixed_order(term) {
-            let (_, known) = region.integrations(term);
-            return (known, known);
+            let (_, fixed_order) = region.integrations(term);
+            return (fixed_order, fixed_order);
         }
         let (width, at) = (cell_width(cell.level[term]), f64::from(cell.at[term]));
         (at * width, (at + 1.0) * width)
@@ -215,8 +215,8 @@ impl GramTables {
     /// Midpoint of a cell.
     fn middle(&self, cell: &Cell) -> [Middle; MAX_TERMS] {
         let mut out = [Middle::default(); MAX_TERMS];
-        for (term, ((stretches, known), out)) in self.terms.iter().zip(&mut out).enumerate() {
-            (out.node, out.off[0]) = (*known, 1.0);
+        for (term, ((stretches, fixed_node), out)) in self.terms.iter().zip(&mut out).enumerate() {
+            (out.node, out.off[0]) = (*fixed_node, 1.0);
             let Some(stretches) = stretches else { continue };
             let (level, at) = (cell.level[term], cell.at[term]);
             let above = level.min(self.table_level);

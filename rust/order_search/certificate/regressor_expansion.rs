@@ -48,7 +48,7 @@ impl BinomialSums {
         let mut coefficients = [[0.0; EXPANSION_COLUMNS]; BINOMIAL_TERMS[0]];
         let mut c = [0.0; EXPANSION_COLUMNS];
         c[0] = 1.0;
-        for (k, kept) in coefficients.iter_mut().enumerate() {
+        for (k, coefficient) in coefficients.iter_mut().enumerate() {
             for j in [2 * k, 2 * k + 1] {
                 let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
                 let divisor = (j + 1) as f64;
@@ -56,7 +56,7 @@ impl BinomialSums {
                     c[i] = (c[i] * factor + if i > 0 { c[i - 1] } else { 0.0 }) / divisor;
                 }
             }
-            *kept = c;
+            *coefficient = c;
         }
         let distances = 2..m.max(2);
         let sums = distances.clone().map(|n| {
@@ -103,13 +103,13 @@ fn fourth_derivative_bound(highest: f64, mu: f64, m: usize) -> f64 {
     if m > 1 {
         sum += libm::exp2(b + 1.0) * far(2.0).powi(4) + 2.0 * mu.powi(4);
     }
-    let (mut before, mut here) = ((1.0, far(1.0)), (libm::pow(2.0, b - 1.0), far(2.0)));
+    let (mut before, mut current) = ((1.0, far(1.0)), (libm::pow(2.0, b - 1.0), far(2.0)));
     for n in 2..m {
         let t = (n + 1) as f64;
         let after = (libm::pow(t, b - 1.0), far(t));
         let (power, l) = (f64::max(before.0, after.0), f64::max(before.1, after.1));
         sum += power * l * l * (((b + 1.0) * b * l + (2.0 * b + 1.0) * 4.0) * l + 12.0);
-        (before, here) = (here, after);
+        (before, current) = (current, after);
     }
     sum
 }
@@ -126,7 +126,7 @@ impl RegressorExpansion {
     pub(super) fn new(records: &[Record], signal: usize, eta: f64, half: f64, stop: &Stop) -> Result<Self> {
         let mut columns: [Vec<f64>; EXPANSION_COLUMNS] = Default::default();
         let mut errors = [0.0; EXPANSION_COLUMNS];
-        let mut made = Vec::with_capacity(records.len());
+        let mut expansions = Vec::with_capacity(records.len());
         // The unit of time is the pulse length of the first record.
         let first = records.first().map_or(1.0, Record::step);
         for record in records {
@@ -134,11 +134,11 @@ impl RegressorExpansion {
             let (m, pace) = (record.m(), record.step() / first);
             let (sums, spectrum) = (BinomialSums::new(eta, m), Kernel::new(record.signal(signal)));
             let (scale, slope) = (libm::pow(pace, eta), libm::log(pace));
-            made.push((sums, spectrum, scale, slope));
+            expansions.push((sums, spectrum, scale, slope));
         }
         let mut buffers = Buffers::default();
         for (j, column) in columns.iter_mut().enumerate().take(2) {
-            for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&made) {
+            for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&expansions) {
                 stop.check()?;
                 column.extend(product(&sums.derivative(j, -slope, record.m()), spectrum, *scale, &mut buffers));
             }
@@ -150,7 +150,7 @@ impl RegressorExpansion {
                 column.clear();
             }
             let mut squares = 0.0;
-            for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&made) {
+            for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&expansions) {
                 stop.check()?;
                 let (m, mu) = (record.m(), lambda - slope);
                 let kernel = sums.derivative(j, mu, m);
@@ -159,11 +159,12 @@ impl RegressorExpansion {
                 }
                 let size = dot(record.signal(signal), record.signal(signal)).sqrt();
                 // The summands of a derivative have either sign, depending on the logarithm of the distance.
-                let lost = rounding_unit(m) * scale * size * sums.moduli(j, mu);
-                squares += lost * lost;
+                let rounding = rounding_unit(m) * scale * size * sums.moduli(j, mu);
+                squares += rounding * rounding;
                 if j == 0 {
-                    let beyond = libm::exp(mu.abs() * half) * fourth_derivative_bound(eta + half, mu, m) * scale * size;
-                    rest += beyond * beyond;
+                    let remainder =
+                        libm::exp(mu.abs() * half) * fourth_derivative_bound(eta + half, mu, m) * scale * size;
+                    rest += remainder * remainder;
                 }
             }
             errors[j] = squares.sqrt();

@@ -94,8 +94,8 @@ impl InfeasibilityProof {
                     constant.slack[n] = probes.target_rounding * scale;
                 }
                 let mut next = 0;
-                for (&p, known) in terms.iter().zip(fixed) {
-                    match *known {
+                for (&p, value) in terms.iter().zip(fixed) {
+                    match *value {
                         Some(c) => {
                             let effect = column(p, c);
                             for half in 0..2 {
@@ -238,17 +238,17 @@ impl InfeasibilityProof {
                 rest[n] = weight[n] * (1.0 + 1.0 / kappa) * total[n];
             }
             for (i, a) in effects.iter().enumerate() {
-                let (mut left, mut right) = ([[0.0; LANE_COUNT]; 2], [[0.0; LANE_COUNT]; 2]);
+                let (mut lhs, mut right) = ([[0.0; LANE_COUNT]; 2], [[0.0; LANE_COUNT]; 2]);
                 for half in 0..2 {
                     for n in 0..LANE_COUNT {
-                        left[half][n] = weight[n] * a.error[half][n];
+                        lhs[half][n] = weight[n] * a.error[half][n];
                         right[half][n] = own[n] * a.divisor[half][n];
                     }
                 }
                 for (j, b) in effects[..=i].iter().enumerate() {
                     let (mut errors, mut divisors) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
                     for n in 0..LANE_COUNT {
-                        errors[n] = left[0][n] * b.error[0][n] + left[1][n] * b.error[1][n];
+                        errors[n] = lhs[0][n] * b.error[0][n] + lhs[1][n] * b.error[1][n];
                         divisors[n] = right[0][n] * b.divisor[0][n] + right[1][n] * b.divisor[1][n];
                     }
                     let (errors, divisors) = (errors.iter().sum::<f64>(), divisors.iter().sum::<f64>());

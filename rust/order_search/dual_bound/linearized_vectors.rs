@@ -76,8 +76,8 @@ pub fn excluded_by_linearized_vector(
             remedy: "give both equations these".into(),
         });
     }
-    let made = tangents.fit((&banks, &targets), &positions[0], &made_for.coefficients, limit);
-    tangents.add(own, made.into_iter().collect());
+    let vector = tangents.fit((&banks, &targets), &positions[0], &made_for.coefficients, limit);
+    tangents.add(own, vector.into_iter().collect());
     Ok(tangents.excludes_candidate(&positions[1], &equation.coefficients, limit, &mut VectorLookup::default()))
 }
 
@@ -151,9 +151,9 @@ impl LinearizedVectors {
     }
 
     /// Store the vectors built for candidates with these own columns.
-    pub(crate) fn add(&mut self, own: Vec<usize>, made: Vec<LinearizedVector>) {
+    pub(crate) fn add(&mut self, own: Vec<usize>, new_vectors: Vec<LinearizedVector>) {
         let from = self.vectors.len();
-        self.vectors.extend(made);
+        self.vectors.extend(new_vectors);
         self.ranges.insert(own, (from, self.vectors.len()));
     }
 
@@ -190,7 +190,7 @@ impl LinearizedVectors {
                 };
                 sum.iter_mut().zip(values).for_each(|(sum, x)| *sum += c * x);
             }
-            let mut wanted: Vec<f64> = Vec::new();
+            let mut target_series: Vec<f64> = Vec::new();
             for (v, y) in divide(&driven, &divisor).ok()?.iter().zip(target) {
                 let error = y - v;
                 let (size, slope) = match self.rounding_bounds.norm {
@@ -202,14 +202,14 @@ impl LinearizedVectors {
                     break;
                 }
                 raw += size;
-                wanted.push(slope);
+                target_series.push(slope);
             }
-            if wanted.is_empty() {
+            if target_series.is_empty() {
                 break;
             }
-            divisor.truncate(wanted.len());
+            divisor.truncate(target_series.len());
             // In reversed time, transposed operators become the operators themselves.
-            let vector = divide(&backwards(&wanted), &divisor).ok()?;
+            let vector = divide(&backwards(&target_series), &divisor).ok()?;
             parts.push(RecordVectors {
                 divisor,
                 vectors: vec![vector],
@@ -251,9 +251,9 @@ impl LinearizedVectors {
                 }
             }
         }
-        let mut made = NormAccumulator::new(self.rounding_bounds.norm, k);
+        let mut accumulator = NormAccumulator::new(self.rounding_bounds.norm, k);
         for part in &mut parts {
-            part.add_corrections(&mut made, &mut buffers);
+            part.add_corrections(&mut accumulator, &mut buffers);
         }
         let mut lengths: Vec<f64> = Vec::new();
         for (i, &(p, _)) in own.iter().enumerate() {
@@ -264,7 +264,8 @@ impl LinearizedVectors {
         let products = self.products(&parts, banks, targets, &own);
         let around = self.rounding_bounds.max_dual_norm
             + own.iter().map(|&(p, c)| c.abs() * self.rounding_bounds.kernel_norms[p]).sum::<f64>();
-        let NormAccumulator { norm, solution_residuals: rests, second_order_norms: bends, .. } = made.final_norms();
+        let NormAccumulator { norm, solution_residuals: rests, second_order_norms: bends, .. } =
+            accumulator.final_norms();
         let sound = [&lengths, &sizes, &products, &rests, &bends, &mix]
             .into_iter()
             .flatten()
@@ -311,9 +312,9 @@ impl LinearizedVectors {
         terms: &[usize],
         coefficients: &[f64],
         limit: f64,
-        held: &mut VectorLookup,
+        lookup: &mut VectorLookup,
     ) -> bool {
-        let VectorLookup { own, next_own: next, range, last_vector: last } = held;
+        let VectorLookup { own, next_own: next, range, last_vector: last } = lookup;
         next.clear();
         next.extend(terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX));
         if next != own {
@@ -335,12 +336,12 @@ impl LinearizedVectors {
     #[inline(always)]
     pub(crate) fn vector_excludes(
         &self,
-        made: &LinearizedVector,
+        linearized: &LinearizedVector,
         terms: &[usize],
         coefficients: &[f64],
         limit: f64,
     ) -> bool {
-        let (losses, k) = (&self.rounding_bounds, made.center.len());
+        let (losses, k) = (&self.rounding_bounds, linearized.center.len());
         let limit = losses.norm_threshold(limit);
         let (mut rounding, mut length) = (losses.target_rounding, 0.0);
         let (mut mine, mut filled) = ([0.0; MAX_OWN_TERMS], 0);
@@ -355,24 +356,24 @@ impl LinearizedVectors {
         // Coordinates with respect to the G_m.
         let mut x = [0.0; MAX_OWN_TERMS];
         for i in 0..k {
-            let off = mine[i] - made.center[i];
+            let off = mine[i] - linearized.center[i];
             x[i] += off;
-            x.iter_mut().zip(&made.mix[i * k..i * k + i]).for_each(|(x, share)| *x += share * off);
+            x.iter_mut().zip(&linearized.mix[i * k..i * k + i]).for_each(|(x, share)| *x += share * off);
         }
-        let (mut size, mut norm, mut steps, mut at) = (1.0, made.norm, 0.0, 0);
+        let (mut size, mut norm, mut steps, mut at) = (1.0, linearized.norm, 0.0, 0);
         for m in 0..k {
-            size += x[m].abs() * made.peak_values[m];
-            norm += x[m].abs() * made.solution_residuals[m];
-            steps += x[m].abs() * made.series_norms[m];
+            size += x[m].abs() * linearized.peak_values[m];
+            norm += x[m].abs() * linearized.solution_residuals[m];
+            steps += x[m].abs() * linearized.series_norms[m];
             for n in 0..=m {
-                norm += (x[m] * x[n]).abs() * made.second_order_norms[at];
+                norm += (x[m] * x[n]).abs() * linearized.second_order_norms[at];
                 at += 1;
             }
         }
-        norm += losses.unit * size * (made.center_norm + length + steps);
-        let (mut seen, row) = (0.0, k + 1 + self.width);
+        norm += losses.unit * size * (linearized.center_norm + length + steps);
+        let (mut response, row) = (0.0, k + 1 + self.width);
         for m in 0..=k {
-            let products = &made.products[m * row..(m + 1) * row];
+            let products = &linearized.products[m * row..(m + 1) * row];
             let mut along = products[0];
             for i in 0..k {
                 along -= mine[i] * products[1 + i];
@@ -382,10 +383,10 @@ impl LinearizedVectors {
                     along -= c * products[1 + k + self.input_index[p]];
                 }
             }
-            seen += if m == 0 { along } else { x[m - 1] * along };
+            response += if m == 0 { along } else { x[m - 1] * along };
         }
         // Neither NaN nor an overflow proves anything.
-        seen.abs() - size * rounding > limit * norm && seen.abs() < f64::MAX
+        response.abs() - size * rounding > limit * norm && response.abs() < f64::MAX
     }
 }
 
@@ -402,13 +403,13 @@ struct RecordVectors {
 
 impl RecordVectors {
     /// Compute the v_m, and accumulate the norms that the bound needs.
-    fn add_corrections(&mut self, made: &mut NormAccumulator, buffers: &mut Buffers) {
+    fn add_corrections(&mut self, accumulator: &mut NormAccumulator, buffers: &mut Buffers) {
         let (m, k) = (self.divisor.len(), self.first_order_terms.len());
         let (divisor, inverse) = (Kernel::new(&self.divisor), Kernel::new(&reciprocal(&self.divisor)));
         let series: Vec<Kernel> = self.series.iter().map(|x| Kernel::new(x)).collect();
         let mut out = vec![0.0; m];
         divisor.times(&Kernel::new(&self.vectors[0]), &mut out, buffers);
-        made.norm = made.accumulate(made.norm, &out);
+        accumulator.norm = accumulator.accumulate(accumulator.norm, &out);
         let mut corrections: Vec<Kernel> = Vec::new();
         for (i, step) in self.first_order_terms.iter().enumerate() {
             let mut vector = vec![0.0; m];
@@ -416,7 +417,7 @@ impl RecordVectors {
             let spectrum = Kernel::new(&vector);
             divisor.times(&spectrum, &mut out, buffers);
             out.iter_mut().zip(step).for_each(|(x, y)| *x -= y);
-            made.solution_residuals[i] = made.accumulate(made.solution_residuals[i], &out);
+            accumulator.solution_residuals[i] = accumulator.accumulate(accumulator.solution_residuals[i], &out);
             corrections.push(spectrum);
             self.vectors.push(vector);
         }
@@ -428,7 +429,7 @@ impl RecordVectors {
                     sum.add(1.0, &series[j], &corrections[i]);
                 }
                 sum.take(&mut out, buffers);
-                made.second_order_norms[at] = made.accumulate(made.second_order_norms[at], &out);
+                accumulator.second_order_norms[at] = accumulator.accumulate(accumulator.second_order_norms[at], &out);
                 at += 1;
             }
         }

@@ -139,8 +139,10 @@ pub fn excluded_in_turn(
     let mut adapted = TailoredVectors::new(&banks, &targets, norm);
     adapted.vectors.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
     let mut memory = NormCache::for_adjacent_candidates();
-    let asked = positions[1..].iter().zip(equations);
-    Ok(asked.map(|(terms, asked)| adapted.excludes_candidate(terms, &asked.coefficients, limit, &mut memory)).collect())
+    let candidates = positions[1..].iter().zip(equations);
+    Ok(candidates
+        .map(|(terms, candidates)| adapted.excludes_candidate(terms, &candidates.coefficients, limit, &mut memory))
+        .collect())
 }
 
 /// Return the bound with all fixed test vectors on one record, and the columns of a structure's terms.

@@ -119,11 +119,11 @@ impl TailoredVectors {
                 }
             }
             let error: Vec<f64> = divide(&driven, &divisor).ok()?.iter().zip(target).map(|(v, y)| y - v).collect();
-            let wanted: Vec<f64> = match self.rounding_bounds.norm {
+            let target_series: Vec<f64> = match self.rounding_bounds.norm {
                 Norm::L1 => error.iter().map(|e| if *e < 0.0 { -1.0 } else { 1.0 }).collect(),
                 Norm::L2 => error,
             };
-            vectors.push(backwards(&divide(&backwards(&wanted), &divisor).ok()?));
+            vectors.push(backwards(&divide(&backwards(&target_series), &divisor).ok()?));
         }
         let top = vectors.iter().flatten().fold(0.0_f64, |top, v| top.max(v.abs()));
         if !vectors.iter().flatten().all(|v| v.is_finite()) || top < f64::MIN_POSITIVE {
@@ -178,11 +178,12 @@ impl TailoredVectors {
                 own.push((self.rows[p], c));
             }
         }
-        let lost = self.rounding_bounds.unit * length;
+        let rounding_error = self.rounding_bounds.unit * length;
         let allowed = |which: usize| {
             let fitted = &self.vectors[which];
-            let seen = terms.iter().zip(coefficients).fold(fitted.target, |sum, (&p, &c)| sum - c * fitted.products[p]);
-            (seen.abs() - rounding) / limit - lost
+            let response =
+                terms.iter().zip(coefficients).fold(fitted.target, |sum, (&p, &c)| sum - c * fitted.products[p]);
+            (response.abs() - rounding) / limit - rounding_error
         };
         let pair: [Weighted; MAX_CACHED_OWN_TERMS] =
             std::array::from_fn(|n| own.get(n).copied().unwrap_or((NO_INDEX, 0.0)));
@@ -190,20 +191,20 @@ impl TailoredVectors {
         if let (Some(near), 1..=MAX_CACHED_OWN_TERMS) = (near, own.len()) {
             near.resize(NORM_CACHE_ENTRIES, None);
             let at = pair[0].0.wrapping_mul(97).wrapping_add(pair[1].0) % NORM_CACHE_ENTRIES;
-            let known = &mut near[at];
-            if known.is_some_and(|known| known.own[0].0 != pair[0].0 || known.own[1].0 != pair[1].0) {
-                *known = None;
+            let cached = &mut near[at];
+            if cached.is_some_and(|cached| cached.own[0].0 != pair[0].0 || cached.own[1].0 != pair[1].0) {
+                *cached = None;
             }
-            if let Some(known) = known {
-                if known.deviation_norms[0].is_nan() {
-                    self.compute_deviation_norms(known);
+            if let Some(cached) = cached {
+                if cached.deviation_norms[0].is_nan() {
+                    self.compute_deviation_norms(cached);
                 }
-                *last = known.vector;
-                if self.norm_upper_bound(known, &pair) <= allowed(known.vector) {
+                *last = cached.vector;
+                if self.norm_upper_bound(cached, &pair) <= allowed(cached.vector) {
                     return true;
                 }
             }
-            place = Some(known);
+            place = Some(cached);
         }
         for turn in 0..self.vectors.len() {
             let which = (*last + turn) % self.vectors.len();
@@ -216,9 +217,9 @@ impl TailoredVectors {
                         .find(|p| self.rows[**p] == pair[n].0)
                         .map_or(0.0, |p| self.rounding_bounds.kernel_norms[*p])
                 };
-                let norm = norm + lost;
+                let norm = norm + rounding_error;
                 *place = Some(match *place {
-                    Some(known) if known.vector == which => CachedNorm { own: pair, norm, ..known },
+                    Some(cached) if cached.vector == which => CachedNorm { own: pair, norm, ..cached },
                     _ => CachedNorm {
                         vector: which,
                         own: pair,
@@ -236,20 +237,20 @@ impl TailoredVectors {
 
     /// Upper bound of ‖Dᵀt‖ of a candidate with the same own columns.
     #[inline(always)]
-    fn norm_upper_bound(&self, known: &CachedNorm, own: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
-        let off = [own[0].1 - known.own[0].1, own[1].1 - known.own[1].1];
-        let [first, second] = known.deviation_norms;
-        let along = (off[0] + known.share * off[1]).abs() * first + off[1].abs() * second;
-        let rounding = off[0].abs() * known.slack[0] + off[1].abs() * known.slack[1];
-        (known.norm + along + self.rounding_bounds.unit * rounding) * (1.0 + self.rounding_bounds.unit)
+    fn norm_upper_bound(&self, cached: &CachedNorm, own: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
+        let off = [own[0].1 - cached.own[0].1, own[1].1 - cached.own[1].1];
+        let [first, second] = cached.deviation_norms;
+        let along = (off[0] + cached.share * off[1]).abs() * first + off[1].abs() * second;
+        let rounding = off[0].abs() * cached.slack[0] + off[1].abs() * cached.slack[1];
+        (cached.norm + along + self.rounding_bounds.unit * rounding) * (1.0 + self.rounding_bounds.unit)
     }
 
     /// Compute how much ‖Dᵀt‖ changes per unit change of the coefficients.
     #[inline(always)]
-    fn compute_deviation_norms(&self, known: &mut CachedNorm) {
-        let fitted = &self.vectors[known.vector];
+    fn compute_deviation_norms(&self, cached: &mut CachedNorm) {
+        let fitted = &self.vectors[cached.vector];
         let length = fitted.vector.len();
-        let row = |n: usize| match known.own[n].0 {
+        let row = |n: usize| match cached.own[n].0 {
             NO_INDEX => &[][..],
             row => &fitted.transposed_products[row * length..(row + 1) * length],
         };
@@ -257,9 +258,9 @@ impl TailoredVectors {
         let (square, inner) = (simd::dot(first, first), simd::dot(&first[..second.len()], second));
         // The bound holds for any share.
         let share = if square > 0.0 && (inner / square).abs() < MAX_SAFE_MAGNITUDE { inner / square } else { 0.0 };
-        known.share = share;
-        known.deviation_norms = [self.difference_norm(first, first, 0.0), self.difference_norm(second, first, share)];
-        known.slack[1] += share.abs() * known.slack[0];
+        cached.share = share;
+        cached.deviation_norms = [self.difference_norm(first, first, 0.0), self.difference_norm(second, first, share)];
+        cached.slack[1] += share.abs() * cached.slack[0];
     }
 
     /// ‖a − share·b‖ in the dual norm, for rows whose length is a multiple of [`NORM_CHECK_SAMPLES`].
@@ -321,11 +322,11 @@ impl TailoredVectors {
                     };
                 }
             }
-            let beyond = match self.rounding_bounds.norm {
+            let is_beyond = match self.rounding_bounds.norm {
                 Norm::L1 => all.iter().any(|v| *v > most),
                 Norm::L2 => all.iter().sum::<f64>() > squares,
             };
-            if beyond {
+            if is_beyond {
                 return None;
             }
         }

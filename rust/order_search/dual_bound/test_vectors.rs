@@ -131,14 +131,14 @@ impl Vector {
     /// `length` is the sum of the column's moduli.
     fn apply_column(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
         std::mem::swap(&mut self.here, &mut self.before);
-        for (spectrum, here) in self.spectra.iter().zip(&mut self.here) {
-            column.times(spectrum, here, buffers);
+        for (spectrum, product) in self.spectra.iter().zip(&mut self.here) {
+            column.times(spectrum, product, buffers);
         }
         let before = self.last.map(|last| (&self.before, last));
-        let [g, h, rest, lost, step] = column_effect(&self.halves, &self.here, before, norm, unit * length);
-        self.last = Some([g, h, lost]);
-        let beyond = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
-        [g * self.size, h * self.size, rest + beyond, step]
+        let [g, h, rest, rounding, step] = column_effect(&self.halves, &self.here, before, norm, unit * length);
+        self.last = Some([g, h, rounding]);
+        let truncation = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
+        [g * self.size, h * self.size, rest + truncation, step]
     }
 }
 
@@ -171,21 +171,24 @@ pub(super) fn divisor_effects(
     // For a long record the vectors need most of the memory, so they are recomputed batch by batch.
     let mut all = Some(vectors).filter(|_| batch == count);
     let shapes = vector_shapes(count, m);
-    let mut held: Vec<Vector> = (0..batch).map(|_| Vector::with_samples(m)).collect();
+    let mut batch_vectors: Vec<Vector> = (0..batch).map(|_| Vector::with_samples(m)).collect();
     let mut spectra = Vec::new();
     for start in (0..count).step_by(batch) {
-        held.truncate(count - start);
-        let drawn = all.take();
-        held.par_iter_mut().with_max_len(1).enumerate().for_each_init(Buffers::default, |buffers, (i, vector)| {
-            if stop.is_set() {
-                return;
-            }
-            match &drawn {
-                Some(all) => vector.halves.clone_from(&all[i]),
-                None => write_vector(shapes[start + i], &mut vector.halves),
-            }
-            vector.load_spectra(start + i, sizes[start + i], buffers);
-        });
+        batch_vectors.truncate(count - start);
+        let next_vector = all.take();
+        batch_vectors.par_iter_mut().with_max_len(1).enumerate().for_each_init(
+            Buffers::default,
+            |buffers, (i, vector)| {
+                if stop.is_set() {
+                    return;
+                }
+                match &next_vector {
+                    Some(all) => vector.halves.clone_from(&all[i]),
+                    None => write_vector(shapes[start + i], &mut vector.halves),
+                }
+                vector.load_spectra(start + i, sizes[start + i], buffers);
+            },
+        );
         for (first, columns) in own.chunks(block).enumerate().map(|(i, columns)| (i * block, columns)) {
             if stop.is_set() {
                 return out;
@@ -194,7 +197,7 @@ pub(super) fn divisor_effects(
                 spectra.clear();
                 spectra.extend(kernels(columns));
             }
-            let found: Vec<(usize, Vec<[f64; 4]>)> = held
+            let effects: Vec<(usize, Vec<[f64; 4]>)> = batch_vectors
                 .par_iter_mut()
                 .with_max_len(1)
                 .map_init(Buffers::default, |buffers, vector| {
@@ -205,7 +208,7 @@ pub(super) fn divisor_effects(
                     (vector.number, rows)
                 })
                 .collect();
-            for (which, rows) in found {
+            for (which, rows) in effects {
                 for (row, values) in (first..).zip(rows) {
                     for (half, value) in values.into_iter().enumerate() {
                         out[row * groups + which / LANE_COUNT][half][which % LANE_COUNT] = value;
@@ -251,7 +254,7 @@ fn column_effect(
         Norm::L1 => sum.max(x),
         Norm::L2 => sum + x,
     };
-    let lost = match norm {
+    let rounding_error = match norm {
         Norm::L1 => rounding,
         Norm::L2 => rounding * count,
     };
@@ -263,10 +266,10 @@ fn column_effect(
                 let step = apart(t, (u - u0, v - v0), g - g0, h - h0);
                 (add(sums.0, rest(t, (u, v))), add(sums.1, step))
             });
-            (rest, f64::sqrt(step) + lost + lost0)
+            (rest, f64::sqrt(step) + rounding_error + lost0)
         }
     };
-    [g, h, f64::sqrt(rest) + lost, lost, step]
+    [g, h, f64::sqrt(rest) + rounding_error, rounding_error, step]
 }
 
 /// Index of a column that does not enter the divisor.
@@ -449,11 +452,11 @@ impl TestVectors {
         }
         let (mut bounds, mut guesses) = ([0.0; LANE_COUNT], [0.0; LANE_COUNT]);
         for n in 0..LANE_COUNT {
-            let seen = (re[n] * re[n] + im[n] * im[n]).sqrt() - rounding;
+            let response = (re[n] * re[n] + im[n] * im[n]).sqrt() - rounding;
             let size = (divisor[n] * divisor[n] + divisor_im[n] * divisor_im[n]).sqrt();
             // Margin for the rounding of the divisor and of the score.
-            bounds[n] = seen / ((size + slack[n]) * (1.0 + self.unit));
-            guesses[n] = seen / size;
+            bounds[n] = response / ((size + slack[n]) * (1.0 + self.unit));
+            guesses[n] = response / size;
         }
         (bounds, guesses)
     }
@@ -469,9 +472,9 @@ impl TestVectors {
                 at -= 1;
             }
         }
-        let (mut left, mut all) = (0.0, 0.0);
+        let (mut remainder, mut all) = (0.0, 0.0);
         for (_, c) in own.iter() {
-            left += c;
+            remainder += c;
             all += c.abs();
         }
         let [.., first, mut before] = self.effects[own[0].0 * self.groups + group];
@@ -479,13 +482,13 @@ impl TestVectors {
         let mut most = [0.0; LANE_COUNT];
         for n in 0..LANE_COUNT {
             // Partial sums lose accuracy in proportion to the sum of the moduli.
-            most[n] = left.abs() * first[n] + 16.0 * f64::EPSILON * all * (first[n] + last[n]);
+            most[n] = remainder.abs() * first[n] + 16.0 * f64::EPSILON * all * (first[n] + last[n]);
         }
         for at in 1..own.len() {
-            left -= own[at - 1].1;
+            remainder -= own[at - 1].1;
             let [.., way] = self.effects[own[at].0 * self.groups + group];
             for n in 0..LANE_COUNT {
-                most[n] += left.abs() * (way[n] - before[n]);
+                most[n] += remainder.abs() * (way[n] - before[n]);
             }
             before = way;
         }
@@ -509,14 +512,14 @@ mod tests {
         let bank = Bank::new(&index, &record, 0)?;
         let all = build_vectors(count, m, &Stop::default());
         let sizes = vec![1.0; count];
-        let found: Vec<Vec<[Wide; 4]>> = [1, 2]
+        let bounds: Vec<Vec<[Wide; 4]>> = [1, 2]
             .iter()
             .filter_map(|&threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok())
             .map(|pool| {
                 pool.install(|| divisor_effects(&bank, &own, all.clone(), &sizes, (Norm::L1, 1e-9), &Stop::default()))
             })
             .collect();
-        assert!(found.len() == 2 && found[0] == found[1], "whatever the threads");
+        assert!(bounds.len() == 2 && bounds[0] == bounds[1], "whatever the threads");
         let groups = count / LANE_COUNT;
         for (row, &p) in own.iter().enumerate() {
             let kernel = Kernel::new(bank.kernel(p));
@@ -531,8 +534,8 @@ mod tests {
                 let [g, h, rest, ..] = column_effect(vector, &[re, im], None, Norm::L1, 1e-9 * length);
                 let alone = [g, h, rest];
                 for (half, value) in alone.into_iter().enumerate() {
-                    let there = found[0][row * groups + j / LANE_COUNT][half][j % LANE_COUNT];
-                    assert!((there - value).abs() <= 1e-12 * (1.0 + value.abs()), "{row} {j} {half}: {there} {value}");
+                    let bound = bounds[0][row * groups + j / LANE_COUNT][half][j % LANE_COUNT];
+                    assert!((bound - value).abs() <= 1e-12 * (1.0 + value.abs()), "{row} {j} {half}: {bound} {value}");
                 }
             }
         }
@@ -545,11 +548,14 @@ mod tests {
         let record = Record::from_rows(0.1, vec![vec![1.0; m]], None)?;
         let mut index = Index::default();
         let own: Vec<usize> = [0.4, 1.1].map(|eta| index.insert(Key::integral(0, eta))).into();
-        let (going, told) = (Stop::default(), Stop::default());
-        told.set();
+        let (going, stopped_flag) = (Stop::default(), Stop::default());
+        stopped_flag.set();
         let bank = Bank::new_interruptible(&index, &record, 0, &going)?;
-        assert!(matches!(Bank::new_interruptible(&index, &record, 0, &told), Err(crate::error::Error::Interrupted)));
-        let found = |stop| {
+        assert!(matches!(
+            Bank::new_interruptible(&index, &record, 0, &stopped_flag),
+            Err(crate::error::Error::Interrupted)
+        ));
+        let columns = |stop| {
             divisor_effects(
                 &bank,
                 &own,
@@ -559,8 +565,8 @@ mod tests {
                 stop,
             )
         };
-        assert!(found(&going).iter().flatten().flatten().any(|v| *v != 0.0));
-        assert!(found(&told).iter().flatten().flatten().all(|v| *v == 0.0));
+        assert!(columns(&going).iter().flatten().flatten().any(|v| *v != 0.0));
+        assert!(columns(&stopped_flag).iter().flatten().flatten().all(|v| *v == 0.0));
         Ok(())
     }
 
@@ -574,9 +580,10 @@ mod tests {
         let bank = Bank::new(&index, &record, 0)?;
         let all = build_vectors(count, m as usize, &Stop::default());
         for norm in [Norm::L1, Norm::L2] {
-            let found = divisor_effects(&bank, &own, all.clone(), &[1.0; LANE_COUNT], (norm, 1e-15), &Stop::default());
+            let effects =
+                divisor_effects(&bank, &own, all.clone(), &[1.0; LANE_COUNT], (norm, 1e-15), &Stop::default());
             let vector = |row: usize, j: usize| -> Vec<(f64, f64)> {
-                let [g, h] = [0, 1].map(|half: usize| found[row][half][j]);
+                let [g, h] = [0, 1].map(|half: usize| effects[row][half][j]);
                 let parts = [0, 1].map(|half: usize| -> Vec<f64> {
                     let (t, f) = (&all[j][half], bank.kernel(own[row]));
                     (0..t.len()).map(|k| (k..t.len()).map(|i| t[i] * f[i - k]).sum()).collect()
@@ -588,7 +595,7 @@ mod tests {
             };
             let mut closest = 0.0_f64;
             for (i, k) in [(0, 1), (0, 38), (3, 9), (20, 22), (17, 18)] {
-                for (j, way) in found[k][3].iter().enumerate() {
+                for (j, way) in effects[k][3].iter().enumerate() {
                     let squares = vector(i, j)
                         .into_iter()
                         .zip(vector(k, j))
@@ -597,7 +604,7 @@ mod tests {
                         Norm::L1 => squares.fold(0.0, f64::max).sqrt(),
                         Norm::L2 => squares.sum::<f64>().sqrt(),
                     };
-                    let way = way - found[i][3][j];
+                    let way = way - effects[i][3][j];
                     assert!(way >= apart * (1.0 - 1e-12), "{norm:?} {i} to {k}, {j}: {way} for {apart}");
                     closest = closest.max(apart / way);
                 }

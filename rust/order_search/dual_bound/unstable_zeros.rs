@@ -122,7 +122,7 @@ fn path_sums(
         .windows(2)
         .map(|pair| ((pair[1].0 - pair[0].0).powi(2) + (pair[1].1 - pair[0].1).powi(2)) / 8.0)
         .collect();
-    let (mut seen, mut slack) =
+    let (mut response, mut slack) =
         (vec![0.0; series.len() * 2 * (PATH_SEGMENT_COUNT + 1)], vec![0.0; series.len() * PATH_SEGMENT_COUNT]);
     for lo in (0..m).step_by(SAMPLES_PER_BLOCK) {
         let shares: Vec<f64> = (lo..m.min(lo + SAMPLES_PER_BLOCK)).map(|k| k as f64 / samples).collect();
@@ -143,7 +143,7 @@ fn path_sums(
             .zip(&bends)
             .map(|(slowest, bend)| shares.iter().map(|k| (bend * k * k + unit) * libm::exp(-slowest * k)).collect())
             .collect();
-        for (of, by, sums) in [(series, &powers, &mut seen), (moduli, &allowed, &mut slack)] {
+        for (of, by, sums) in [(series, &powers, &mut response), (moduli, &allowed, &mut slack)] {
             let of: Vec<&[f64]> = of.iter().map(|x| &x[lo..lo + shares.len()]).collect();
             let by: Vec<&[f64]> = by.iter().map(Vec::as_slice).collect();
             sums.iter_mut().zip(dense::inner_products(&of, &by, &Stop::default())).for_each(|(sum, x)| *sum += x);
@@ -153,8 +153,8 @@ fn path_sums(
         let mut row = [[0.0; PADDED_NODE_COUNT]; 3];
         for j in 0..PADDED_NODE_COUNT {
             let node = (p * (PATH_SEGMENT_COUNT + 1) + j.min(PATH_SEGMENT_COUNT)) * 2;
-            row[0][j] = seen[node];
-            row[1][j] = seen[node + 1];
+            row[0][j] = response[node];
+            row[1][j] = response[node + 1];
             row[2][j] = slack[p * PATH_SEGMENT_COUNT + j.min(PATH_SEGMENT_COUNT - 1)] * (1.0 + unit);
         }
         row
@@ -264,27 +264,27 @@ impl UnstableZeros {
         limit: f64,
         last: &mut usize,
     ) -> bool {
-        for seen in &self.records {
+        for record in &self.records {
             let error = match self.norm {
                 Norm::L1 => limit,
-                Norm::L2 => limit.sqrt() * seen.samples.sqrt(),
+                Norm::L2 => limit.sqrt() * record.samples.sqrt(),
             };
-            let size = seen.output_modulus + error * (1.0 + seen.unit);
+            let size = record.output_modulus + error * (1.0 + record.unit);
             let (mut length, mut driven) = (0.0, 0.0);
             for (&p, &c) in terms.iter().zip(coefficients) {
-                *(if self.own[p] { &mut length } else { &mut driven }) += c.abs() * seen.sums[p];
+                *(if self.own[p] { &mut length } else { &mut driven }) += c.abs() * record.sums[p];
             }
-            let rounding = seen.unit * (driven + (1.0 + length) * size);
+            let rounding = record.unit * (driven + (1.0 + length) * size);
             let of = |own: bool| {
                 let all = terms.iter().copied().zip(coefficients.iter().copied());
                 all.filter(move |&(p, _)| self.own[p] == own)
             };
-            for turn in 0..seen.paths {
-                let path = (*last + turn) % seen.paths;
+            for turn in 0..record.paths {
+                let path = (*last + turn) % record.paths;
                 let divisor = of(true).map(|(p, c)| (p, -c));
-                let Some(most @ 1..) = seen.count_zeros(path, divisor, 1.0, [seen.unit, 0.0]) else { continue };
+                let Some(most @ 1..) = record.count_zeros(path, divisor, 1.0, [record.unit, 0.0]) else { continue };
                 let left_out = [rounding, length * size];
-                if seen.count_zeros(path, of(false), 0.0, left_out).is_some_and(|zeros| zeros < most) {
+                if record.count_zeros(path, of(false), 0.0, left_out).is_some_and(|zeros| zeros < most) {
                     *last = path;
                     return true;
                 }

@@ -267,12 +267,12 @@ impl Bits {
     pub(super) fn run(&self, from: usize) -> usize {
         let mut at = from;
         while let Some(&word) = self.0.get(at / 64) {
-            let left = 64 - at % 64;
-            let here = (!word >> (at % 64)).trailing_zeros() as usize;
-            if here < left {
-                return at + here - from;
+            let remaining = 64 - at % 64;
+            let run_length = (!word >> (at % 64)).trailing_zeros() as usize;
+            if run_length < remaining {
+                return at + run_length - from;
             }
-            at += left;
+            at += remaining;
         }
         at - from
     }
@@ -280,15 +280,15 @@ impl Bits {
     /// Member with `rank` members before it.
     pub(super) fn select(&self, mut rank: u64) -> Option<usize> {
         for (word, &bits) in self.0.iter().enumerate() {
-            let here = u64::from(bits.count_ones());
-            if rank < here {
+            let bit_count = u64::from(bits.count_ones());
+            if rank < bit_count {
                 let mut bits = bits;
                 for _ in 0..rank {
                     bits &= bits - 1;
                 }
                 return Some(word * 64 + bits.trailing_zeros() as usize);
             }
-            rank -= here;
+            rank -= bit_count;
         }
         None
     }

@@ -91,8 +91,8 @@ impl OrderLawGrid {
     #[must_use]
     pub fn with_fixed_coefficients(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
         let terms = self.equations.iter().zip(fixed).flat_map(|(equation, fixed)| {
-            let known = fixed.iter().enumerate().filter(|(_, value)| value.is_some());
-            known.map(|(k, _)| (equation.output, k))
+            let fixed_terms = fixed.iter().enumerate().filter(|(_, value)| value.is_some());
+            fixed_terms.map(|(k, _)| (equation.output, k))
         });
         self.known = terms.collect();
         self

@@ -64,12 +64,12 @@ impl<'a> Cursor<'a> {
         let mut index = 0;
         for (g, group) in lattice.groups.iter().enumerate() {
             let count = lattice.blocks[block].tuples[g].count;
-            let wanted = || group.terms.iter().map(|&term| digits[term]);
+            let digits_of_group = || group.terms.iter().map(|&term| digits[term]);
             let (mut lo, mut hi) = (0, count);
             while lo < hi {
                 let rank = lo + (hi - lo) / 2;
                 cursor.seek(g, rank);
-                if cursor.digits[g].iter().copied().lt(wanted()) {
+                if cursor.digits[g].iter().copied().lt(digits_of_group()) {
                     lo = rank + 1;
                 } else {
                     hi = rank;
@@ -79,7 +79,7 @@ impl<'a> Cursor<'a> {
                 return None;
             }
             cursor.seek(g, lo);
-            if !cursor.digits[g].iter().copied().eq(wanted()) {
+            if !cursor.digits[g].iter().copied().eq(digits_of_group()) {
                 return None;
             }
             index = index * count + lo;
@@ -94,13 +94,13 @@ impl<'a> Cursor<'a> {
         let mut rest = rank - slice.before[stretch];
         for prefix in stretch * PREFIX_STRIDE..slice.prefixes {
             group.decode(&slice.first, prefix, &mut self.digits[g]);
-            let here = group.count_completions(&slice.first, &self.digits[g]);
-            if rest < here {
+            let completions = group.count_completions(&slice.first, &self.digits[g]);
+            if rest < completions {
                 self.enter(g, prefix);
                 self.digits[g][group.last()] = self.completions[g].select(rest).unwrap_or(0);
                 return;
             }
-            rest -= here;
+            rest -= completions;
         }
     }
 

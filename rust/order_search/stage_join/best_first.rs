@@ -197,23 +197,23 @@ impl<'a> Stage<'a> {
     /// # Errors
     /// Candidates that are not part of this stage, or [`Error::Interrupted`].
     pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
-        let mut wanted = Vec::new();
+        let mut requests = Vec::new();
         for &Span { equation, first, last, limit } in spans {
             let used = self.tables.get(equation).map_or(&[][..], |table| &table.used);
             // Candidates that occur in no tuple have no regressors.
-            let known =
+            let is_evaluated =
                 first < last && last - first <= used.len() && (first..last).all(|id| used.binary_search(&id).is_ok());
-            if !known || limit.is_nan() {
+            if !is_evaluated || limit.is_nan() {
                 let count = used.len();
                 let what = format!("candidates {first} to {last} of equation {equation} are not among its {count}");
                 return Err(mismatch_error(what));
             }
             let limit = self.raw_limit(equation, limit);
-            wanted.extend((first..last).map(|id| (equation, id, limit)));
+            requests.extend((first..last).map(|id| (equation, id, limit)));
         }
         let scratches = PerThread::<Scratch>::new(pool);
         let verdicts: Vec<Verdict> = pool.install(|| {
-            wanted
+            requests
                 .par_iter()
                 .map(|&(e, id, limit)| {
                     control.check_stop()?;
@@ -285,7 +285,7 @@ impl SearchState {
     /// Best score of a tuple, if there is one.
     #[must_use]
     pub fn best(&self) -> Option<f64> {
-        self.kept.first().map(|kept| kept.0)
+        self.kept.first().map(|incumbent| incumbent.0)
     }
 
     /// Raise an error if the state belongs to another stage.
@@ -314,13 +314,13 @@ impl SearchState {
         control: &Control,
     ) -> Result<()> {
         self.check(stage)?;
-        let wanted: usize = self.pending_spans.iter().map(|span| span.last - span.first).sum();
+        let count: usize = self.pending_spans.iter().map(|span| span.last - span.first).sum();
         let sound = |verdict: &Verdict| match *verdict {
             Verdict::Score(raw) | Verdict::Bounded(raw) | Verdict::Stopped(raw) => raw >= 0.0,
             Verdict::Failed(_) => true,
         };
-        if verdicts.len() != wanted || !verdicts.iter().all(sound) {
-            return Err(mismatch_error(format!("{} verdicts are not those of {wanted} candidates", verdicts.len())));
+        if verdicts.len() != count || !verdicts.iter().all(sound) {
+            return Err(mismatch_error(format!("{} verdicts are not those of {count} candidates", verdicts.len())));
         }
         let first_pass = self.pass.0 < stage.tables.len();
         let mut verdicts = verdicts.iter();

@@ -40,7 +40,7 @@ pub(super) struct Half {
 
 impl Half {
     /// Sum of scores and class of every combination.
-    pub(super) fn states(&self, known: &ScoreTables) -> Vec<ScoreEntry> {
+    pub(super) fn states(&self, scores: &ScoreTables) -> Vec<ScoreEntry> {
         let width = self.equations.len();
         if width == 0 {
             return vec![ScoreEntry { value: 0.0, class: Class::Exact }];
@@ -48,7 +48,7 @@ impl Half {
         self.combinations
             .chunks_exact(width)
             .map(|ids| {
-                let entries = self.equations.clone().zip(ids).map(|(e, &id)| known[e][id as usize]);
+                let entries = self.equations.clone().zip(ids).map(|(e, &id)| scores[e][id as usize]);
                 entries.fold(ScoreEntry { value: 0.0, class: Class::Exact }, |sum, entry| ScoreEntry {
                     value: sum.value + entry.value,
                     class: sum.class.combine(entry.class),
@@ -150,7 +150,7 @@ impl Join {
         for (h, axes) in [&own, &other].into_iter().enumerate() {
             let equations = ranges[h].clone();
             let mut half = Half { equations: equations.clone(), combinations: Vec::new(), rows: Vec::new() };
-            let mut known: HashMap<Box<[u32]>, u32> = HashMap::new();
+            let mut ids_by_key: HashMap<Box<[u32]>, u32> = HashMap::new();
             let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
             rows[h].for_each_choice(lattice, axes, &rows[1 - h], |index, sums, theirs| {
                 control.check_stop()?;
@@ -163,7 +163,7 @@ impl Join {
                         continue;
                     }
                     let combination =
-                        combination(lattice, candidates, &mut half, &mut known, &orders, &mut key, &mut ids)?;
+                        combination(lattice, candidates, &mut half, &mut ids_by_key, &orders, &mut key, &mut ids)?;
                     let (mine, named) = (number_of_addend as u64, u64::from(named));
                     let bucket = if h == 0 { mine * stride + named } else { named * stride + mine };
                     half.rows.push(HalfRow { bucket, index, combination });
@@ -238,7 +238,7 @@ fn combination(
     lattice: &OrderLawGrid,
     candidates: &mut [Candidates],
     half: &mut Half,
-    known: &mut HashMap<Box<[u32]>, u32>,
+    ids_by_key: &mut HashMap<Box<[u32]>, u32>,
     orders: &[f64],
     key: &mut Vec<i64>,
     ids: &mut Vec<u32>,
@@ -250,7 +250,7 @@ fn combination(
         ids.push(candidates[e].id(mine, key)?);
         rest = others;
     }
-    match known.entry(ids.as_slice().into()) {
+    match ids_by_key.entry(ids.as_slice().into()) {
         Slot::Occupied(slot) => Ok(*slot.get()),
         Slot::Vacant(slot) => {
             // Without free orders of their own, equations add candidates in the order of combinations.
@@ -313,9 +313,9 @@ pub struct Span {
 }
 
 /// Group the candidates of an equation into spans with the same limit.
-pub(super) fn spans(equation: usize, wanted: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
+pub(super) fn spans(equation: usize, requests: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
     let mut spans: Vec<Span> = Vec::new();
-    for (id, limit) in wanted {
+    for (id, limit) in requests {
         match spans.last_mut() {
             Some(span) if span.last == id && span.limit.to_bits() == limit.to_bits() => span.last = id + 1,
             _ => spans.push(Span { equation, first: id, last: id + 1, limit }),
@@ -457,11 +457,11 @@ impl OrderLawSums {
         control: &Control,
     ) -> Result<Option<DistinctSums>> {
         let width = self.constants.len();
-        let mut found = DistinctSums::of(width);
-        found.insert(&vec![0.0; width]);
+        let mut distinct = DistinctSums::of(width);
+        distinct.insert(&vec![0.0; width]);
         for &axis in axes {
             let mut next = DistinctSums::of(width);
-            for sums in found.each() {
+            for sums in distinct.each() {
                 for (i, value) in lattice.axes()[axis].iter().enumerate() {
                     if i % ROWS_PER_STOP_CHECK == 0 {
                         control.check_stop()?;
@@ -473,9 +473,9 @@ impl OrderLawSums {
                     return Ok(None);
                 }
             }
-            found = next;
+            distinct = next;
         }
-        Ok(Some(found))
+        Ok(Some(distinct))
     }
 
     /// Call `take` for every choice of these free orders. Its arguments are the contribution to a tuple's index, the

@@ -32,11 +32,11 @@ impl Join {
     }
 
     /// Score of a tuple, added over the equations in the order of an enumeration.
-    fn score(&self, known: &ScoreTables, pair: [u32; 2]) -> f64 {
+    fn score(&self, scores: &ScoreTables, pair: [u32; 2]) -> f64 {
         let halves = self.halves.iter().zip(pair);
         halves
             .flat_map(|(half, combination)| half.equations.clone().zip(half.ids(combination)))
-            .map(|(e, &id)| known[e][id as usize].value)
+            .map(|(e, &id)| scores[e][id as usize].value)
             .sum()
     }
 
@@ -44,27 +44,27 @@ impl Join {
     pub(super) fn best(
         &self,
         states: &[Vec<ScoreEntry>; 2],
-        known: &ScoreTables,
+        scores: &ScoreTables,
         keep: usize,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<Vec<(f64, u64)>> {
         let exact = |class: Class| class == Class::Exact;
         let mut order: Vec<(f64, usize, [f64; 2])> = pool.install(|| {
-            let found = self.buckets.par_iter().enumerate().filter_map(|(i, bucket)| {
+            let candidates = self.buckets.par_iter().enumerate().filter_map(|(i, bucket)| {
                 self.least_scores(bucket, states, exact).map(|least| (least[0] + least[1], i, least))
             });
-            let mut order: Vec<_> = found.collect();
+            let mut order: Vec<_> = candidates.collect();
             order.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
             order
         });
         order.dedup_by_key(|o| o.1);
-        let mut kept: Vec<(f64, u64)> = Vec::new();
-        let trim = |kept: &mut Vec<(f64, u64)>| {
-            kept.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            kept.truncate(keep);
-            if kept.len() == keep {
-                kept[keep - 1].0 * (1.0 + SCORE_TOLERANCE)
+        let mut best_pairs: Vec<(f64, u64)> = Vec::new();
+        let trim = |best_pairs: &mut Vec<(f64, u64)>| {
+            best_pairs.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            best_pairs.truncate(keep);
+            if best_pairs.len() == keep {
+                best_pairs[keep - 1].0 * (1.0 + SCORE_TOLERANCE)
             } else {
                 f64::INFINITY
             }
@@ -95,30 +95,30 @@ impl Join {
                         break;
                     }
                     let pair = [first.combination, second.combination];
-                    kept.push((self.score(known, pair), first.index + second.index));
-                    if kept.len() >= room {
-                        worst = trim(&mut kept);
+                    best_pairs.push((self.score(scores, pair), first.index + second.index));
+                    if best_pairs.len() >= room {
+                        worst = trim(&mut best_pairs);
                     }
                 }
             }
-            if worst == f64::INFINITY && kept.len() >= keep {
-                worst = trim(&mut kept);
+            if worst == f64::INFINITY && best_pairs.len() >= keep {
+                worst = trim(&mut best_pairs);
             }
         }
-        trim(&mut kept);
-        Ok(kept)
+        trim(&mut best_pairs);
+        Ok(best_pairs)
     }
 
     /// Inexact entries that may still belong to a row of the table, with the score up to which to evaluate each.
     pub(super) fn unresolved_spans(
         &self,
         states: &[Vec<ScoreEntry>; 2],
-        known: &ScoreTables,
+        scores: &ScoreTables,
         worst: f64,
         raise: f64,
         control: &Control,
     ) -> Result<Vec<Span>> {
-        let mut limits: Vec<Vec<f64>> = known.iter().map(|k| vec![f64::NEG_INFINITY; k.len()]).collect();
+        let mut limits: Vec<Vec<f64>> = scores.iter().map(|k| vec![f64::NEG_INFINITY; k.len()]).collect();
         for bucket in &self.buckets {
             control.check_stop()?;
             // `None` if all candidates of one half have failed.
@@ -134,7 +134,7 @@ impl Join {
                         continue;
                     }
                     for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
-                        let entry = known[e][id as usize];
+                        let entry = scores[e][id as usize];
                         if entry.class == Class::Exact {
                             continue;
                         }
@@ -152,11 +152,11 @@ impl Join {
                 }
             }
         }
-        let wanted = limits
+        let requests = limits
             .into_iter()
             .enumerate()
             .flat_map(|(e, all)| spans(e, all.into_iter().enumerate().filter(|(_, limit)| *limit > f64::NEG_INFINITY)));
-        Ok(wanted.collect())
+        Ok(requests.collect())
     }
 
     /// Number of tuples by outcome, and the first failures by index.

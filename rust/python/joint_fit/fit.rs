@@ -84,7 +84,7 @@ pub fn joint_fit<'py>(
     stop: Option<&Stop>,
 ) -> PyResult<Option<Bound<'py, PyDict>>> {
     let (free, (threads, memory)) = (Arc::clone(&problem.inner), means);
-    let candidates = candidates.map(|found| Vec::clone(&found.inner));
+    let candidates = candidates.map(|fit| Vec::clone(&fit.inner));
     let initialization = match (near, start) {
         (Some((values, noise, pulses_per_sample)), _) => Initialization::WarmStart {
             values: values.into(),
@@ -99,13 +99,13 @@ pub fn joint_fit<'py>(
     let settings = Settings { loss, refine, threads };
     let size = free.problem.size();
     let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
-    let found = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
+    let fit = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let starts = OrderGrids::new(&source, threads, memory, stop);
         let sizes = OutputScale::of_recordings(&source)?;
         let sought = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
         fit::fit(sought, initialization, settings, report)
     })?;
-    found.map(|found| fit_to_dict(py, found, size)).transpose()
+    fit.map(|fit| fit_to_dict(py, fit, size)).transpose()
 }
 
 /// Tables of all runs.

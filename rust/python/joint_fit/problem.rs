@@ -48,8 +48,8 @@ impl JointProblem {
     /// Coefficients that a law determines: name, sign, factors.
     #[getter]
     fn products(&self) -> PyResult<Vec<(String, f64, Vec<String>)>> {
-        let told = |law: &Law| (law.name.clone(), law.sign, law.factors.clone());
-        run_attached(|| Ok(self.inner.products.iter().map(told).collect()))
+        let law_tuple = |law: &Law| (law.name.clone(), law.sign, law.factors.clone());
+        run_attached(|| Ok(self.inner.products.iter().map(law_tuple).collect()))
     }
 
     /// Bounds of all free parameters.
@@ -66,8 +66,8 @@ impl JointProblem {
         towards: PyReadonlyArray1<'py, f64>,
     ) -> PyResult<Array<'py>> {
         let (at, towards) = (vector("values to go from", &at)?, vector("values to go to", &towards)?);
-        let found = run_detached(py, || self.inner.problem.last_feasible_point(&at, &towards))?;
-        Ok(PyArray1::from_vec(py, found))
+        let point = run_detached(py, || self.inner.problem.last_feasible_point(&at, &towards))?;
+        Ok(PyArray1::from_vec(py, point))
     }
 
     /// Minimize the output error on sampled runs by Levenberg–Marquardt.
@@ -91,25 +91,25 @@ impl JointProblem {
         let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
         let place = Iterate { point: self.inner.problem.point(&start.0)?, states: to_vectors(start.1) };
         let size = self.inner.problem.size();
-        if let Some(beyond) = held.iter().find(|&&number| number >= size) {
-            let what = format!("number {beyond} of {size} to be held");
+        if let Some(index) = held.iter().find(|&&number| number >= size) {
+            let what = format!("number {index} of {size} to be held");
             return Err(Error::Structure { what, remedy: "count them from 0".into() }.into());
         }
         let (free, settings) = (Arc::clone(&self.inner), MinimizationSettings { evaluations, tolerance });
         let points = count_evaluated_pulses(&experiments, evaluations);
-        let found = run_interruptible(py, points, stop, move |stop| {
+        let optimum = run_interruptible(py, points, stop, move |stop| {
             free.problem_at(&place, plain, &held).minimize(&experiments, &place, settings, steady, stop)
         })?;
         let dict = PyDict::new(py);
-        dict.set_item("values", found.values())?;
-        dict.set_item("states", &found.iterate.states)?;
-        dict.set_item("initial", found.initial)?;
-        dict.set_item("cost", found.cost)?;
-        dict.set_item("residuals", PyArray1::from_vec(py, found.residuals))?;
-        let none = found.jacobian.first().is_none_or(Vec::is_empty);
-        dict.set_item("jacobian", if none { None } else { Some(stack_rows(py, &found.jacobian)?) })?;
-        dict.set_item("evaluations", found.evaluations)?;
-        dict.set_item("status", status(found.status))?;
+        dict.set_item("values", optimum.values())?;
+        dict.set_item("states", &optimum.iterate.states)?;
+        dict.set_item("initial", optimum.initial)?;
+        dict.set_item("cost", optimum.cost)?;
+        dict.set_item("residuals", PyArray1::from_vec(py, optimum.residuals))?;
+        let none = optimum.jacobian.first().is_none_or(Vec::is_empty);
+        dict.set_item("jacobian", if none { None } else { Some(stack_rows(py, &optimum.jacobian)?) })?;
+        dict.set_item("evaluations", optimum.evaluations)?;
+        dict.set_item("status", status(optimum.status))?;
         Ok(dict)
     }
 }

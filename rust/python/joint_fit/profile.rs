@@ -86,16 +86,16 @@ pub fn profile_intervals<'py>(
     let (free, fit) = (Arc::clone(&problem.inner), state(fit)?);
     let source = source(&free, &runs)?;
     let settings = ProfileSettings { parameters: parameters.map(Vec::from), width, budget, threads };
-    let found = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
+    let result = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         search_intervals(ProfileLikelihood::new((&free, &source, stop), &fit, evaluations)?, &settings, report)
     })?;
     let dict = PyDict::new(py);
-    let intervals = found.intervals.into_iter().map(|(i, one)| (i, one.low, one.high, one.points, one.evaluations));
+    let intervals = result.intervals.into_iter().map(|(i, one)| (i, one.low, one.high, one.points, one.evaluations));
     dict.set_item("intervals", intervals.collect::<Vec<_>>())?;
-    dict.set_item("lower_optimum", found.lower_optimum.map(|values| PyArray1::from_vec(py, values)))?;
-    dict.set_item("lower_on_finer_grid", found.lower_on_finer_grid)?;
-    dict.set_item("incomplete", found.incomplete)?;
-    dict.set_item("evaluations", found.evaluations)?;
+    dict.set_item("lower_optimum", result.lower_optimum.map(|values| PyArray1::from_vec(py, values)))?;
+    dict.set_item("lower_on_finer_grid", result.lower_on_finer_grid)?;
+    dict.set_item("incomplete", result.incomplete)?;
+    dict.set_item("evaluations", result.evaluations)?;
     Ok(dict)
 }
 

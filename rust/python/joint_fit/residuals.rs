@@ -27,9 +27,9 @@ pub fn covariance_of<'py>(
 ) -> PyResult<Table<'py>> {
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let found =
+    let covariance =
         run_interruptible(py, points, None, move |_| spread::covariance_of_residuals(&jacobian, &series, squares))?;
-    matrix(py, found, size)
+    matrix(py, covariance, size)
 }
 
 /// Covariance of a fit, whose residuals may have robust weights.
@@ -44,9 +44,9 @@ pub fn fit_covariance<'py>(
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let shares = shares.map(|shares| vector("shares", &shares)).transpose()?;
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let found =
+    let covariance =
         run_interruptible(py, points, None, move |_| spread::robust_covariance(&jacobian, series, shares.as_deref()))?;
-    matrix(py, found, size)
+    matrix(py, covariance, size)
 }
 
 /// Long-run covariance of sums of scores, with Bartlett weights.
@@ -59,8 +59,8 @@ pub fn long_run_covariance<'py>(
 ) -> PyResult<Table<'py>> {
     let (jacobian, series) = (rows(&jacobian)?, copy_vectors("residuals", &series)?);
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
-    let found = run_interruptible(py, points, None, move |_| spread::long_run_covariance(&jacobian, &series))?;
-    matrix(py, found, size)
+    let covariance = run_interruptible(py, points, None, move |_| spread::long_run_covariance(&jacobian, &series))?;
+    matrix(py, covariance, size)
 }
 
 /// Filter that whitens series with one spectrum, and the innovation variance.
@@ -102,8 +102,8 @@ pub fn arx_model<'py>(
             }
         }
         crate::error::check_points("lags by 256", lags.saturating_mul(256))?;
-        let given: Vec<Vec<&[f64]>> = inputs.iter().map(|rows| rows.iter().map(Vec::as_slice).collect()).collect();
-        Ok(statistics::arx_model(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), &given, most))
+        let input_rows: Vec<Vec<&[f64]>> = inputs.iter().map(|rows| rows.iter().map(Vec::as_slice).collect()).collect();
+        Ok(statistics::arx_model(&series.iter().map(Vec::as_slice).collect::<Vec<_>>(), &input_rows, most))
     })?;
     let innovations = model.innovations.into_iter().map(|row| PyArray1::from_vec(py, row)).collect();
     Ok((PyArray1::from_vec(py, model.filter), model.start, innovations, model.parameters))

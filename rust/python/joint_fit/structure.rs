@@ -92,7 +92,7 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> 
     }
     let hints = argument.hints;
     let law = |(name, sign, factors): (String, f64, List<String>)| Law { name, sign, factors: factors.into() };
-    let found = ParametricStructure {
+    let structure = ParametricStructure {
         signals: argument.signals.into(),
         derived: derived_signals(argument.derived)?,
         equations: argument.equations.into_iter().map(equation).collect(),
@@ -111,12 +111,12 @@ pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> 
             known: hints.known.into_iter().collect(),
         },
     };
-    let signals = found.signals.len();
+    let signals = structure.signals.len();
     let missing =
-        found.equations.iter().flat_map(|e| std::iter::once(e.output).chain(e.terms.iter().map(|t| t.signal)));
-    if let Some(signal) = missing.chain(found.inputs.iter().map(|i| i.free.signal)).find(|&s| s >= signals) {
+        structure.equations.iter().flat_map(|e| std::iter::once(e.output).chain(e.terms.iter().map(|t| t.signal)));
+    if let Some(signal) = missing.chain(structure.inputs.iter().map(|i| i.free.signal)).find(|&s| s >= signals) {
         let what = format!("signal {signal} of {signals}");
         return Err(Error::Structure { what, remedy: "number them from 0".into() }.into());
     }
-    Ok(found)
+    Ok(structure)
 }

@@ -247,7 +247,7 @@ pub fn part_of(part: Part) -> PartArg {
 
 /// Result of batches from Python tuples.
 pub fn part((rows, counts, failures): PartArg) -> Part {
-    let (candidates, kept, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
+    let (candidates, retained, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
         CountsArg::Plain((a, b, c, d, e, f, g)) => (a, b, c, d, e, f, g, 0),
         CountsArg::Boxed(all) => all,
     };
@@ -263,7 +263,7 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
             .collect(),
         counts: Counts {
             candidates,
-            kept,
+            kept: retained,
             beaten,
             excluded_by_bound: bounded,
             excluded_by_box: boxed,
@@ -320,7 +320,7 @@ pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
 
 /// Verdicts serialized by [`verdicts_of`].
 pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
-    let known = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
+    let decoded = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
         let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));
         match kind {
             0 => Some(Verdict::Score(raw)),
@@ -331,7 +331,7 @@ pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
             _ => None,
         }
     });
-    known.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
+    decoded.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
         mismatch_error(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
     })
 }

@@ -41,13 +41,16 @@ pub fn search<'py>(
     settings: SettingsArg,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
-    let found = run_watched(py, progress.as_ref(), |control| {
-        let lattice = orders.lattice(&given.inputs)?;
-        let records = given.records(control)?;
-        Ok(OrderTable::new(&lattice, batches::search(&records, &lattice, &given.fixed, &given.options, control)?))
+    let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+    let result = run_watched(py, progress.as_ref(), |control| {
+        let lattice = orders.lattice(&arguments.inputs)?;
+        let records = arguments.records(control)?;
+        Ok(OrderTable::new(
+            &lattice,
+            batches::search(&records, &lattice, &arguments.fixed, &arguments.options, control)?,
+        ))
     })?;
-    found.dict(py)
+    result.dict(py)
 }
 
 /// Row of a table, initial terms by record.
@@ -133,7 +136,7 @@ pub fn search_join<'py>(
     parts: List<PartArg>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let options = settings.options(terms)?;
-    let found = run_detached(py, || {
+    let result = run_detached(py, || {
         let lattice = orders.lattice(&inputs)?;
         let mut all = Part::default();
         for argument in parts {
@@ -159,7 +162,7 @@ pub fn search_join<'py>(
         }
         Ok(OrderTable::new(&lattice, all.outcome(options.norm, samples)))
     })?;
-    found.dict(py)
+    result.dict(py)
 }
 
 /// Search prepared for its batches, on this machine or on several.
@@ -181,12 +184,19 @@ impl OrderSearch {
         terms: InitialArg,
         settings: SettingsArg,
     ) -> PyResult<Self> {
-        let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+        let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
         let ready = run_watched(py, None, |control| {
-            let lattice = orders.lattice(&given.inputs)?;
-            let records = given.records(control)?;
-            let pool = pool(given.options.threads)?;
-            batches::BatchEvaluator::new(&records, Cow::Owned(lattice), &given.fixed, &given.options, &pool, control)
+            let lattice = orders.lattice(&arguments.inputs)?;
+            let records = arguments.records(control)?;
+            let pool = pool(arguments.options.threads)?;
+            batches::BatchEvaluator::new(
+                &records,
+                Cow::Owned(lattice),
+                &arguments.fixed,
+                &arguments.options,
+                &pool,
+                control,
+            )
         })?;
         Ok(Self { ready })
     }
@@ -204,11 +214,11 @@ impl OrderSearch {
         progress: Option<Py<PyAny>>,
         save: Option<Py<PyAny>>,
     ) -> PyResult<PartArg> {
-        let found = run_checkpointed(py, progress.as_ref(), save.as_ref(), |control| {
+        let result = run_checkpointed(py, progress.as_ref(), save.as_ref(), |control| {
             let pool = pool(threads)?;
             self.ready.evaluate_batches(first, last, &seed, start.map(checkpoint), &pool, control)
         })?;
-        Ok(part_of(found))
+        Ok(part_of(result))
     }
 }
 
@@ -236,15 +246,16 @@ pub fn certify<'py>(
     let records = records(&runs)?;
     let terms = terms.iter().map(|&(signal, lowest, highest)| Range { signal, lowest, highest }).collect();
     let region = Region { output, alpha, terms, min_separation };
-    let asked = CertificateOptions { tolerance, max_coefficient: max_term_ratio, max_cells, threads, memory };
-    let found = run_watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &asked, control))?;
+    let options = CertificateOptions { tolerance, max_coefficient: max_term_ratio, max_cells, threads, memory };
+    let certificate =
+        run_watched(py, progress.as_ref(), |control| certificate::certify(&records, &region, &options, control))?;
     let dict = PyDict::new(py);
-    dict.set_item("at_least", found.lower_bound)?;
-    dict.set_item("best", found.best)?;
-    dict.set_item("alpha", found.order)?;
-    dict.set_item("orders", found.orders)?;
-    dict.set_item("cells", found.cells)?;
-    dict.set_item("open", found.open_cells)?;
+    dict.set_item("at_least", certificate.lower_bound)?;
+    dict.set_item("best", certificate.best)?;
+    dict.set_item("alpha", certificate.order)?;
+    dict.set_item("orders", certificate.orders)?;
+    dict.set_item("cells", certificate.cells)?;
+    dict.set_item("open", certificate.open_cells)?;
     Ok(dict)
 }
 
@@ -287,7 +298,7 @@ impl Points {
         check_size(&candidates)?;
         check_length("a candidate", size, columns(&candidates))?;
         let values: Vec<f64> = candidates.as_array().iter().copied().collect();
-        let found = run_watched(py, None, |control| {
+        let errors = run_watched(py, None, |control| {
             let point = |row: &[f64]| {
                 let (orders, coefficients) = row[1..].split_at(*width);
                 Point { order: row[0], orders: orders.to_vec(), coefficients: coefficients.to_vec() }
@@ -295,7 +306,7 @@ impl Points {
             let points: Vec<Point> = values.chunks_exact(size).map(point).collect();
             inner.scores(&points, limit, threads, control)
         })?;
-        Ok(PyArray1::from_vec(py, found))
+        Ok(PyArray1::from_vec(py, errors))
     }
 }
 

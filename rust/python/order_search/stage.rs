@@ -33,14 +33,14 @@ pub fn search_stage<'py>(
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let (axes, fixed) = (to_vectors(axes), to_vectors(fixed));
-    let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
-    let found = run_watched(py, progress.as_ref(), |control| {
-        let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
-        let records = given.records(control)?;
-        let outcome = stage_join::search(&records, &lattice, &given.fixed, &scales, &given.options, control)?;
+    let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+    let result = run_watched(py, progress.as_ref(), |control| {
+        let lattice = law_lattice(&axes, laws, &arguments.inputs, &arguments.fixed)?;
+        let records = arguments.records(control)?;
+        let outcome = stage_join::search(&records, &lattice, &arguments.fixed, &scales, &arguments.options, control)?;
         Ok(StageTable::new(&lattice, outcome))
     })?;
-    found.dict(py)
+    result.dict(py)
 }
 
 /// Result of one equation: (score, α, orders, coefficients, initial terms by record).
@@ -94,11 +94,11 @@ impl StageSearch {
     /// Run `work` on the search state.
     fn course<T>(&self, work: impl FnOnce(&mut SearchState) -> Result<T, Error>) -> Result<T, Error> {
         let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
-        let found = course.as_mut().ok_or_else(|| Error::Structure {
+        let state = course.as_mut().ok_or_else(|| Error::Structure {
             what: "this search only follows candidates".into(),
             remedy: "make one that keeps its course".into(),
         })?;
-        work(found)
+        work(state)
     }
 }
 
@@ -119,12 +119,12 @@ impl StageSearch {
         keeps_course: bool,
     ) -> PyResult<Self> {
         let (axes, fixed) = (to_vectors(axes), to_vectors(fixed));
-        let mut given = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
+        let mut arguments = SearchInputs::new(&runs, inputs, fixed, terms, settings)?;
         let (stage, course) = run_watched(py, None, |control| {
-            let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
-            let records = given.records(control)?;
-            let pool = pool(given.options.threads)?;
-            Stage::new(&records, Cow::Owned(lattice), &given.fixed, &scales, &given.options, &pool, control)
+            let lattice = law_lattice(&axes, laws, &arguments.inputs, &arguments.fixed)?;
+            let records = arguments.records(control)?;
+            let pool = pool(arguments.options.threads)?;
+            Stage::new(&records, Cow::Owned(lattice), &arguments.fixed, &scales, &arguments.options, &pool, control)
         })?;
         Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
     }
@@ -150,9 +150,9 @@ impl StageSearch {
         threads: usize,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)> {
-        let wanted: Vec<_> = spans.into_iter().map(span).collect();
+        let requests: Vec<_> = spans.into_iter().map(span).collect();
         let (values, kinds) = run_watched(py, progress.as_ref(), |control| {
-            Ok(verdicts_of(&self.stage.evaluate(&wanted, &pool(threads)?, control)?))
+            Ok(verdicts_of(&self.stage.evaluate(&requests, &pool(threads)?, control)?))
         })?;
         Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
     }
@@ -160,17 +160,17 @@ impl StageSearch {
     /// Add the results of the pending candidates, in their order.
     fn take(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
         run_watched(py, None, |control| {
-            let found = verdicts(values, kinds)?;
-            self.course(|course| course.record_verdicts(&self.stage, &found, &pool(threads)?, control))
+            let decoded = verdicts(values, kinds)?;
+            self.course(|course| course.record_verdicts(&self.stage, &decoded, &pool(threads)?, control))
         })
     }
 
     /// Result, once no candidates are pending.
     fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let found = run_watched(py, None, |control| {
+        let result = run_watched(py, None, |control| {
             let outcome = self.course(|course| self.stage.outcome(course, control))?;
             Ok(StageTable::new(self.stage.lattice(), outcome))
         })?;
-        found.dict(py)
+        result.dict(py)
     }
 }

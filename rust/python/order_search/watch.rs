@@ -120,9 +120,9 @@ pub fn run_interruptible<T: Send + 'static>(
     }
     py.detach(|| {
         let (send, receive) = channel();
-        let told = stop.clone();
+        let stop_copy = stop.clone();
         // An abandoned thread has no receiver.
-        std::thread::spawn(move || drop(send.send(catch_panic(|| work(&told)))));
+        std::thread::spawn(move || drop(send.send(catch_panic(|| work(&stop_copy)))));
         loop {
             match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
                 Ok(result) => return result.map_err(PyErr::from),
@@ -164,18 +164,18 @@ pub fn run_with_progress<T: Send + 'static>(
     let stop = flag.cloned().unwrap_or_default().0;
     py.detach(|| {
         let (send, receive) = channel();
-        let told = stop.clone();
+        let stop_copy = stop.clone();
         // An abandoned thread has no receiver.
         std::thread::spawn(move || {
-            let report = |done, of| send.send(WorkerMessage::Progresses(done, of)).map_err(|_| Error::Interrupted);
-            let ended = catch_panic(|| work(&told, &report));
+            let report = |count, of| send.send(WorkerMessage::Progresses(count, of)).map_err(|_| Error::Interrupted);
+            let ended = catch_panic(|| work(&stop_copy, &report));
             drop(send.send(WorkerMessage::Ends(ended)));
         });
         loop {
             let looked = match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
                 Ok(WorkerMessage::Ends(result)) => return result.map_err(PyErr::from),
-                Ok(WorkerMessage::Progresses(done, of)) => {
-                    Python::attach(|py| progress.map_or(Ok(()), |progress| progress.call1(py, (done, of)).map(drop)))
+                Ok(WorkerMessage::Progresses(count, of)) => {
+                    Python::attach(|py| progress.map_or(Ok(()), |progress| progress.call1(py, (count, of)).map(drop)))
                 }
                 Err(RecvTimeoutError::Timeout) => Python::attach(|py| py.check_signals()),
                 Err(RecvTimeoutError::Disconnected) => {

@@ -109,7 +109,7 @@ pub fn integer_order_optima(
     if !plain || IntegerOrders::of(model, grid.experiments(), &start).is_none() {
         return Ok(None);
     }
-    let mut found: Vec<Candidate> = Vec::new();
+    let mut candidates: Vec<Candidate> = Vec::new();
     for i in 0..model.equations.len() {
         let representative = representative_runs(&model.equations[i], grid.experiments());
         let experiments: Vec<Experiment> = representative.into_iter().map(|e| single_output(e, i)).collect();
@@ -122,16 +122,16 @@ pub fn integer_order_optima(
         for (k, guess) in guesses.into_iter().enumerate() {
             if i == 0 {
                 let place = Iterate { point: guess.point, states: Vec::new() };
-                found.push(Candidate::at(place, guess.origin));
-            } else if k < found.len() {
-                let place = &mut found[k].result.iterate.point;
+                candidates.push(Candidate::at(place, guess.origin));
+            } else if k < candidates.len() {
+                let place = &mut candidates[k].result.iterate.point;
                 for j in equation.coefficients() {
                     place.coefficients[j] = guess.point.coefficients[j];
                 }
             }
         }
     }
-    Ok(Some(found))
+    Ok(Some(candidates))
 }
 
 /// Runs on which the guesses of an equation are compared, of many runs those with the most excitation.
@@ -157,21 +157,21 @@ fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment
             order
         })
         .collect();
-    let (mut chosen, mut samples) = (Vec::new(), 0);
+    let (mut selection, mut samples) = (Vec::new(), 0);
     for run in (0..experiments.len()).flat_map(|place| ranked.iter().map(move |order| order[place])) {
-        if chosen.len() >= MIN_RUNS.max(inputs.len()) && samples >= MAX_COARSE_SAMPLES {
+        if selection.len() >= MIN_RUNS.max(inputs.len()) && samples >= MAX_COARSE_SAMPLES {
             break;
         }
-        if !chosen.contains(&run) {
-            chosen.push(run);
+        if !selection.contains(&run) {
+            selection.push(run);
             samples += experiments[run].compared_count();
         }
     }
-    if chosen.is_empty() {
+    if selection.is_empty() {
         return experiments.iter().collect();
     }
-    chosen.sort_unstable();
-    chosen.into_iter().map(|run| &experiments[run]).collect()
+    selection.sort_unstable();
+    selection.into_iter().map(|run| &experiments[run]).collect()
 }
 
 /// Experiment of one output.
@@ -254,11 +254,11 @@ impl<'a> Equation<'a> {
     fn optima(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Guess>> {
         let delays = self.likely_delays(start, delays)?;
         let mut lower: Vec<Vec<Vec<Pole>>> = vec![Vec::new(); delays.len()];
-        let mut found = Vec::new();
+        let mut evaluations = Vec::new();
         for order in (self.integrators.max(1))..=self.order() {
             let last = order == self.order();
             let equation = self.at_order(order);
-            let mut here = Vec::new();
+            let mut ends_of_round = Vec::new();
             for (delay, poles) in delays.iter().zip(&mut lower) {
                 let begin = ParameterPoint { inputs: delay.clone(), ..start.clone() };
                 let mut guesses = equation.instrumental_variables(&begin)?;
@@ -266,14 +266,14 @@ impl<'a> Equation<'a> {
                 let ends = equation.refine(guesses)?;
                 let best = ends.first().map(|end| equation.poles(&end.point)).unwrap_or_default();
                 poles.push(best);
-                here.extend(ends);
+                ends_of_round.extend(ends);
             }
             if last {
-                found = here;
+                evaluations = ends_of_round;
             }
         }
-        found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-        Ok(found)
+        evaluations.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        Ok(evaluations)
     }
 
     /// Delays at which a filter of second order fits best: local minima of its cost.
@@ -287,8 +287,8 @@ impl<'a> Equation<'a> {
             let point = ParameterPoint { inputs: delay.clone(), ..start.clone() };
             let mut least = f64::INFINITY;
             for ratio in [1.0, 4.0] {
-                if let Some(found) = equation.filtered_least_squares(&point, ratio * self.frequency)? {
-                    least = least.min(equation.evaluate(&found)?.map_or(f64::INFINITY, |e| cost(&e)));
+                if let Some(evaluation) = equation.filtered_least_squares(&point, ratio * self.frequency)? {
+                    least = least.min(equation.evaluate(&evaluation)?.map_or(f64::INFINITY, |e| cost(&e)));
                 }
             }
             costs.push(least);
@@ -338,8 +338,12 @@ impl<'a> Equation<'a> {
                     }
                 }
                 let point = self.at_poles(start, &with);
-                if let Some(found) = self.evaluate(&point)? {
-                    guesses.push(Guess { cost: cost(&found), point: found.point, origin: "lower order".into() });
+                if let Some(evaluation) = self.evaluate(&point)? {
+                    guesses.push(Guess {
+                        cost: cost(&evaluation),
+                        point: evaluation.point,
+                        origin: "lower order".into(),
+                    });
                 }
             }
         }
@@ -370,8 +374,8 @@ impl<'a> Equation<'a> {
             let sections = self.sections(&self.poles(&guess.point));
             let start = [sections, guess.point.inputs.clone()].concat();
             match minimize(&problem, problem.clamp_to_bounds(start), settings) {
-                Ok(found) => {
-                    ends.push(Guess { cost: found.cost, point: found.evaluation.point, origin: guess.origin });
+                Ok(optimum) => {
+                    ends.push(Guess { cost: optimum.cost, point: optimum.evaluation.point, origin: guess.origin });
                 }
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
                 Err(_) => ends.push(guess),
@@ -408,11 +412,11 @@ impl<'a> Equation<'a> {
     }
 
     fn at_poles(&self, point: &ParameterPoint, poles: &[Pole]) -> ParameterPoint {
-        let mut moved = point.clone();
+        let mut mirrored = point.clone();
         for (&j, c) in self.own.iter().zip(polynomial(poles)) {
-            moved.coefficients[j] = -c;
+            mirrored.coefficients[j] = -c;
         }
-        moved
+        mirrored
     }
 
     /// Point with unstable poles reflected and poles within the bounds of the sampling.
@@ -484,13 +488,13 @@ impl<'a> Equation<'a> {
             }
             let mut basis = Vec::new();
             if !self.model.initial.is_at_rest() || self.model.initial.has_level() {
-                let held = |samples: Vec<f64>| SourceInput {
+                let constant_input = |samples: Vec<f64>| SourceInput {
                     samples: Cow::Owned(samples),
                     between: Intersample::Hold,
                     delay: 0.0,
                     before: 0.0,
                 };
-                let (Some(impulse), Some(constant)) = (respond(None), respond(Some(&held(vec![1.0])))) else {
+                let (Some(impulse), Some(constant)) = (respond(None), respond(Some(&constant_input(vec![1.0])))) else {
                     return Ok(None);
                 };
                 for j in 0..n {
@@ -515,42 +519,42 @@ impl<'a> Equation<'a> {
 
     /// Improve a point by refined instrumental variables; None if it has no finite simulation.
     fn refine_instruments(&self, start: &ParameterPoint) -> Result<Option<Evaluation<'a>>> {
-        let Some(mut here) = self.evaluate(start)? else { return Ok(None) };
+        let Some(mut iterate) = self.evaluate(start)? else { return Ok(None) };
         for _ in 0..INSTRUMENT_STEPS {
-            let Some(step) = self.instrument_step(&here)? else { break };
+            let Some(step) = self.instrument_step(&iterate)? else { break };
             let (mut share, mut next) = (1.0, None);
             for _ in 0..MAX_HALVINGS {
-                let mut point = here.point.clone();
+                let mut point = iterate.point.clone();
                 for (&j, by) in self.own.iter().zip(&step) {
                     point.coefficients[j] += share * by;
                 }
-                next = self.evaluate(&self.stabilize(&point))?.filter(|there| cost(there) < cost(&here));
+                next = self.evaluate(&self.stabilize(&point))?.filter(|trial| cost(trial) < cost(&iterate));
                 if next.is_some() {
                     break;
                 }
                 share *= 0.5;
             }
-            let Some(there) = next else { break };
-            let gain = 1.0 - cost(&there) / cost(&here);
-            here = there;
+            let Some(trial) = next else { break };
+            let gain = 1.0 - cost(&trial) / cost(&iterate);
+            iterate = trial;
             if gain < 1e-4 {
                 break;
             }
         }
-        Ok(Some(here))
+        Ok(Some(iterate))
     }
 
     /// Step of the autoregressive coefficients with the simulation as instrument; None if it is not determined.
-    fn instrument_step(&self, here: &Evaluation<'a>) -> Result<Option<Vec<f64>>> {
-        let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &here.point) else { return Ok(None) };
+    fn instrument_step(&self, evaluation: &Evaluation<'a>) -> Result<Option<Vec<f64>>> {
+        let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &evaluation.point) else { return Ok(None) };
         let linear = self.model.linear_coefficients();
-        let Ok(jacobian) = exact.jacobian(&self.model, self.experiments, &linear, here) else { return Ok(None) };
-        let orders = here.point.orders.len();
+        let Ok(jacobian) = exact.jacobian(&self.model, self.experiments, &linear, evaluation) else { return Ok(None) };
+        let orders = evaluation.point.orders.len();
         let places: Vec<usize> = self.own.iter().chain(&linear).map(|j| orders + j).collect();
-        let own: Vec<f64> = self.divisor(&here.point).iter().map(|c| -c).collect();
+        let own: Vec<f64> = self.divisor(&evaluation.point).iter().map(|c| -c).collect();
         let mut regressors: Vec<Vec<f64>> = vec![Vec::new(); self.own.len()];
         let mut companions = Vec::new();
-        for (experiment, basis) in self.experiments.iter().zip(here.parts.iter().map(ExactSimulation::basis)) {
+        for (experiment, basis) in self.experiments.iter().zip(evaluation.parts.iter().map(ExactSimulation::basis)) {
             let companion = Companion::of_width(&mut companions, &own, experiment.record.step());
             let grid = (experiment.pulses_per_sample, experiment.compared_count());
             let Some(output) = companion.respond(Some(&measured_input(experiment)), None, grid) else {
@@ -567,7 +571,7 @@ impl<'a> Equation<'a> {
         let (mut cross, mut right) = (vec![0.0; k * k], vec![0.0; k]);
         for (a, &instrument) in places.iter().enumerate() {
             // The Jacobian is that of the residuals, measured minus simulated samples.
-            right[a] = -inner(&jacobian[instrument], &here.residuals);
+            right[a] = -inner(&jacobian[instrument], &evaluation.residuals);
             for b in 0..k {
                 cross[a * k + b] = match regressors.get(b) {
                     Some(regressor) => -inner(&jacobian[instrument], regressor),
@@ -587,7 +591,7 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
     let Some(weights) = experiment.sample_weights.first().filter(|w| w.contains(&0.0)) else {
         return Cow::Borrowed(samples);
     };
-    let known = |(k, v): (usize, &f64)| {
+    let marked_value = |(k, v): (usize, &f64)| {
         let read = k == 0 || weights.get(k - 1).is_none_or(|w| *w > 0.0);
         if read {
             *v
@@ -595,7 +599,7 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
             f64::NAN
         }
     };
-    let marked: Vec<f64> = samples.iter().enumerate().map(known).collect();
+    let marked: Vec<f64> = samples.iter().enumerate().map(marked_value).collect();
     Cow::Owned(interpolate_gaps(&marked).into_owned())
 }
 
@@ -740,8 +744,8 @@ impl<'a> damped_step::LeastSquaresProblem for SectionsProblem<'_, 'a> {
         let limited = |(k, (v, by)): (usize, (&f64, &f64))| if k < count { v + by.clamp(-1.5, 1.5) } else { v + by };
         let next = self.clamp_to_bounds(point.iter().zip(steps).enumerate().map(limited).collect());
         let size = |k: usize| if k < count { 1.0 } else { self.bounds(k).1.max(f64::MIN_POSITIVE) };
-        let moved = next.iter().zip(point).enumerate().map(|(k, (a, b))| (a - b).abs() / size(k)).fold(0.0, f64::max);
-        (next, moved)
+        let change = next.iter().zip(point).enumerate().map(|(k, (a, b))| (a - b).abs() / size(k)).fold(0.0, f64::max);
+        (next, change)
     }
 
     fn distance_to_bounds(&self, point: &Vec<f64>, k: usize) -> (f64, f64) {

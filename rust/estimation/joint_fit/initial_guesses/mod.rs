@@ -127,15 +127,15 @@ impl<'a> OrderGrids<'a> {
             let coarse = coarse.with_records(&records);
             let words = |corner| format!("prefilter {} rad/s", format_general(corner, 3));
             let origin = corner.map_or_else(|| "no prefilter".into(), words);
-            let mut here: Vec<Candidate> = Vec::new();
+            let mut candidates_of_inputs: Vec<Candidate> = Vec::new();
             for axes in &grids {
-                let more = grid_candidate(free, &coarse, axes, &origin, &here)?;
-                here.extend(more);
+                let more = grid_candidate(free, &coarse, axes, &origin, &candidates_of_inputs)?;
+                candidates_of_inputs.extend(more);
             }
             if let Some(axes) = &natural {
-                here.extend(law_candidates(free, &coarse, axes, &origin)?);
+                candidates_of_inputs.extend(law_candidates(free, &coarse, axes, &origin)?);
             }
-            attempts.extend(here);
+            attempts.extend(candidates_of_inputs);
         }
         let scanned = scan_candidates(free, &coarse, frequencies, &attempts)?;
         attempts.extend(scanned);
@@ -151,9 +151,9 @@ impl<'a> OrderGrids<'a> {
         let (inputs, signals) = (self.source.inputs(), &free.structure.signals);
         for item in free.structure.equations.iter().filter(|e| !e.order.is_free()) {
             let alpha = item.order.constant;
-            let held = |signal: usize| inputs.get(signal).copied().flatten() == Some(Intersample::Hold);
+            let is_held_input = |signal: usize| inputs.get(signal).copied().flatten() == Some(Intersample::Hold);
             let above = item.terms.iter().filter(|t| !t.order.is_free() && t.order.constant > alpha + ORDER_TOLERANCE);
-            if let Some(term) = above.into_iter().find(|t| held(t.signal)) {
+            if let Some(term) = above.into_iter().find(|t| is_held_input(t.signal)) {
                 let (order, signal) = (format_general(term.order.constant, 6), &signals[term.signal]);
                 let (alpha, output) = (format_general(alpha, 6), &signals[item.output]);
                 let what = format!(
@@ -215,8 +215,8 @@ fn input_axis(item: &Input, count: usize, source: &Recordings, fastest: f64) -> 
     let (low, high) = item.free.bounds;
     let most = (libm::pow(MAX_DELAY_STARTS, 1.0 / count as f64) as usize).max(2);
     if item.free.law == InputLaw::Delay {
-        let wanted = ((high - low) * fastest / MAX_DELAY_PHASE_RAD).ceil() as usize;
-        return Ok(linspace(low, high, wanted.saturating_add(1).max(2).min(most)));
+        let axis_count = ((high - low) * fastest / MAX_DELAY_PHASE_RAD).ceil() as usize;
+        return Ok(linspace(low, high, axis_count.saturating_add(1).max(2).min(most)));
     }
     // `max` ignores NaN, so missing samples are skipped.
     let samples = source.samples(item.free.signal)?;

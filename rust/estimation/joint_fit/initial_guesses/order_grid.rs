@@ -38,7 +38,7 @@ impl GridRow {
     fn merge(&mut self, other: &Self) {
         for (name, value) in &other.orders {
             match self.orders.iter_mut().find(|(n, _)| n == name) {
-                Some((_, here)) => *here = *value,
+                Some((_, value_of_row)) => *value_of_row = *value,
                 None => self.orders.push((name.clone(), *value)),
             }
         }
@@ -115,13 +115,13 @@ impl GridSearch<'_> {
         };
         let scales: Vec<f64> = equations.iter().map(size).collect();
         let lattice = OrderLawGrid::new(&along, &laws, self.inputs)?.with_fixed_coefficients(&fixed);
-        let found = stage_join::search(self.records, &lattice, &fixed, &scales, &self.options(keep), &self.control())?;
-        let row = |found: stage_join::StageRow| {
-            let pairs = equations.iter().zip(&found.rows);
+        let result = stage_join::search(self.records, &lattice, &fixed, &scales, &self.options(keep), &self.control())?;
+        let row = |result: stage_join::StageRow| {
+            let pairs = equations.iter().zip(&result.rows);
             let coefficients = pairs.flat_map(|(item, part)| named_coefficients(item, &part.coefficients)).collect();
-            GridRow { orders: names.iter().cloned().zip(found.free).collect(), coefficients }
+            GridRow { orders: names.iter().cloned().zip(result.free).collect(), coefficients }
         };
-        Ok(found.rows.into_iter().map(row).collect())
+        Ok(result.rows.into_iter().map(row).collect())
     }
 
     /// Best rows of one equation with independent free orders.
@@ -147,29 +147,29 @@ impl GridSearch<'_> {
         let named = |error| name_signals(error, &structure.signals);
         let lattice = OrderGrid::new(item.output, &axis(&item.order), &terms, is_input).map_err(named)?;
         let (options, control) = (self.options(keep), self.control());
-        let found =
+        let result =
             batches::search(self.records, &lattice, &fixed_coefficients(item), &options, &control).map_err(named)?;
-        let row = |found: crate::order_search::result::Row| {
-            let at = lattice.structure(found.index);
-            let there = std::iter::once(at.order).chain(at.terms.iter().map(|term| term.order));
-            let pairs = item.orders().zip(there);
+        let row = |result: crate::order_search::result::Row| {
+            let at = lattice.structure(result.index);
+            let term_orders = std::iter::once(at.order).chain(at.terms.iter().map(|term| term.order));
+            let pairs = item.orders().zip(term_orders);
             let orders = pairs.filter_map(|(order, value)| Some((order.names().next()?.clone(), value))).collect();
-            GridRow { orders, coefficients: named_coefficients(item, &found.coefficients).collect() }
+            GridRow { orders, coefficients: named_coefficients(item, &result.coefficients).collect() }
         };
-        Ok(found.rows.into_iter().map(row).collect())
+        Ok(result.rows.into_iter().map(row).collect())
     }
 }
 
 /// Combine rows of independent tables rank by rank; a shorter table repeats its last row.
 pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &ParametricStructure) -> Vec<GridRow> {
-    let wanted = structure.coefficient_names().len();
+    let count = structure.coefficient_names().len();
     let merged = |rank: usize| {
         let mut merged = GridRow::default();
         tables.iter().filter_map(|table| table.get(rank).or(table.last())).for_each(|row| merged.merge(row));
         merged
     };
     let ranks = tables.iter().map(Vec::len).max().unwrap_or(0);
-    (0..ranks).map(merged).filter(|row| row.coefficients.len() == wanted).collect()
+    (0..ranks).map(merged).filter(|row| row.coefficients.len() == count).collect()
 }
 
 /// Free coefficients by name, from products of factor and coefficient.
@@ -282,17 +282,18 @@ pub(super) fn law_candidates(
                 let size = row.coefficients.get(&law.name).copied().unwrap_or(f64::NAN).abs();
                 ((*first).clone(), (0..*others).fold(size, |size, _| size / ratio))
             };
-            let known: BTreeMap<String, f64> = tied.iter().map(value).collect();
-            if !known.values().all(|v| v.is_finite() && *v != 0.0) {
+            let values_by_name: BTreeMap<String, f64> = tied.iter().map(value).collect();
+            if !values_by_name.values().all(|v| v.is_finite() && *v != 0.0) {
                 continue;
             }
-            if let Some(lost) = known.keys().find(|name| !named.contains(name)) {
-                let what = format!("no free coefficient {lost}");
+            if let Some(missing_name) = values_by_name.keys().find(|name| !named.contains(name)) {
+                let what = format!("no free coefficient {missing_name}");
                 return Err(Error::Structure { what, remedy: "name one of the equations'".into() });
             }
-            for rest in coarse.best_rows(&structure.with_coefficients(&known), &point, 1)? {
-                let found = |name: &String| known.get(name).or(rest.coefficients.get(name)).copied().unwrap_or(ratio);
-                let coefficients = free.coefficients.iter().map(found).collect();
+            for rest in coarse.best_rows(&structure.with_coefficients(&values_by_name), &point, 1)? {
+                let value_of =
+                    |name: &String| values_by_name.get(name).or(rest.coefficients.get(name)).copied().unwrap_or(ratio);
+                let coefficients = free.coefficients.iter().map(value_of).collect();
                 let words = format!("{origin}, by the law at {}", format_general(ratio, 6));
                 attempts.push(new_candidate(row.values(&free.orders), coefficients, &words));
             }
@@ -343,13 +344,13 @@ pub(super) fn start_axes(free: &ParameterSet) -> Axes {
         .flat_map(|e| e.input_terms().flat_map(|term| term.order.names()))
         .filter(|name| !highest.contains(name))
         .collect();
-    for kept in [&[0.0, 1.0][..], &[0.0]] {
+    for exponent_values in [&[0.0, 1.0][..], &[0.0]] {
         if equations.iter().all(|e| candidate_count(e, &axes) <= MAX_START_CANDIDATES) {
             break;
         }
         for (_, values) in axes.iter_mut().filter(|(name, _)| driving.contains(name)) {
             let (low, high) = (values[0], values[values.len() - 1]);
-            let inside: Vec<f64> = kept.iter().copied().filter(|v| low <= *v && *v <= high).collect();
+            let inside: Vec<f64> = exponent_values.iter().copied().filter(|v| low <= *v && *v <= high).collect();
             *values = if inside.is_empty() { vec![low] } else { inside };
         }
     }

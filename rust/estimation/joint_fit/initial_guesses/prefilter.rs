@@ -42,23 +42,23 @@ impl LowPassCache {
     fn low_pass_series(&self, omega: f64, m: usize, step: f64) -> Result<Arc<Vec<f64>>> {
         let key = (omega.to_bits(), m, step.to_bits());
         {
-            let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(at) = kept.iter().position(|(k, _)| *k == key) {
-                let found = kept.remove(at);
-                let series = found.1.clone();
-                kept.push(found);
+            let mut cache = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(at) = cache.iter().position(|(k, _)| *k == key) {
+                let entry = cache.remove(at);
+                let series = entry.1.clone();
+                cache.push(entry);
                 return Ok(series);
             }
         }
         let square = omega * omega;
         let denominator = vec![(1.0, 2.0), (1.4 * omega, 1.0), (square, 0.0)];
-        let made = Arc::new(Filter { numerator: vec![(square, 0.0)], denominator }.series(m, step)?);
-        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.push((key, made.clone()));
-        if kept.len() > MAX_CACHED_LOW_PASSES {
-            kept.remove(0);
+        let filter = Arc::new(Filter { numerator: vec![(square, 0.0)], denominator }.series(m, step)?);
+        let mut cache = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        cache.push((key, filter.clone()));
+        if cache.len() > MAX_CACHED_LOW_PASSES {
+            cache.remove(0);
         }
-        Ok(made)
+        Ok(filter)
     }
 }
 
@@ -111,11 +111,11 @@ pub(super) fn power_share_frequency(samples: &[f64], step: f64, share: f64) -> f
 #[allow(clippy::cast_precision_loss)]
 fn interpolate_gaps(samples: &[f64]) -> Vec<f64> {
     let mut out = samples.to_vec();
-    let there: Vec<usize> = (0..samples.len()).filter(|&k| !samples[k].is_nan()).collect();
-    let (Some(&first), Some(&last)) = (there.first(), there.last()) else { return out };
+    let rows_present: Vec<usize> = (0..samples.len()).filter(|&k| !samples[k].is_nan()).collect();
+    let (Some(&first), Some(&last)) = (rows_present.first(), rows_present.last()) else { return out };
     out[..first].fill(samples[first]);
     out[last..].fill(samples[last]);
-    for pair in there.windows(2) {
+    for pair in rows_present.windows(2) {
         let (low, high) = (pair[0], pair[1]);
         let slope = (samples[high] - samples[low]) / (high - low) as f64;
         for (k, value) in out[low + 1..high].iter_mut().enumerate() {

@@ -78,12 +78,16 @@ pub(super) fn scan_candidates(
 
 /// True if an offset coincides with a given initial term: they are not separately identifiable.
 fn has_duplicate_offset(fixed: &ParametricStructure) -> bool {
-    let given = match fixed.initial.under() {
+    let exponents = match fixed.initial.under() {
         Initial::Powers(powers) if !fixed.history => powers,
         _ => return false,
     };
     let offsets = |e: &ParametricEquation| fixed.initial.offset_exponents(e.order.constant);
-    fixed.equations.iter().flat_map(offsets).any(|power| given.iter().any(|e| (power - e).abs() < EXPONENT_TOLERANCE))
+    fixed
+        .equations
+        .iter()
+        .flat_map(offsets)
+        .any(|power| exponents.iter().any(|e| (power - e).abs() < EXPONENT_TOLERANCE))
 }
 
 /// Autoregressive coefficients of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y; None if any is fixed.
@@ -118,8 +122,9 @@ fn scan_equation(
     let grid = FREQUENCY_RATIOS
         .iter()
         .flat_map(|share| DAMPING_RATIOS.iter().map(move |damping| (share * frequency, *damping)));
-    let tried: Option<Vec<_>> = grid.map(|(omega, damping)| resonance_coefficients(item, omega, damping)).collect();
-    let Some(tried) = tried else { return Ok(Vec::new()) };
+    let candidates: Option<Vec<_>> =
+        grid.map(|(omega, damping)| resonance_coefficients(item, omega, damping)).collect();
+    let Some(candidates) = candidates else { return Ok(Vec::new()) };
     check_linear(structure, item, "what is linear in its coefficients")?;
     coarse.stop.check()?;
     // The Caputo exponents must be those of the full equation, including the autoregressive terms.
@@ -132,15 +137,18 @@ fn scan_equation(
     bare.check(structure.signals.len(), |s| coarse.inputs.get(s).copied().unwrap_or(false))?;
     let etas: Vec<f64> = own.iter().map(|t| item.order.constant - t.order.constant).collect();
     let point = |values: &Vec<(String, f64)>| values.iter().zip(&own).map(|((_, v), t)| v * t.factor).collect();
-    let points: Vec<Vec<f64>> = tried.iter().map(point).collect();
-    let found =
+    let points: Vec<Vec<f64>> = candidates.iter().map(point).collect();
+    let evaluations =
         fit_with_fixed_poles(coarse.records, &bare, &fixed_coefficients(&rest), coarse.initial, &etas, &points)?;
     let mut best: Vec<(f64, GridRow)> = Vec::new();
-    for (found, tried) in found.chunks(DAMPING_RATIOS.len()).zip(tried.chunks(DAMPING_RATIOS.len())) {
+    for (evaluations, candidates) in
+        evaluations.chunks(DAMPING_RATIOS.len()).zip(candidates.chunks(DAMPING_RATIOS.len()))
+    {
         // Missing points are too fast for the step, or have collinear regressors.
-        let there = found.iter().zip(tried).filter_map(|(at, values)| Some((at.as_ref()?, values)));
-        let there = there.filter(|(at, _)| at.error.is_finite());
-        if let Some((at, values)) = there.min_by(|(a, _), (b, _)| a.error.total_cmp(&b.error)) {
+        let finite_evaluations =
+            evaluations.iter().zip(candidates).filter_map(|(at, values)| Some((at.as_ref()?, values)));
+        let finite_evaluations = finite_evaluations.filter(|(at, _)| at.error.is_finite());
+        if let Some((at, values)) = finite_evaluations.min_by(|(a, _), (b, _)| a.error.total_cmp(&b.error)) {
             let coefficients = values.iter().cloned().chain(named_coefficients(&rest, &at.coefficients)).collect();
             best.push((at.error, GridRow { orders: Vec::new(), coefficients }));
         }

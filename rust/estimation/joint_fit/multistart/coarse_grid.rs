@@ -73,7 +73,7 @@ fn varies_like_whole(outputs: &[Vec<&[f64]>], first: usize) -> bool {
 
 /// Standard deviation of the present samples.
 fn standard_deviation(samples: &[f64]) -> f64 {
-    let known: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
-    let middle = mean(&known);
-    mean(&known.iter().map(|v| (v - middle) * (v - middle)).collect::<Vec<_>>()).sqrt()
+    let finite: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
+    let middle = mean(&finite);
+    mean(&finite.iter().map(|v| (v - middle) * (v - middle)).collect::<Vec<_>>()).sqrt()
 }

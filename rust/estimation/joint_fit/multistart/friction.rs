@@ -113,9 +113,9 @@ fn bodies(structure: &ParametricStructure) -> impl Iterator<Item = (&ParametricE
 fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<()> {
     for (item, _) in bodies(structure) {
         let still = |samples: &&[f64]| {
-            let known = samples.iter().filter(|v| !v.is_nan());
+            let finite = samples.iter().filter(|v| !v.is_nan());
             let (low, high) =
-                known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+                finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
             high - low <= MIN_MOTION_NOISE_RATIO * white_noise_deviation(samples)
         };
         if source.samples(item.output)?.iter().all(still) {
@@ -148,8 +148,8 @@ fn has_stribeck(friction: &FrictionParameters) -> bool {
 }
 
 fn without_stribeck(friction: &FrictionParameters) -> FrictionParameters {
-    let known = |value| (1.0, Coefficient::Known(value));
-    FrictionParameters { stribeck: known(0.0), speed: known(1.0), ..friction.clone() }
+    let fixed = |value| (1.0, Coefficient::Known(value));
+    FrictionParameters { stribeck: fixed(0.0), speed: fixed(1.0), ..friction.clone() }
 }
 
 /// Values of all parameters of a candidate, with the coefficients that a law determines.
@@ -338,13 +338,13 @@ fn loaded_body_guesses(
     let each = if fitted.len() > 1 { ", each" } else { "" };
     let guess = |shares: Vec<f64>| {
         // Forces on a body act on the others, too.
-        let (mut found, mut at) = (values.clone(), values.clone());
+        let (mut candidate, mut at) = (values.clone(), values.clone());
         for ((item, orders, numbers), share) in fitted.iter().zip(&shares) {
-            found.extend(reaction_coefficients(structure, item, values, *share));
-            found.extend(numbers.iter().map(|(name, value)| (name.clone(), (1.0 + share) * value)));
+            candidate.extend(reaction_coefficients(structure, item, values, *share));
+            candidate.extend(numbers.iter().map(|(name, value)| (name.clone(), (1.0 + share) * value)));
             at.extend(orders.clone());
         }
-        at.extend(free.coefficients.iter().cloned().zip(free.free_from(&found)));
+        at.extend(free.coefficients.iter().cloned().zip(free.free_from(&candidate)));
         let named: Vec<String> = shares.iter().map(|share| format_general(*share, 6)).collect();
         let carried = if together { named[0].clone() } else { named.join(" and ") };
         let words = format!("{}{each} by itself, carrying {carried} of its inertia", outputs.join(" and "));
@@ -415,11 +415,13 @@ fn reaction_coefficients(
     };
     let mut out = Values::new();
     for other in structure.equations.iter().filter(|e| e.output != item.output) {
-        for (there, here) in sorted(other, other.output).iter().zip(sorted(item, other.output)) {
-            if let Some(name) =
-                here.coefficient.name().filter(|_| (order(&here) - order(there)).abs() <= MAX_REACTION_ORDER_GAP)
+        for (other_term, own_term) in sorted(other, other.output).iter().zip(sorted(item, other.output)) {
+            if let Some(name) = own_term
+                .coefficient
+                .name()
+                .filter(|_| (order(&own_term) - order(other_term)).abs() <= MAX_REACTION_ORDER_GAP)
             {
-                out.insert(name.clone(), -share * value_of(there, values) / here.factor);
+                out.insert(name.clone(), -share * value_of(other_term, values) / own_term.factor);
             }
         }
     }
@@ -471,13 +473,13 @@ fn coulomb_guesses(
     let source = Recordings::new(runs)?;
     let coarse = Objective::new((&linear.problem, &source, grid.stop()), grid.weights.clone(), grid.sampling, false)?;
     let start = guess_at(&linear, &values, String::new())?.result.iterate;
-    let found = match coarse.minimize_in(&linear.problem_at(&start, false, &[]), &start, FIRST_BUDGET_EVALUATIONS) {
+    let optimum = match coarse.minimize_in(&linear.problem_at(&start, false, &[]), &start, FIRST_BUDGET_EVALUATIONS) {
         Err(Error::Interrupted) => return Err(Error::Interrupted),
         // Without any friction the simulation diverges.
         Err(_) => return Ok(out),
-        Ok(found) => Candidate { result: found, origin: String::new(), duplicates: Vec::new() },
+        Ok(optimum) => Candidate { result: optimum, origin: String::new(), duplicates: Vec::new() },
     };
-    values.extend(values_of(&linear, &found));
+    values.extend(values_of(&linear, &optimum));
     let largest = |(item, factor, _): &(&ParametricEquation, f64, _)| {
         Ok(largest_input_force(grid.source(), item, &values)? / factor)
     };
@@ -509,7 +511,13 @@ fn stribeck_guesses(
             speeds.insert(name.clone(), rms_speed(grid, item.output)?);
         }
     }
-    let some = |known: &Values, ratios: [f64; 3]| if known.is_empty() { ratios[..1].to_vec() } else { ratios.to_vec() };
+    let some = |speed_values: &Values, ratios: [f64; 3]| {
+        if speed_values.is_empty() {
+            ratios[..1].to_vec()
+        } else {
+            ratios.to_vec()
+        }
+    };
     let mut out = Vec::new();
     for near in some(&forces, STRIBECK_COULOMB_RATIOS) {
         for fall in some(&speeds, STRIBECK_SPEED_RATIOS) {
@@ -530,8 +538,8 @@ fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
     let every = grid.sampling.decimation;
     let mut speeds = Vec::new();
     for (samples, (step, _)) in grid.source().samples(output)?.iter().zip(grid.source().spans()) {
-        let kept: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).step_by(every).collect();
-        speeds.extend(kept.windows(2).map(|w| (w[1] - w[0]) / (step * every as f64)));
+        let finite: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).step_by(every).collect();
+        speeds.extend(finite.windows(2).map(|w| (w[1] - w[0]) / (step * every as f64)));
     }
     Ok(root_mean_square(&speeds))
 }
@@ -540,8 +548,8 @@ fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
 fn largest_input_force(source: &Recordings, item: &ParametricEquation, values: &Values) -> Result<f64> {
     let mut largest: f64 = 0.0;
     for term in item.input_terms().filter(|term| !term.order.is_free() && term.order.constant == 0.0) {
-        let known: Vec<f64> = source.samples(term.signal)?.concat().into_iter().filter(|v| !v.is_nan()).collect();
-        largest = largest.max(value_of(term, values).abs() * root_mean_square(&known));
+        let finite: Vec<f64> = source.samples(term.signal)?.concat().into_iter().filter(|v| !v.is_nan()).collect();
+        largest = largest.max(value_of(term, values).abs() * root_mean_square(&finite));
     }
     Ok(largest)
 }

@@ -67,11 +67,11 @@ impl RungExecutor<'_> {
             evaluations,
             stop: grid.stop(),
         };
-        let mut done = 0;
+        let mut count = 0;
         let mut heard = || {
-            let so_far = done.min(self.starts.saturating_sub(1));
-            done += 1;
-            self.told.map_or(Ok(()), |told| told(so_far, self.starts))
+            let so_far = count.min(self.starts.saturating_sub(1));
+            count += 1;
+            self.told.map_or(Ok(()), |listener| listener(so_far, self.starts))
         };
         if self.threads.min(runners.len()) <= 1 {
             let each = runners.iter().map(|runner| {
@@ -82,16 +82,16 @@ impl RungExecutor<'_> {
             return each.collect();
         }
         let mut ended: Vec<Option<Candidate>> = vec![None; runners.len()];
-        let (next, left) = (AtomicUsize::new(0), Stop::default());
+        let (next, stop_flag) = (AtomicUsize::new(0), Stop::default());
         let (send, receive) = channel();
-        let (lap, next, left) = (&lap, &next, &left);
+        let (lap, next, stop_flag) = (&lap, &next, &stop_flag);
         std::thread::scope(|scope| {
             let mut refused = None;
             let threads = self.threads.min(runners.len());
             for _ in 0..threads {
                 let send = send.clone();
                 let runs = move || {
-                    while !left.is_set() {
+                    while !stop_flag.is_set() {
                         let k = next.fetch_add(1, Ordering::Relaxed);
                         let Some(runner) = runners.get(k) else { return };
                         if send.send((k, lap.optimize(runner))).is_err() {
@@ -100,17 +100,17 @@ impl RungExecutor<'_> {
                     }
                 };
                 if let Err(error) = std::thread::Builder::new().spawn_scoped(scope, runs) {
-                    left.set();
+                    stop_flag.set();
                     refused = Some(Error::Threads { threads, why: error.to_string() });
                     break;
                 }
             }
             drop(send);
-            for (k, found) in &receive {
-                match found.and_then(|found| heard().map(|()| found)) {
-                    Ok(found) => ended[k] = found,
+            for (k, outcome) in &receive {
+                match outcome.and_then(|outcome| heard().map(|()| outcome)) {
+                    Ok(outcome) => ended[k] = outcome,
                     Err(error) => {
-                        left.set();
+                        stop_flag.set();
                         refused.get_or_insert(error);
                     }
                 }
@@ -204,17 +204,17 @@ pub(super) fn are_all_close(numbers: &[f64], others: &[f64], share: f64, distanc
 /// Merge candidates that duplicate an earlier one; their origins are added to it.
 #[must_use]
 pub fn merge_duplicates(runners: &[Candidate], same: impl Fn(&Candidate, &Candidate) -> bool) -> Vec<Candidate> {
-    let mut kept: Vec<Candidate> = Vec::new();
+    let mut distinct: Vec<Candidate> = Vec::new();
     for runner in runners {
-        match kept.iter_mut().find(|kept| same(kept, runner)) {
-            None => kept.push(runner.clone()),
+        match distinct.iter_mut().find(|distinct| same(distinct, runner)) {
+            None => distinct.push(runner.clone()),
             Some(first) => {
                 first.duplicates.push(runner.origin.clone());
                 first.duplicates.extend(runner.duplicates.iter().cloned());
             }
         }
     }
-    kept
+    distinct
 }
 
 #[cfg(test)]

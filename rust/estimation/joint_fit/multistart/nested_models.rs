@@ -39,11 +39,15 @@ impl ReducedProblem {
     #[must_use]
     pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
         let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
-        let known: BTreeMap<&String, f64> = self.free.orders.iter().zip(orders.iter().copied()).collect();
-        let highest = self.order.at(|name| known.get(&name.to_owned()).copied().unwrap_or(0.0));
+        let values_by_name: BTreeMap<&String, f64> = self.free.orders.iter().zip(orders.iter().copied()).collect();
+        let highest = self.order.at(|name| values_by_name.get(&name.to_owned()).copied().unwrap_or(0.0));
         let values: BTreeMap<&String, f64> = self.free.coefficients.iter().zip(coefficients.iter().copied()).collect();
         let point = ParameterPoint {
-            orders: whole.orders.iter().map(|name| known.get(name).copied().unwrap_or(0.5 * highest)).collect(),
+            orders: whole
+                .orders
+                .iter()
+                .map(|name| values_by_name.get(name).copied().unwrap_or(0.5 * highest))
+                .collect(),
             coefficients: whole.coefficients.iter().map(|n| values.get(n).copied().unwrap_or(self.value)).collect(),
             inputs: inputs.clone(),
         };
@@ -95,14 +99,14 @@ pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
         for term in driving.iter().filter(|term| !structure.coupled && driving.len() > 1 && !term.order.is_free()) {
             if let Some(name) = term.coefficient.name() {
                 // The signal stays with coefficient 0, because the records contain it.
-                let known = BTreeMap::from([(name.clone(), 0.0)]);
-                add(structure.with_coefficients(&known), name, &item.order, 0.0, true);
+                let values_by_name = BTreeMap::from([(name.clone(), 0.0)]);
+                add(structure.with_coefficients(&values_by_name), name, &item.order, 0.0, true);
             }
         }
         for name in item.coefficient_names() {
             if let Some(&value) = structure.hints.known.get(name) {
-                let known = BTreeMap::from([(name.clone(), value)]);
-                add(structure.with_coefficients(&known), name, &item.order, value, true);
+                let values_by_name = BTreeMap::from([(name.clone(), value)]);
+                add(structure.with_coefficients(&values_by_name), name, &item.order, value, true);
             }
         }
     }
@@ -126,10 +130,10 @@ impl IntegerOrderProblem {
     /// Embed a candidate of this problem in the full problem.
     #[must_use]
     pub fn embed(&self, runner: &Candidate) -> Candidate {
-        let mut found = runner.clone();
-        found.result.iterate.point.orders.clone_from(&self.orders);
-        found.origin = format!("{}, from whole orders", runner.origin);
-        found
+        let mut candidate = runner.clone();
+        candidate.result.iterate.point.orders.clone_from(&self.orders);
+        candidate.origin = format!("{}, from whole orders", runner.origin);
+        candidate
     }
 }
 
@@ -143,10 +147,10 @@ pub fn integer_order_problems(free: &ParameterSet, near: &[f64]) -> Vec<IntegerO
     let natural = &free.structure.hints.natural;
     let values: Vec<Vec<f64>> = (free.orders.iter().zip(free.bounds()))
         .map(|(name, &(low, high))| {
-            let known: Vec<f64> =
+            let exponents: Vec<f64> =
                 natural.get(name).into_iter().flatten().copied().filter(|v| *v == v.round()).collect();
-            let known = if known.is_empty() { DEFAULT_INTEGER_ORDERS.to_vec() } else { known };
-            known.into_iter().filter(|v| (low..=high).contains(v)).collect()
+            let exponents = if exponents.is_empty() { DEFAULT_INTEGER_ORDERS.to_vec() } else { exponents };
+            exponents.into_iter().filter(|v| (low..=high).contains(v)).collect()
         })
         .collect();
     if values.is_empty() || values.iter().any(Vec::is_empty) {
@@ -163,9 +167,9 @@ pub fn integer_order_problems(free: &ParameterSet, near: &[f64]) -> Vec<IntegerO
         add(first.clone());
         for (k, choices) in values.iter().enumerate() {
             for &other in choices.iter().filter(|v| **v != first[k]) {
-                let mut moved = first.clone();
-                moved[k] = other;
-                add(moved);
+                let mut neighbor = first.clone();
+                neighbor[k] = other;
+                add(neighbor);
             }
         }
     }
@@ -182,8 +186,8 @@ fn nearest_value(values: &[f64], at: f64) -> f64 {
 
 /// Submodel at given integer orders; None if they give no valid equation.
 fn integer_order_problem(free: &ParameterSet, orders: Vec<f64>) -> Option<IntegerOrderProblem> {
-    let known: BTreeMap<String, f64> = free.orders.iter().cloned().zip(orders.iter().copied()).collect();
-    let reduced = free.structure.with_orders(&known).and_then(ParameterSet::from_structure).ok()?;
+    let values_by_name: BTreeMap<String, f64> = free.orders.iter().cloned().zip(orders.iter().copied()).collect();
+    let reduced = free.structure.with_orders(&values_by_name).and_then(ParameterSet::from_structure).ok()?;
     // The sequence of the terms is unchanged, so the coefficients keep their indices.
     (reduced.coefficients == free.coefficients).then_some(IntegerOrderProblem { free: reduced, orders })
 }
@@ -203,9 +207,9 @@ impl FixedOrderProblem {
     /// Restrict a candidate of the full problem to this one, with the coefficients kept in scaled time.
     #[must_use]
     pub fn restrict(&self, runner: &Candidate, clock: &TimeScaling) -> Candidate {
-        let mut told = clock.to_scaled(&runner.result.values());
-        told[self.order] = self.value;
-        let mut values = clock.to_unscaled(&told);
+        let mut scaled_values = clock.to_scaled(&runner.result.values());
+        scaled_values[self.order] = self.value;
+        let mut values = clock.to_unscaled(&scaled_values);
         values.remove(self.order);
         let (orders, rest) = values.split_at(self.free.orders.len());
         let (coefficients, inputs) = rest.split_at(self.free.coefficients.len());
@@ -216,11 +220,11 @@ impl FixedOrderProblem {
     /// Embed a candidate of this problem in the full problem.
     #[must_use]
     pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
-        let mut found = runner.clone();
-        found.result.iterate.point.orders.insert(self.order, self.value);
-        found.origin =
+        let mut candidate = runner.clone();
+        candidate.result.iterate.point.orders.insert(self.order, self.value);
+        candidate.origin =
             format!("{}, from {} = {}", runner.origin, whole.orders[self.order], format_general(self.value, 6));
-        found
+        candidate
     }
 }
 
@@ -233,9 +237,11 @@ pub fn fixed_order_problems(free: &ParameterSet) -> Vec<FixedOrderProblem> {
         if free.orders.len() < 2 || value != value.round() {
             continue;
         }
-        let known = BTreeMap::from([(free.orders[order].clone(), value)]);
+        let values_by_name = BTreeMap::from([(free.orders[order].clone(), value)]);
         // Some give no valid equation.
-        let Ok(reduced) = free.structure.with_orders(&known).and_then(ParameterSet::from_structure) else { continue };
+        let Ok(reduced) = free.structure.with_orders(&values_by_name).and_then(ParameterSet::from_structure) else {
+            continue;
+        };
         let rest = free.orders.iter().enumerate().filter(|(k, _)| *k != order).map(|(_, name)| name);
         if reduced.coefficients == free.coefficients && reduced.orders.iter().eq(rest) {
             out.push(FixedOrderProblem { free: reduced, order, value });

@@ -50,8 +50,8 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
         let of_source = course.starts.for_recordings(source);
         if structure.has_friction() {
             let own = MultistartContext { source, starts: of_source.as_ref(), told: None, ..course };
-            let found = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
-            starts.extend(embed(free, &linear, &found)?);
+            let candidates = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
+            starts.extend(embed(free, &linear, &candidates)?);
             continue;
         }
         starts.extend(none_if_invalid_model(of_source.initial_guesses(&linear))?.unwrap_or_default());
@@ -89,13 +89,13 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
         for source in others {
             let starts = course.starts.for_recordings(source);
             let own = MultistartContext { source, starts: starts.as_ref(), told: None, ..course };
-            let found = none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default();
-            more.extend(embed(free, &linear, &found)?);
+            let candidates = none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default();
+            more.extend(embed(free, &linear, &candidates)?);
         }
         if let Some(less) = without_nonlinear_terms(structure) {
             let own = MultistartContext { told: None, ..course };
-            let found = none_if_invalid_model(run_friction_multistart(&less, own))?.unwrap_or_default();
-            more.extend(embed(free, &less, &found)?);
+            let candidates = none_if_invalid_model(run_friction_multistart(&less, own))?.unwrap_or_default();
+            more.extend(embed(free, &less, &candidates)?);
         }
         reached.extend(laps.run(free, &grid, &more, FIRST_BUDGET_EVALUATIONS)?);
         reached = sort_by_cost(reached);
@@ -108,7 +108,7 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
 }
 
 /// Best candidates of a problem with some of the parameters as guesses of the full one.
-fn embed(free: &ParameterSet, less: &ParameterSet, found: &[Candidate]) -> Result<Vec<Candidate>> {
+fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> Result<Vec<Candidate>> {
     let of = |runner: &Candidate| {
         let mut values = values_of(less, runner);
         for name in &free.coefficients {
@@ -116,7 +116,7 @@ fn embed(free: &ParameterSet, less: &ParameterSet, found: &[Candidate]) -> Resul
         }
         guess_at(free, &values, format!("{}, from a linear fit", runner.origin))
     };
-    found.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
+    candidates.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
 }
 
 /// Problem without the non-linear terms; None if an equation has no others.
@@ -187,10 +187,10 @@ fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_wi
 /// Derivative of smoothed samples by Grünwald–Letnikov.
 fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usize) -> Vec<f64> {
     let first = if run.is_at_rest { 0.0 } else { samples[0] };
-    let moved: Vec<f64> = smooth(&samples, half_width).iter().map(|v| v - first).collect();
-    let weights = grunwald_letnikov_weights(order, moved.len());
+    let deviations: Vec<f64> = smooth(&samples, half_width).iter().map(|v| v - first).collect();
+    let weights = grunwald_letnikov_weights(order, deviations.len());
     let scale = libm::pow(run.step(), -order);
-    series::multiply(&weights, &moved, moved.len()).into_iter().map(|v| scale * v).collect()
+    series::multiply(&weights, &deviations, deviations.len()).into_iter().map(|v| scale * v).collect()
 }
 
 /// Samples smoothed by local cubics (Savitzky–Golay), over shorter windows near the ends.

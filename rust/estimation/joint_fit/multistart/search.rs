@@ -79,8 +79,8 @@ impl<'a> MultistartContext<'a> {
 /// # Errors
 /// As the source, the initial guesses and the callback; [`Error::Interrupted`].
 pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
-    if let Some(found) = integer_order_multistart(free, course, None)? {
-        return Ok(found);
+    if let Some(candidates) = integer_order_multistart(free, course, None)? {
+        return Ok(candidates);
     }
     if free.structure.history {
         return multistart_with_history(free, course);
@@ -102,15 +102,15 @@ fn integer_order_multistart(
     let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
     let Some(starts) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
     let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
-    let found = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
-    Ok((!found.is_empty()).then_some(found))
+    let candidates = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
+    Ok((!candidates.is_empty()).then_some(candidates))
 }
 
 /// Convert the error of an invalid model to None.
-pub(super) fn none_if_invalid_model<T>(found: Result<T>) -> Result<Option<T>> {
-    match found {
+pub(super) fn none_if_invalid_model<T>(outcome: Result<T>) -> Result<Option<T>> {
+    match outcome {
         Err(error) if error.kind() == Kind::Model => Ok(None),
-        found => found.map(Some),
+        outcome => outcome.map(Some),
     }
 }
 
@@ -146,12 +146,12 @@ fn multistart_without_history<'a>(
     let mut run = MultistartState { free, course, laps, coarse, half, starts, first, integer_order_optima, reached };
     run.optimize_starts()?;
     run.add_nested_models()?;
-    let told = run.laps.starts;
-    let found = run.promote_survivors()?;
+    let total = run.laps.starts;
+    let candidates = run.promote_survivors()?;
     if let Some(heard) = course.told {
-        heard(told, told)?;
+        heard(total, total)?;
     }
-    Ok(found)
+    Ok(candidates)
 }
 
 /// Best candidate of each problem of integer orders, near the usual ones and near the first guess.
@@ -163,13 +163,13 @@ fn integer_order_optima(
 ) -> Result<Vec<Candidate>> {
     let usual = free.integer_orders();
     let near = starts.first().map_or(&usual, |start| &start.result.iterate.point.orders);
-    let mut found = Vec::new();
+    let mut candidates = Vec::new();
     for less in integer_order_problems(free, near) {
         // With fixed orders most initial guesses lead to the same optimum.
         let ended = optimize_submodel(&less.free, course, coarse, MAX_FINAL_SURVIVORS)?;
-        found.extend(ended.iter().take(1).map(|runner| less.embed(runner)));
+        candidates.extend(ended.iter().take(1).map(|runner| less.embed(runner)));
     }
-    Ok(found)
+    Ok(candidates)
 }
 
 /// Optimize a submodel from its own initial guesses; the best `going` of them continue.
@@ -182,8 +182,8 @@ fn optimize_submodel(
     going: usize,
 ) -> Result<Vec<Candidate>> {
     let part = leading_part(free, course.source, SELECTION_INTERVALS)?;
-    if let Some(found) = integer_order_multistart(free, course.for_submodel(), part)? {
-        return Ok(found);
+    if let Some(candidates) = integer_order_multistart(free, course.for_submodel(), part)? {
+        return Ok(candidates);
     }
     let Some(starts) = none_if_invalid_model(course.starts.initial_guesses(free))? else { return Ok(Vec::new()) };
     let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: None };
@@ -243,8 +243,8 @@ impl<'a> MultistartState<'a> {
 
     /// Evaluate candidates on the grid of this problem and add them.
     fn evaluate_and_add(&mut self, runners: &[Candidate]) -> Result<()> {
-        let there = self.laps.run(self.free, &self.coarse, runners, 1)?;
-        self.add(there);
+        let evaluated = self.laps.run(self.free, &self.coarse, runners, 1)?;
+        self.add(evaluated);
         Ok(())
     }
 
@@ -272,9 +272,9 @@ impl<'a> MultistartState<'a> {
             if let Some((ended, _)) =
                 none_if_invalid_model(multistart_without_history(&one.free, self.course.for_submodel()))?
             {
-                let there = competitive_candidates(&ended).into_iter().take(MAX_FINAL_SURVIVORS);
-                let there = there.map(|runner| one.embed(&runner, self.free));
-                return self.evaluate_and_add(&there.collect::<Vec<_>>());
+                let embedded = competitive_candidates(&ended).into_iter().take(MAX_FINAL_SURVIVORS);
+                let embedded = embedded.map(|runner| one.embed(&runner, self.free));
+                return self.evaluate_and_add(&embedded.collect::<Vec<_>>());
             }
         }
         // Start from the optima found so far and from those with integer orders.
@@ -312,11 +312,11 @@ impl<'a> MultistartState<'a> {
     /// Promote the survivors to the second budget; duplicates and candidates far behind do not continue.
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
         let reached = merge_duplicates(&self.reached, is_same_optimum);
-        let (survivors, lost) = reached.split_at(competitive_candidates(&reached).len());
-        let found = self.laps.run(self.free, &self.coarse, survivors, SECOND_BUDGET_EVALUATIONS)?;
-        let mut found = rank_candidates(&self.coarse, self.half, found)?;
-        found.extend_from_slice(lost);
-        Ok((found, self.coarse))
+        let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
+        let candidates = self.laps.run(self.free, &self.coarse, survivors, SECOND_BUDGET_EVALUATIONS)?;
+        let mut candidates = rank_candidates(&self.coarse, self.half, candidates)?;
+        candidates.extend_from_slice(rest);
+        Ok((candidates, self.coarse))
     }
 }
 
@@ -358,9 +358,9 @@ fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -
         order.iter().take(MIN_SURVIVORS).filter(|&&i| levels[i] <= limit).map(|&i| reached[i].clone()).collect();
     let mut rest = order[going.len()..].to_vec();
     rest.sort_unstable();
-    let mut ahead = rank_candidates(&coarse, None, laps.run(free, &coarse, &going, FIRST_BUDGET_EVALUATIONS)?)?;
-    ahead.extend(rest.into_iter().map(|i| reached[i].clone()));
-    Ok(merge_duplicates(&ahead, is_same_optimum))
+    let mut leaders = rank_candidates(&coarse, None, laps.run(free, &coarse, &going, FIRST_BUDGET_EVALUATIONS)?)?;
+    leaders.extend(rest.into_iter().map(|i| reached[i].clone()));
+    Ok(merge_duplicates(&leaders, is_same_optimum))
 }
 
 /// Optimize candidates on coarse grids; return them best first.

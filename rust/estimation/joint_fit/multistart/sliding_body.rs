@@ -50,16 +50,20 @@ pub(super) fn fit_sliding_body(
     }
     let mut parts = runs.iter().map(|run| Part::of(run, item.output)).collect::<Result<Vec<_>>>()?;
     let rest: Vec<Vec<bool>> = parts.iter().map(|part| part.sign.iter().map(|v| *v == 0.0).collect()).collect();
-    let mut found = BTreeMap::new();
+    let mut estimates = BTreeMap::new();
     for _ in 0..MAX_REST_ITERATIONS {
         stop.check()?;
-        found = signed_least_squares(item, &parts);
-        let Some(holds) = found.get(strength).map(|value| factor * value).filter(|holds| *holds > 0.0) else { break };
+        estimates = signed_least_squares(item, &parts);
+        let Some(holds) = estimates.get(strength).map(|value| factor * value).filter(|holds| *holds > 0.0) else {
+            break;
+        };
         for (part, still) in parts.iter_mut().zip(&rest) {
             let mut push = vec![0.0; part.sign.len()];
             for term in item.input_terms().filter(|term| term.order.constant == 0.0) {
                 let free = || {
-                    term.coefficient.name().map_or(0.0, |name| term.factor * found.get(name).copied().unwrap_or(0.0))
+                    term.coefficient
+                        .name()
+                        .map_or(0.0, |name| term.factor * estimates.get(name).copied().unwrap_or(0.0))
                 };
                 let value = term.fixed_coefficient().unwrap_or_else(free);
                 push.iter_mut().zip(part.record.signal(term.signal)).for_each(|(p, v)| *p += value * v);
@@ -69,7 +73,7 @@ pub(super) fn fit_sliding_body(
             }
         }
     }
-    Ok(found)
+    Ok(estimates)
 }
 
 impl Part {
@@ -77,15 +81,15 @@ impl Part {
     fn of(run: &Recording, output: usize) -> Result<Self> {
         let m = run.len() - 1;
         let record = run.pulses(m, false)?.into_record()?;
-        let known: Vec<f64> = run.channel(output)?.samples.iter().copied().filter(|v| !v.is_nan()).collect();
-        let least = VELOCITY_NOISE_RATIO * white_noise_deviation(&known);
+        let finite: Vec<f64> = run.channel(output)?.samples.iter().copied().filter(|v| !v.is_nan()).collect();
+        let least = VELOCITY_NOISE_RATIO * white_noise_deviation(&finite);
         let span = ((VELOCITY_SPAN_FRACTION * m as f64).round() as usize).max(1);
         let means = record.signal(output);
         let sign = (0..m).map(|i| {
             let first = i.saturating_sub(span / 2).min(m - span - 1);
-            let moved = means[first + span] - means[first];
-            if moved.abs() > least {
-                moved.signum()
+            let change = means[first + span] - means[first];
+            if change.abs() > least {
+                change.signum()
             } else {
                 0.0
             }
@@ -152,15 +156,15 @@ fn signed_least_squares(item: &ParametricEquation, parts: &[Part]) -> BTreeMap<S
     columns.push(target);
     let (k, factor) = (columns.len(), triangular_factor(&columns));
     let mut small: Vec<Vec<f64>> = (0..k).map(|j| (0..k).map(|i| factor[i * k + j]).collect()).collect();
-    let wanted = small.pop().unwrap_or_default();
-    let solved = nonnegative_solution(&small, &wanted);
-    let mut found = BTreeMap::new();
+    let target_values = small.pop().unwrap_or_default();
+    let solved = nonnegative_solution(&small, &target_values);
+    let mut estimates = BTreeMap::new();
     for (((name, side), size), x) in names.into_iter().zip(sizes).zip(solved) {
         if let Some(name) = name {
-            *found.entry(name).or_insert(0.0) += if size > 0.0 { side * x / size } else { 0.0 };
+            *estimates.entry(name).or_insert(0.0) += if size > 0.0 { side * x / size } else { 0.0 };
         }
     }
-    found
+    estimates
 }
 
 #[cfg(test)]
@@ -205,12 +209,12 @@ mod tests {
                 speed: (1.0, Coefficient::Known(1.0)),
             }),
         };
-        let found = fit_sliding_body(&[run], &item, &Stop::default())?;
+        let estimates = fit_sliding_body(&[run], &item, &Stop::default())?;
         for (name, truth) in [("v", -2.0), ("b", 3.0), ("fc", 0.5)] {
-            assert!((found[name] / truth - 1.0).abs() < 0.1, "{name}: {found:?}");
+            assert!((estimates[name] / truth - 1.0).abs() < 0.1, "{name}: {estimates:?}");
         }
         // There is no spring, and one that does not restore is excluded.
-        assert!(found["k"] <= 0.0 && found["k"] > -0.2, "{found:?}");
+        assert!(estimates["k"] <= 0.0 && estimates["k"] > -0.2, "{estimates:?}");
         Ok(())
     }
 }

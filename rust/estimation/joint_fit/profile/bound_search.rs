@@ -155,23 +155,23 @@ impl BoundSearch {
                 0 => Refit::Infeasible,
                 _ => around.refit(self.parameter, self.start + self.side * self.way, &origin, lap)?,
             };
-            let there = match refit {
+            let refit_result = match refit {
                 Refit::Lower(lower) => {
                     self.evaluations += lower.evaluations;
                     return Ok(BoundOutcome::Lower(lower.values()));
                 }
-                Refit::Optimum(there) => Some(there),
+                Refit::Optimum(refit_result) => Some(refit_result),
                 Refit::Infeasible => None,
             };
-            let took = there.as_ref().map_or(lap, |there| there.evaluations);
+            let took = refit_result.as_ref().map_or(lap, |refit_result| refit_result.evaluations);
             self.evaluations += took;
             if lap < MAX_REFIT_EVALUATIONS && took >= lap {
                 // A refit that is cut short tells nothing.
-                self.origin = Some(there.unwrap_or(origin));
+                self.origin = Some(refit_result.unwrap_or(origin));
                 return Ok(BoundOutcome::Paused);
             }
             self.refits += 1;
-            if let Some(distance) = self.step(around, there) {
+            if let Some(distance) = self.step(around, refit_result) {
                 return Ok(BoundOutcome::Found(self.side_of(self.start + self.side * distance)));
             }
         }
@@ -190,13 +190,14 @@ impl BoundSearch {
     }
 
     /// Choose the next distance after a refit; return that of the bound if it is found. NaN ends the search.
-    fn step(&mut self, around: &ProfileLikelihood<'_>, there: Option<OptimizationResult>) -> Option<f64> {
+    fn step(&mut self, around: &ProfileLikelihood<'_>, refit_result: Option<OptimizationResult>) -> Option<f64> {
         let (i, width) = (self.parameter, self.width);
         let (mut rise, mut following, mut near) = (f64::INFINITY, f64::INFINITY, false);
-        if let Some(there) = &there {
-            rise = around.rise(i, 2.0 * there.cost);
+        if let Some(refit_result) = &refit_result {
+            rise = around.rise(i, 2.0 * refit_result.cost);
             self.points.push((self.start + self.side * self.way + around.shift[i], rise * rise));
-            let slope = if rise > 0.0 { self.side * around.slope(there, i) / (around.units[i] * rise) } else { 0.0 };
+            let slope =
+                if rise > 0.0 { self.side * around.slope(refit_result, i) / (around.units[i] * rise) } else { 0.0 };
             if slope > 0.0 {
                 following = self.way + (width - rise) / slope;
             }
@@ -206,9 +207,9 @@ impl BoundSearch {
                 return Some(following);
             }
         }
-        match there {
-            Some(there) if rise <= width => {
-                (self.inside, self.within) = (self.way, there);
+        match refit_result {
+            Some(refit_result) if rise <= width => {
+                (self.inside, self.within) = (self.way, refit_result);
                 if self.way >= self.outside {
                     // The outer point was a refit that had lost its way.
                     self.outside = f64::INFINITY;

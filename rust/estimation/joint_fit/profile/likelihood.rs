@@ -103,15 +103,15 @@ impl<'a> ProfileLikelihood<'a> {
             let coarse = fit.objective(sources, fit.pulses_per_sample / 2);
             match coarse.and_then(|grid| Self::at(sources.0, grid, &fit.on_grid, evaluations)) {
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
-                Ok(found) if found.best.has_converged() && found.is_near(&fit.on_grid) => {
-                    return Ok(Self { shift: difference(&found.values()), ..found });
+                Ok(likelihood) if likelihood.best.has_converged() && likelihood.is_near(&fit.on_grid) => {
+                    return Ok(Self { shift: difference(&likelihood.values()), ..likelihood });
                 }
                 _ => {}
             }
         }
         let grid = fit.objective(sources, fit.pulses_per_sample)?;
-        let found = Self::at(sources.0, grid, &fit.on_grid, evaluations)?;
-        Ok(Self { shift: difference(&fit.on_grid), ..found })
+        let likelihood = Self::at(sources.0, grid, &fit.on_grid, evaluations)?;
+        Ok(Self { shift: difference(&fit.on_grid), ..likelihood })
     }
 
     fn at(free: &'a ParameterSet, grid: Objective<'a>, values: &[f64], evaluations: usize) -> Result<Self> {
@@ -137,8 +137,8 @@ impl<'a> ProfileLikelihood<'a> {
     /// # Errors
     /// As [`Objective::minimize`].
     pub fn moved_to(&self, values: &[f64]) -> Result<Self> {
-        let found = Self::at(self.free, self.grid.clone(), values, MAX_REFIT_EVALUATIONS)?;
-        Ok(Self { on_grid: self.on_grid.clone(), ..found })
+        let likelihood = Self::at(self.free, self.grid.clone(), values, MAX_REFIT_EVALUATIONS)?;
+        Ok(Self { on_grid: self.on_grid.clone(), ..likelihood })
     }
 
     fn is_near(&self, values: &[f64]) -> bool {
@@ -225,11 +225,11 @@ impl<'a> ProfileLikelihood<'a> {
                 return Ok(f64::INFINITY);
             }
             let point = self.point_along(i, &values, &direction, end)?;
-            let Some(there) = finite(self.minimize_others(i, &point, 1, REFIT_TOLERANCE))? else {
+            let Some(refit_result) = finite(self.minimize_others(i, &point, 1, REFIT_TOLERANCE))? else {
                 return Ok(f64::INFINITY);
             };
-            let (sensitivities, _) = other_sensitivities(&there, &[i])?;
-            let rest = projected_residuals(&there, &sensitivities);
+            let (sensitivities, _) = other_sensitivities(&refit_result, &[i])?;
+            let rest = projected_residuals(&refit_result, &sensitivities);
             worst = worst.max((self.rise(i, inner(&rest, &rest)) / width - 1.0).abs());
         }
         Ok(worst)
@@ -243,17 +243,17 @@ impl<'a> ProfileLikelihood<'a> {
         let (rise, least) = (self.units[i], 2.0 * self.cost());
         let tolerance = REFIT_TOLERANCE * rise / least.max(rise);
         for point in self.refit_starts(i, value, near)? {
-            let Some(there) = finite(self.minimize_others(i, &point, evaluations, tolerance))? else { continue };
-            let is_lower = 2.0 * there.cost < least - LOWER_OPTIMUM_MARGIN * rise;
-            return Ok(if is_lower { Refit::Lower(there) } else { Refit::Optimum(there) });
+            let Some(refit_result) = finite(self.minimize_others(i, &point, evaluations, tolerance))? else { continue };
+            let is_lower = 2.0 * refit_result.cost < least - LOWER_OPTIMUM_MARGIN * rise;
+            return Ok(if is_lower { Refit::Lower(refit_result) } else { Refit::Optimum(refit_result) });
         }
         Ok(Refit::Infeasible)
     }
 
     /// Half the derivative of the sum of squares by one parameter; 0 on overflow.
     #[must_use]
-    pub fn slope(&self, there: &OptimizationResult, i: usize) -> f64 {
-        let slope = inner(&there.jacobian[i], &there.residuals);
+    pub fn slope(&self, refit: &OptimizationResult, i: usize) -> f64 {
+        let slope = inner(&refit.jacobian[i], &refit.residuals);
         // Near where a simulation diverges its derivatives overflow.
         if slope.is_finite() {
             slope
@@ -289,8 +289,8 @@ impl<'a> ProfileLikelihood<'a> {
         }
         let mut ranked = Vec::with_capacity(points.len());
         for point in points {
-            let there = finite(self.minimize_others(i, &point, 0, REFIT_TOLERANCE))?;
-            ranked.push((there.map_or(f64::INFINITY, |there| there.cost), point));
+            let refit_result = finite(self.minimize_others(i, &point, 0, REFIT_TOLERANCE))?;
+            ranked.push((refit_result.map_or(f64::INFINITY, |refit_result| refit_result.cost), point));
         }
         ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
         Ok(ranked.into_iter().map(|(_, point)| point).collect())
@@ -366,10 +366,10 @@ impl<'a> CostSurface<'a> {
         self.squares(&self.best)
     }
 
-    fn squares(&self, there: &OptimizationResult) -> f64 {
+    fn squares(&self, result: &OptimizationResult) -> f64 {
         let rest = match &self.sensitivities {
-            Some(sensitivities) => projected_residuals(there, sensitivities),
-            None => there.residuals.clone(),
+            Some(sensitivities) => projected_residuals(result, sensitivities),
+            None => result.residuals.clone(),
         };
         inner(&rest, &rest)
     }
@@ -384,31 +384,31 @@ impl<'a> CostSurface<'a> {
             for x in first {
                 let mut values = self.best.values();
                 (values[self.pair[0]], values[self.pair[1]]) = (*x, *y);
-                let there = finite(minimize(self.free, &self.grid, &values, &[], (0, RELATIVE_COST_TOLERANCE)))?;
-                scores.push(there.map_or(f64::INFINITY, |there| self.squares(&there)));
+                let result = finite(minimize(self.free, &self.grid, &values, &[], (0, RELATIVE_COST_TOLERANCE)))?;
+                scores.push(result.map_or(f64::INFINITY, |result| self.squares(&result)));
             }
         }
         Ok(scores)
     }
 }
 
-/// Minimize the cost in plain coordinates, with the parameters `held` fixed.
+/// Minimize the cost in plain coordinates, with the parameters `fixed` fixed.
 fn minimize(
     free: &ParameterSet,
     grid: &Objective<'_>,
     values: &[f64],
-    held: &[usize],
+    fixed: &[usize],
     (evaluations, tolerance): (usize, f64),
 ) -> Result<OptimizationResult> {
     let start = Iterate { point: free.problem.point(values)?, states: Vec::new() };
-    let (problem, settings) = (free.problem_at(&start, true, held), MinimizationSettings { evaluations, tolerance });
+    let (problem, settings) = (free.problem_at(&start, true, fixed), MinimizationSettings { evaluations, tolerance });
     problem.minimize(grid.experiments(), &start, settings, grid.requires_stability, grid.stop())
 }
 
 /// None where a point cannot be simulated.
-fn finite<T>(found: Result<T>) -> Result<Option<T>> {
-    match found {
-        Ok(found) => Ok(Some(found)),
+fn finite<T>(outcome: Result<T>) -> Result<Option<T>> {
+    match outcome {
+        Ok(outcome) => Ok(Some(outcome)),
         Err(Error::Interrupted) => Err(Error::Interrupted),
         Err(_) => Ok(None),
     }
@@ -418,8 +418,8 @@ fn finite<T>(found: Result<T>) -> Result<Option<T>> {
 type Sensitivities = SingularValues;
 
 /// Singular values of the sensitivities of all parameters but some, scaled to unit rows, and the norms of the rows.
-fn other_sensitivities(there: &OptimizationResult, without: &[usize]) -> Result<(Sensitivities, Vec<f64>)> {
-    let others = there.jacobian.iter().enumerate().filter(|(j, _)| !without.contains(j)).map(|(_, row)| row);
+fn other_sensitivities(result: &OptimizationResult, without: &[usize]) -> Result<(Sensitivities, Vec<f64>)> {
+    let others = result.jacobian.iter().enumerate().filter(|(j, _)| !without.contains(j)).map(|(_, row)| row);
     let (mut scaled, mut lengths) = (Vec::new(), Vec::new());
     for row in others {
         // Far out, sensitivities may be so large that their squares overflow.
@@ -430,36 +430,36 @@ fn other_sensitivities(there: &OptimizationResult, without: &[usize]) -> Result<
         lengths.push(if peak > 0.0 { peak * length } else { 1.0 });
     }
     let failed = || Error::Internal { what: "sensitivities without singular values".into() };
-    let mut found = if scaled.is_empty() {
+    let mut factors = if scaled.is_empty() {
         SingularValues { left: Vec::new(), values: Vec::new(), right: Vec::new() }
     } else {
         dense::singular_values(&scaled).ok_or_else(failed)?
     };
-    let largest = found.values.iter().copied().fold(0.0, f64::max);
-    let kept = found.values.iter().filter(|size| **size > SINGULAR_VALUE_TOLERANCE * largest).count();
-    found.left.truncate(kept);
-    found.values.truncate(kept);
-    found.right.truncate(kept);
-    Ok((found, lengths))
+    let largest = factors.values.iter().copied().fold(0.0, f64::max);
+    let rank = factors.values.iter().filter(|size| **size > SINGULAR_VALUE_TOLERANCE * largest).count();
+    factors.left.truncate(rank);
+    factors.values.truncate(rank);
+    factors.right.truncate(rank);
+    Ok((factors, lengths))
 }
 
 /// Residuals after one linear step of the parameters of these sensitivities.
-fn projected_residuals(there: &OptimizationResult, sensitivities: &Sensitivities) -> Vec<f64> {
-    let mut rest = there.residuals.clone();
+fn projected_residuals(result: &OptimizationResult, sensitivities: &Sensitivities) -> Vec<f64> {
+    let mut rest = result.residuals.clone();
     for direction in &sensitivities.left {
-        let along = inner(direction, &there.residuals);
+        let along = inner(direction, &result.residuals);
         rest.iter_mut().zip(direction).for_each(|(v, d)| *v -= along * d);
     }
     rest
 }
 
 /// Direction of all parameters along the profile when one moves by 1.
-fn tangent(there: &OptimizationResult, i: usize) -> Result<Vec<f64>> {
-    let (SingularValues { left, values, right }, lengths) = other_sensitivities(there, &[i])?;
+fn tangent(result: &OptimizationResult, i: usize) -> Result<Vec<f64>> {
+    let (SingularValues { left, values, right }, lengths) = other_sensitivities(result, &[i])?;
     let weights: Vec<f64> =
-        left.iter().zip(&values).map(|(direction, size)| inner(direction, &there.jacobian[i]) / size).collect();
-    let moved = |j: usize| right.iter().zip(&weights).map(|(v, w)| v[j] * w).sum::<f64>();
-    let mut tangent: Vec<f64> = lengths.iter().enumerate().map(|(j, length)| -moved(j) / length).collect();
+        left.iter().zip(&values).map(|(direction, size)| inner(direction, &result.jacobian[i]) / size).collect();
+    let change = |j: usize| right.iter().zip(&weights).map(|(v, w)| v[j] * w).sum::<f64>();
+    let mut tangent: Vec<f64> = lengths.iter().enumerate().map(|(j, length)| -change(j) / length).collect();
     tangent.insert(i, 1.0);
     Ok(tangent)
 }

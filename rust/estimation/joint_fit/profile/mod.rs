@@ -72,7 +72,7 @@ pub fn profile_intervals(
     report: &ProgressListener<'_>,
 ) -> Result<ProfileResult> {
     let parameters = match &settings.parameters {
-        Some(given) => given.clone(),
+        Some(indices) => indices.clone(),
         None => {
             let mut inaccurate = Vec::new();
             for i in 0..start.size() {
@@ -90,9 +90,9 @@ pub fn profile_intervals(
     let mut bounds = Vec::new();
     for _ in 0..MAX_LOWER_OPTIMA {
         let budget = settings.budget.map(|(most, _)| most.saturating_sub(spent));
-        let found = search_bounds(&around, &parameters, settings, budget, report)?;
-        (bounds, spent) = (found.bounds, spent + found.evaluations);
-        let Some(lower) = found.lower else { break };
+        let bounds_result = search_bounds(&around, &parameters, settings, budget, report)?;
+        (bounds, spent) = (bounds_result.bounds, spent + bounds_result.evaluations);
+        let Some(lower) = bounds_result.lower else { break };
         // The limit for step 0 of another optimum is not known.
         around = around.moved_to(&lower)?;
     }
@@ -105,11 +105,11 @@ pub fn profile_intervals(
     }
     for i in parameters {
         let own: Vec<&(usize, Option<Interval>)> = bounds.iter().filter(|(of, _)| *of == i).collect();
-        if own.iter().any(|(_, found)| found.is_none()) {
+        if own.iter().any(|(_, bounds_result)| bounds_result.is_none()) {
             result.incomplete.push(i);
             continue;
         }
-        let sides = own.into_iter().filter_map(|(_, found)| found.clone());
+        let sides = own.into_iter().filter_map(|(_, bounds_result)| bounds_result.clone());
         let whole = sides.reduce(Interval::intersect).unwrap_or_else(Interval::whole_line);
         result.intervals.push((i, whole.shift(around.shift[i], around.bounds()[i])));
     }
@@ -141,8 +141,8 @@ fn search_bounds(
     let (workers, first_lower) = (pool(settings.threads.max(1))?, AtomicUsize::new(usize::MAX));
     let mut took = vec![0; total];
     let mut lower = None;
-    while bounds.iter().any(|(_, found)| found.is_none()) {
-        let open = bounds.iter().filter(|(_, found)| found.is_none()).count();
+    while bounds.iter().any(|(_, bound)| bound.is_none()) {
+        let open = bounds.iter().filter(|(_, bound)| bound.is_none()).count();
         // In whole rounds, so that what a bound may take does not depend on the number of threads.
         let share = budget.map_or(2 * MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND, |most| {
             most.saturating_sub(took.iter().sum()) / open
@@ -156,22 +156,22 @@ fn search_bounds(
             for (k, search) in searches.iter_mut().enumerate().filter(|(k, _)| bounds[*k].1.is_none()) {
                 let (send, allowed, first_lower) = (send.clone(), took[k] + share, &first_lower);
                 scope.spawn(move |_| {
-                    let found = search.advance(around, allowed, &|| first_lower.load(Ordering::Relaxed) < k);
-                    if matches!(found, Ok(BoundOutcome::Lower(_))) {
+                    let bound = search.advance(around, allowed, &|| first_lower.load(Ordering::Relaxed) < k);
+                    if matches!(bound, Ok(BoundOutcome::Lower(_))) {
                         first_lower.fetch_min(k, Ordering::Relaxed);
                     }
-                    drop(send.send((k, found)));
+                    drop(send.send((k, bound)));
                 });
             }
             drop(send);
-            let mut done = total - open;
-            for (k, found) in receive {
-                let found = found.inspect_err(|_| around.stop().set())?;
-                if let BoundOutcome::Found(_) = found {
-                    done += 1;
-                    report(done, total).inspect_err(|_| around.stop().set())?;
+            let mut count = total - open;
+            for (k, bound) in receive {
+                let bound = bound.inspect_err(|_| around.stop().set())?;
+                if let BoundOutcome::Found(_) = bound {
+                    count += 1;
+                    report(count, total).inspect_err(|_| around.stop().set())?;
                 }
-                outcomes[k] = Some(found);
+                outcomes[k] = Some(bound);
             }
             Ok(())
         })?;
