@@ -324,7 +324,7 @@ fn joint_fit(m: usize) -> Option<f64> {
     let found =
         fit::fit(asked, Initialization::Multistart { known: Vec::new(), candidates: None }, settings, &|_, _| Ok(()))
             .ok()??;
-    black_box(found).finished.estimate.first().copied()
+    black_box(found).optimum.estimate.first().copied()
 }
 
 /// One of the hottest kernels a fixed number of times, for callgrind; prints how many units of work it did.

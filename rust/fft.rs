@@ -61,8 +61,8 @@ const IN_USE: u64 = 16;
 
 /// Plans by length, each with the number of its last request.
 struct Plans {
-    asked: u64,
-    made: BTreeMap<usize, (Plan, u64)>,
+    uses: u64,
+    plans: BTreeMap<usize, (Plan, u64)>,
 }
 
 /// Plans of all threads. Each thread copies short ones once, so that no thread waits for a lock.
@@ -75,14 +75,14 @@ thread_local! {
 
 impl Plans {
     const fn new() -> Self {
-        Self { asked: 0, made: BTreeMap::new() }
+        Self { uses: 0, plans: BTreeMap::new() }
     }
 
     fn find(&mut self, len: usize) -> Option<Plan> {
-        let (plan, last) = self.made.get_mut(&len)?;
+        let (plan, last) = self.plans.get_mut(&len)?;
         if len > MAX_PERMANENT_PLAN_POINTS {
-            self.asked += 1;
-            *last = self.asked;
+            self.uses += 1;
+            *last = self.uses;
         }
         Some(plan.clone())
     }
@@ -97,17 +97,17 @@ impl Plans {
         }
         let mut forgotten = Vec::new();
         if len > MAX_PERMANENT_PLAN_POINTS {
-            self.asked += 1;
+            self.uses += 1;
             forgotten = self.make_room(MAX_CACHED_PLAN_POINTS.saturating_sub(len));
         }
-        self.made.insert(len, (plan.clone(), self.asked));
+        self.plans.insert(len, (plan.clone(), self.uses));
         (plan, forgotten)
     }
 
     /// Evict long plans, the least recently used first, until at most this many points are left.
     fn make_room(&mut self, points: usize) -> Vec<Plan> {
         let mut long: Vec<(u64, usize)> = self
-            .made
+            .plans
             .iter()
             .map(|(&len, &(_, last))| (last, len))
             .filter(|&(_, len)| len > MAX_PERMANENT_PLAN_POINTS)
@@ -116,11 +116,11 @@ impl Plans {
         let mut stored_points: usize = long.iter().map(|&(_, len)| len).sum();
         let mut forgotten = Vec::new();
         for (last, len) in long {
-            if stored_points <= points || self.asked - last <= IN_USE {
+            if stored_points <= points || self.uses - last <= IN_USE {
                 break;
             }
             stored_points -= len;
-            forgotten.extend(self.made.remove(&len).map(|(plan, _)| plan));
+            forgotten.extend(self.plans.remove(&len).map(|(plan, _)| plan));
         }
         forgotten
     }
@@ -297,7 +297,7 @@ mod tests {
         for len in [90, MAX_PERMANENT_PLAN_POINTS + 2] {
             let (first, second) = SHARED_PLANS.hold_during(|| (plan(len), plan(len)));
             assert!(is_sound(&first));
-            assert!(Arc::ptr_eq(&first.forward, &second.forward), "made once");
+            assert!(Arc::ptr_eq(&first.forward, &second.forward), "plans once");
         }
     }
 }

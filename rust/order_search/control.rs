@@ -14,7 +14,7 @@ pub struct Control {
     /// Set to end the search with [`Error::Interrupted`].
     pub stop: Stop,
     /// Number of candidates processed so far.
-    pub done: AtomicU64,
+    pub finished_count: AtomicU64,
     /// Total number of candidates, once known.
     pub total: AtomicU64,
     /// Number of processed candidates whose evaluation ended before the end of the record.
@@ -52,7 +52,7 @@ impl Control {
 
     /// Count candidates as processed, and some of them as pruned.
     pub(crate) fn count(&self, processed: u64, pruned: u64) {
-        self.done.fetch_add(processed, Ordering::Relaxed);
+        self.finished_count.fetch_add(processed, Ordering::Relaxed);
         self.pruned.fetch_add(pruned, Ordering::Relaxed);
     }
 }

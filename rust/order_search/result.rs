@@ -47,7 +47,7 @@ pub struct Counts {
     /// Total number of candidates.
     pub candidates: u64,
     /// Number of candidates in the table.
-    pub kept: u64,
+    pub table_rows: u64,
     /// Number of complete evaluations that did not enter the table.
     pub beaten: u64,
     /// Number of candidates excluded by a lower bound, without simulation.
@@ -98,7 +98,7 @@ impl Part {
     /// let mut all = part(7, 2.0);
     /// all.join(part(3, 1.0), 1);
     /// assert_eq!(all.seed(), [(3, 1.0)]);
-    /// assert_eq!(all.outcome(Norm::L1, 100).counts.kept, 1);
+    /// assert_eq!(all.outcome(Norm::L1, 100).counts.table_rows, 1);
     /// ```
     pub fn join(&mut self, other: Self, keep: usize) {
         self.rows.extend(other.rows);
@@ -118,8 +118,8 @@ impl Part {
     /// Result of a search from all of its batches over records with this many samples. Raw sums become scores.
     #[must_use]
     pub fn outcome(mut self, norm: Norm, samples: usize) -> Outcome {
-        self.counts.kept = self.rows.len() as u64;
-        self.counts.beaten = self.counts.beaten.saturating_sub(self.counts.kept);
+        self.counts.table_rows = self.rows.len() as u64;
+        self.counts.beaten = self.counts.beaten.saturating_sub(self.counts.table_rows);
         for row in &mut self.rows {
             row.score = norm.score(row.score, samples);
         }
@@ -131,7 +131,7 @@ impl Counts {
     fn add(&mut self, other: &Self) {
         for (sum, n) in [
             (&mut self.candidates, other.candidates),
-            (&mut self.kept, other.kept),
+            (&mut self.table_rows, other.table_rows),
             (&mut self.beaten, other.beaten),
             (&mut self.excluded_by_bound, other.excluded_by_bound),
             (&mut self.excluded_by_box, other.excluded_by_box),
@@ -146,7 +146,7 @@ impl Counts {
     /// Number of candidates with an outcome. At the end of a search it is the total number.
     #[must_use]
     pub fn processed_count(&self) -> u64 {
-        [self.kept, self.beaten, self.excluded_by_bound, self.stopped, self.singular, self.diverged]
+        [self.table_rows, self.beaten, self.excluded_by_bound, self.stopped, self.singular, self.diverged]
             .iter()
             .fold(0, |sum, n| sum.saturating_add(*n))
     }

@@ -211,16 +211,7 @@ impl<const L: usize> Screen<L> {
         (open, singular): &mut (Vec<OpenCandidate>, Vec<u64>),
     ) {
         let Self {
-            solve,
-            positions,
-            initial,
-            columns,
-            coefficients,
-            weights,
-            norm_cache: memory,
-            lookup: lookup,
-            path,
-            ..
+            solve, positions, initial, columns, coefficients, weights, norm_cache: memory, lookup, path, ..
         } = self;
         let failed = catalogue.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine

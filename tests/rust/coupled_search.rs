@@ -102,13 +102,17 @@ fn run(records: &[Record], lattice: &OrderLawGrid, options: &Options) -> StageOu
     let control = Control::default();
     let found = search(records, lattice, &free(), &scales(records), options, &control).unwrap();
     let counts = found.counts;
-    let sum =
-        counts.kept + counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged;
+    let sum = counts.table_rows
+        + counts.beaten
+        + counts.excluded_by_bound
+        + counts.stopped
+        + counts.singular
+        + counts.diverged;
     assert_eq!(sum, counts.candidates);
-    assert_eq!(counts.kept, found.rows.len() as u64);
+    assert_eq!(counts.table_rows, found.rows.len() as u64);
     // One that was left early may have been followed further.
     assert!(found.distinct.iter().sum::<u64>() <= control.total.load(Ordering::Relaxed));
-    assert_eq!(control.done.load(Ordering::Relaxed), control.total.load(Ordering::Relaxed));
+    assert_eq!(control.finished_count.load(Ordering::Relaxed), control.total.load(Ordering::Relaxed));
     found
 }
 

@@ -486,7 +486,7 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
     assert_eq!(found.rows, run(1, false).rows);
     let counts = found.counts;
     let left = counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged;
-    assert_eq!(counts.kept + left, lattice.count());
+    assert_eq!(counts.table_rows + left, lattice.count());
 
     let band = 2.0 * power_frequency(noisy.signal(0), noisy.step());
     let smooth = noisy.clean_record().with_filter(&low_pass(band, &noisy).unwrap()).unwrap();

@@ -199,7 +199,12 @@ fn proofs_keep_the_table_of_brute_force() {
     let counts = proved.counts;
     println!("{counts:?}");
     assert_eq!(
-        counts.kept + counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged,
+        counts.table_rows
+            + counts.beaten
+            + counts.excluded_by_bound
+            + counts.stopped
+            + counts.singular
+            + counts.diverged,
         lattice.count()
     );
     assert!(counts.excluded_by_bound > lattice.count() / 4);

@@ -44,7 +44,7 @@ fn options() -> Options {
 }
 
 fn total(counts: &Counts) -> u64 {
-    counts.kept + counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged
+    counts.table_rows + counts.beaten + counts.excluded_by_bound + counts.stopped + counts.singular + counts.diverged
 }
 
 // ---------------------------------------------------------------------------------------------------------- lattices
@@ -193,8 +193,8 @@ impl Problem {
         let outcome = search(&self.records, &self.lattice, &self.fixed, &options, &control).unwrap();
         assert_eq!(outcome.counts.candidates, self.lattice.count());
         assert_eq!(total(&outcome.counts), outcome.counts.candidates);
-        assert_eq!(outcome.counts.kept, outcome.rows.len() as u64);
-        assert_eq!(control.done.load(Ordering::Relaxed), self.lattice.count());
+        assert_eq!(outcome.counts.table_rows, outcome.rows.len() as u64);
+        assert_eq!(control.finished_count.load(Ordering::Relaxed), self.lattice.count());
         assert_eq!(control.total.load(Ordering::Relaxed), self.lattice.count());
         outcome
     }
@@ -608,20 +608,20 @@ fn a_search_ends_when_told_to() {
     control.stop.set();
     let found = search(&problem.records, &problem.lattice, &problem.fixed, &problem.options, &control);
     assert_eq!(found, Err(Error::Interrupted));
-    assert_eq!(control.done.load(Ordering::Relaxed), 0);
+    assert_eq!(control.finished_count.load(Ordering::Relaxed), 0);
     // From another thread, once it is under way.
     let control = Control::default();
     std::thread::scope(|scope| {
         let run =
             scope.spawn(|| search(&problem.records, &problem.lattice, &problem.fixed, &problem.options, &control));
-        while control.done.load(Ordering::Relaxed) < 500 && !run.is_finished() {
+        while control.finished_count.load(Ordering::Relaxed) < 500 && !run.is_finished() {
             std::thread::yield_now();
         }
         control.stop.set();
         assert_eq!(run.join().unwrap(), Err(Error::Interrupted));
     });
     assert_eq!(control.total.load(Ordering::Relaxed), 313_845);
-    assert!(control.done.load(Ordering::Relaxed) < 313_845);
+    assert!(control.finished_count.load(Ordering::Relaxed) < 313_845);
 }
 
 /// A record and an equation on it, a third of them unstable, some with coefficients fitted and some far off.
@@ -865,7 +865,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                 let (finished, watched) = (&finished, &control);
                 let found = std::thread::scope(|scope| {
                     scope.spawn(move || {
-                        while watched.done.load(Relaxed) < end && !finished.load(Relaxed) {
+                        while watched.finished_count.load(Relaxed) < end && !finished.load(Relaxed) {
                             std::thread::yield_now();
                         }
                         watched.stop.set();
@@ -889,7 +889,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                         let control = Control::default();
                         control.saving.store(true, Relaxed);
                         assert_eq!(run(&ready, Some(other), &control).unwrap(), whole);
-                        assert_eq!(control.done.load(Relaxed), whole.counts.processed_count());
+                        assert_eq!(control.finished_count.load(Relaxed), whole.counts.processed_count());
                         assert!(control.take_checkpoint().is_some_and(|first| first.replaces_previous));
                     }
                     assert_eq!(checkpoint.replaces_previous, from.is_none());

@@ -114,7 +114,7 @@ fn searches_refuse_settings_out_of_range() {
     // As many rows as there are, however many are asked for.
     let all = Options { top: usize::MAX, ..Options::default() };
     let found = search(&[data()], &small(), &[None; 2], &all, &Control::default()).unwrap();
-    assert_eq!(found.counts.kept + found.counts.singular + found.counts.diverged, small().count());
+    assert_eq!(found.counts.table_rows + found.counts.singular + found.counts.diverged, small().count());
     assert_eq!((batch_count(0, &all), generation_ends(0)), (0, vec![]));
 }
 

@@ -122,11 +122,11 @@ pub struct Settings {
 #[non_exhaustive]
 pub struct JointFit {
     /// The optimum and its statistics.
-    pub finished: OptimumStatistics,
+    pub optimum: OptimumStatistics,
     /// Candidates of the multistart, best first.
-    pub reached: Vec<Candidate>,
+    pub candidates: Vec<Candidate>,
     /// Comparison of a stable and an unstable optimum, if one was unstable.
-    pub growth: Option<StabilityComparison>,
+    pub stability: Option<StabilityComparison>,
 }
 
 /// Fit problem: parameter set, runs, initial guesses and output scales.
@@ -174,7 +174,7 @@ impl<'a> FitProblem<'a> {
             |count, of| shared.borrow_mut().advance_within(MULTISTART_PROGRESS_SHARE, SWEEP_PROGRESS_SHARE, count, of);
         let Self { source, starts, stop, .. } = *self;
         let course =
-            MultistartContext { source, starts, stop, weights: &weights, floor, threads, told: Some(&listener) };
+            MultistartContext { source, starts, stop, weights: &weights, floor, threads, listener: Some(&listener) };
         let run = match &self.free.problem {
             problem if !problem.derived.is_empty() => run_nonlinear_multistart,
             problem if !problem.frictions.is_empty() => run_friction_multistart,
@@ -222,7 +222,7 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -
     let fit =
         fit(problem, Initialization::Multistart { known: Vec::new(), candidates: None }, settings, &|_, _| Ok(()))?
             .ok_or_else(|| Error::Diverged { what: "simulation of every initial guess".into(), index: 0 })?;
-    Ok(EquationFit { values: free.names().cloned().zip(fit.finished.estimate.iter().copied()).collect(), fit })
+    Ok(EquationFit { values: free.names().cloned().zip(fit.optimum.estimate.iter().copied()).collect(), fit })
 }
 
 /// Fit a structure to runs by output error; None if no initial guess has a finite simulation.
@@ -265,7 +265,7 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -
 /// let initialization = Initialization::Multistart { known: Vec::new(), candidates: None };
 /// // None if no initial guess has a finite simulation.
 /// let found = fit::fit(problem, initialization, settings, &|_, _| Ok(()))?;
-/// let estimate = found.map_or_else(Vec::new, |fit| fit.finished.estimate);
+/// let estimate = found.map_or_else(Vec::new, |fit| fit.optimum.estimate);
 /// assert_eq!(estimate.len(), 3);
 /// assert!(estimate.iter().zip([1.0, -2.0, 3.0]).all(|(value, truth)| (value - truth).abs() < 1e-2));
 /// # Ok(())
@@ -279,7 +279,7 @@ pub fn fit(
 ) -> Result<Option<JointFit>> {
     let free = sought.free;
     let mut pace = FitProgress::new(listener);
-    let (reached, contenders) = match outset {
+    let (candidates, contenders) = match outset {
         Initialization::WarmStart { values, noise, pulses_per_sample: every, candidates: raced } => {
             let start = sought.start(&values, GIVEN_START_ORIGIN)?;
             let sampling = Sampling { pulses_per_sample: every, ..Sampling::default() };
@@ -290,13 +290,13 @@ pub fn fit(
         }
         Initialization::InitialGuess(values) => (Vec::new(), vec![sought.start(&values, GIVEN_START_ORIGIN)?]),
         Initialization::Multistart { known: guesses, candidates: raced } => {
-            let reached =
+            let candidates =
                 if let Some(raced) = raced { raced } else { sought.run_multistart(settings.threads, &mut pace)? };
-            let mut contenders = select_survivors(&reached);
+            let mut contenders = select_survivors(&candidates);
             for values in &guesses {
                 contenders.push(sought.start(values, GIVEN_START_ORIGIN)?);
             }
-            (reached, contenders)
+            (candidates, contenders)
         }
     };
     let Some(first) = contenders.first() else { return Ok(None) };
@@ -323,7 +323,7 @@ pub fn fit(
     pace.advance_to(0.65)?;
     let (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
     pace.advance_to(0.75)?;
-    let final_fit = finish_fit(free, best, grid, reached, settings)?;
+    let final_fit = finish_fit(free, best, grid, candidates, settings)?;
     pace.advance_to(1.0)?;
     Ok(Some(final_fit))
 }
@@ -336,11 +336,11 @@ fn finish_fit(
     free: &ParameterSet,
     best: Candidate,
     grid: Objective<'_>,
-    reached: Vec<Candidate>,
+    candidates: Vec<Candidate>,
     settings: Settings,
 ) -> Result<JointFit> {
-    let (mut best, mut grid, growth) = prefer_stable(free, best, grid, &reached)?;
-    if growth.is_some_and(|growth| !growth.keeps_unstable) {
+    let (mut best, mut grid, stability) = prefer_stable(free, best, grid, &candidates)?;
+    if stability.is_some_and(|stability| !stability.keeps_unstable) {
         (best, grid) = reweight_candidate(&best, grid, settings.loss)?;
     }
     let optimum = if !settings.refine || grid.is_exact(&best.result.iterate) {
@@ -348,10 +348,11 @@ fn finish_fit(
     } else if let Some(corrected) = correct_step(&best.result, &grid, settings.loss)? {
         corrected
     } else {
-        let others: Vec<Iterate> = select_survivors(&reached).into_iter().map(|runner| runner.result.iterate).collect();
+        let others: Vec<Iterate> =
+            select_survivors(&candidates).into_iter().map(|runner| runner.result.iterate).collect();
         refine_step(best.result, grid, settings.loss, &others)?
     };
-    Ok(JointFit { finished: optimum.into_statistics(), reached, growth })
+    Ok(JointFit { optimum: optimum.into_statistics(), candidates, stability })
 }
 
 /// Fit a candidate with iterated weights until they converge.

@@ -10,10 +10,10 @@ pub type ProgressListener<'a> = dyn Fn(usize, usize) -> Result<()> + 'a;
 
 /// Progress of a fit as a share of 1, over phases of unknown length.
 pub struct FitProgress<'a> {
-    told: &'a ProgressListener<'a>,
-    reached: f64,
-    said: Option<usize>,
-    begun: f64,
+    listener: &'a ProgressListener<'a>,
+    share_done: f64,
+    reported_parts: Option<usize>,
+    phase_start: f64,
     last: f64,
 }
 
@@ -21,7 +21,7 @@ impl<'a> FitProgress<'a> {
     /// Progress 0, with a callback.
     #[must_use]
     pub fn new(listener: &'a ProgressListener<'a>) -> Self {
-        Self { told: listener, reached: 0.0, said: None, begun: 0.0, last: 0.0 }
+        Self { listener, share_done: 0.0, reported_parts: None, phase_start: 0.0, last: 0.0 }
     }
 
     /// Advance to a share of the whole.
@@ -30,13 +30,13 @@ impl<'a> FitProgress<'a> {
     /// The error of the callback.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn advance_to(&mut self, share: f64) -> Result<()> {
-        self.reached = self.reached.max(share.min(1.0));
-        let parts = (PROGRESS_PARTS as f64 * self.reached).round_ties_even() as usize;
-        if self.said.is_some_and(|reported| parts <= reported) {
+        self.share_done = self.share_done.max(share.min(1.0));
+        let parts = (PROGRESS_PARTS as f64 * self.share_done).round_ties_even() as usize;
+        if self.reported_parts.is_some_and(|reported| parts <= reported) {
             return Ok(());
         }
-        self.said = Some(parts);
-        (self.told)(parts, PROGRESS_PARTS)
+        self.reported_parts = Some(parts);
+        (self.listener)(parts, PROGRESS_PARTS)
     }
 
     /// Advance within a phase that ends at a share of the whole. A phase can count from zero repeatedly; each sweep
@@ -48,10 +48,10 @@ impl<'a> FitProgress<'a> {
     pub fn advance_within(&mut self, share: f64, sweep: f64, count: usize, of: usize) -> Result<()> {
         let fraction = count as f64 / of.max(1) as f64;
         if fraction < self.last {
-            self.begun = self.reached;
+            self.phase_start = self.share_done;
         }
         self.last = fraction;
-        self.advance_to(self.begun + sweep * (share - self.begun) * fraction)
+        self.advance_to(self.phase_start + sweep * (share - self.phase_start) * fraction)
     }
 }
 

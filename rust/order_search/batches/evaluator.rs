@@ -109,12 +109,8 @@ impl<'a> BatchEvaluator<'a> {
         }
         let pay = count >= MIN_BOX_CANDIDATES && BranchAndBound::is_worthwhile(&catalogue);
         let closely = uses_close_bounds(count, options);
-        let InitialIncumbent {
-            kept: mut top_rows,
-            tried: mut evaluated,
-            needs_close_bounds: hard,
-            selected_vectors: which,
-        } = BatchEvaluation::new(&catalogue, None, pool, control).find_incumbent(pay, closely)?;
+        let InitialIncumbent { mut top_rows, mut evaluated, needs_close_bounds: hard, selected_vectors: which } =
+            BatchEvaluation::new(&catalogue, None, pool, control).find_incumbent(pay, closely)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.select_vectors(&which));
@@ -258,7 +254,7 @@ impl<'a> BatchEvaluator<'a> {
             hunt.result.rows.retain(|row| !own(row));
             if !hunt.evaluate_batch(bounds, &mut top_rows, place)? {
                 // Its candidates would be evaluated twice or never, so the foreign result is discarded.
-                control.done.fetch_sub(processed, Ordering::Relaxed);
+                control.finished_count.fetch_sub(processed, Ordering::Relaxed);
                 (hunt.result, hunt.replaces_previous, place) = (Part::default(), true, BatchPosition::start(first));
                 continue;
             }

@@ -33,8 +33,8 @@ const HARD_SEARCH_OPEN_RATIO: usize = 8;
 /// Incumbent found by the initial sample.
 pub(super) struct InitialIncumbent {
     /// Rows that give the initial limit, and the candidates evaluated for them.
-    pub(super) kept: TopRows,
-    pub(super) tried: HashSet<u64>,
+    pub(super) top_rows: TopRows,
+    pub(super) evaluated: HashSet<u64>,
     /// Whether so many candidates remain open at this limit that close bounds are worthwhile.
     pub(super) needs_close_bounds: bool,
     /// Indices of the selected test vectors, the best first.
@@ -115,7 +115,7 @@ impl BatchEvaluation<'_> {
             let each: Vec<Vec<f64>> = candidates.into_iter().map(|(_, each)| each).collect();
             select_test_vectors(&each, MAX_SEARCH_VECTORS.min(bound.len()), limit)
         });
-        Ok(InitialIncumbent { kept: top_rows, tried: evaluated, needs_close_bounds: hard, selected_vectors: which })
+        Ok(InitialIncumbent { top_rows, evaluated, needs_close_bounds: hard, selected_vectors: which })
     }
 }
 

@@ -239,7 +239,7 @@ impl<'a> SliceTables<'a> {
         let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
         let [u, v] = &self.sides;
         (strip.start, strip.len) = (rows.start, len);
-        let RowCoefficients { plus, minus, independence: independence, product, .. } = strip;
+        let RowCoefficients { plus, minus, independence, product, .. } = strip;
         for all in [&mut *plus, minus, independence] {
             all.resize(rows.len() * len, 0.0);
         }
@@ -327,7 +327,7 @@ impl<'a> SliceTables<'a> {
             mixed_slopes: bends,
             explained,
             all,
-            rounding: rounding,
+            rounding,
         })
     }
 
@@ -407,7 +407,7 @@ impl<'a> SliceTables<'a> {
     pub(super) fn moduli(&self, [su, sv]: [Interval; 2], cell: &BoxQuantities) -> Moduli {
         let k = self.others.columns.len();
         let [u, v] = &self.sides;
-        let BoxQuantities { at, wide: [wu, wv], ps, qs, rounding: rounding, .. } = *cell;
+        let BoxQuantities { at, wide: [wu, wv], ps, qs, rounding, .. } = *cell;
         let ((u0, v0), (u1, v1)) = (at[0], at[3]);
         let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
         let (mut others, mut rests) = ([[0.0; 4]; MAX_REMAINING_COLUMNS], [0.0; MAX_REMAINING_COLUMNS]);

@@ -116,7 +116,7 @@ struct LinearizedVectorKernel<'a> {
     limit: f64,
     terms: &'a [usize],
     coefficients: &'a [f64],
-    held: &'a mut VectorLookup,
+    lookup: &'a mut VectorLookup,
 }
 
 impl simd::SimdKernel for LinearizedVectorKernel<'_> {
@@ -124,7 +124,7 @@ impl simd::SimdKernel for LinearizedVectorKernel<'_> {
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.tangents.excludes_candidate(self.terms, self.coefficients, self.limit, self.held)
+        self.tangents.excludes_candidate(self.terms, self.coefficients, self.limit, self.lookup)
     }
 }
 
@@ -418,7 +418,7 @@ impl Problem {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let Scratch {
             norm_cache: memory,
-            lookup: lookup,
+            lookup,
             infeasibility: reach,
             start,
             one,
@@ -467,13 +467,7 @@ impl Problem {
             return Verdict::Bounded(limit);
         }
         if let (Some(tangents), true) = (&self.linearized_vectors, limit < f64::INFINITY)
-            && simd::dispatch_simd(LinearizedVectorKernel {
-                tangents,
-                limit,
-                terms: positions,
-                coefficients,
-                held: lookup,
-            })
+            && simd::dispatch_simd(LinearizedVectorKernel { tangents, limit, terms: positions, coefficients, lookup })
         {
             return Verdict::Bounded(limit);
         }

@@ -115,7 +115,7 @@ pub fn certify(
     let pool = pool(options.threads)?;
     pool.install(|| {
         let tables = GramTables::new(records, region, options.memory, control)?;
-        CellBisection { tables, region, options: options, control }.run(records)
+        CellBisection { tables, region, options, control }.run(records)
     })
 }
 

@@ -98,7 +98,7 @@ pub struct SearchState {
     pending_spans: Vec<Span>,
     total: u64,
     /// Best exact tuples, after the first pass.
-    kept: Vec<(f64, u64)>,
+    best_rows: Vec<(f64, u64)>,
 }
 
 impl<'a> Stage<'a> {
@@ -175,7 +175,7 @@ impl<'a> Stage<'a> {
             limit_factor: FIRST_LIMIT,
             pending_spans: Vec::new(),
             total: stage.tables.iter().map(|t| t.used.len() as u64).sum(),
-            kept: Vec::new(),
+            best_rows: Vec::new(),
         };
         course.plan_next(&stage, pool, control)?;
         Ok((stage, course))
@@ -241,11 +241,11 @@ impl<'a> Stage<'a> {
         }
         course.check(self)?;
         let (mut counts, failures) = course.join.count_outcomes(&course.states());
-        counts.kept = course.kept.len() as u64;
-        counts.beaten -= counts.kept;
+        counts.table_rows = course.best_rows.len() as u64;
+        counts.beaten -= counts.table_rows;
         let mut scratch = Scratch::default();
-        let mut rows = Vec::with_capacity(course.kept.len());
-        for &(score, index) in &course.kept {
+        let mut rows = Vec::with_capacity(course.best_rows.len());
+        for &(score, index) in &course.best_rows {
             let structures = self
                 .lattice
                 .structures(index)
@@ -285,7 +285,7 @@ impl SearchState {
     /// Best score of a tuple, if there is one.
     #[must_use]
     pub fn best(&self) -> Option<f64> {
-        self.kept.first().map(|incumbent| incumbent.0)
+        self.best_rows.first().map(|incumbent| incumbent.0)
     }
 
     /// Raise an error if the state belongs to another stage.
@@ -352,8 +352,8 @@ impl SearchState {
         }
         let keep = stage.options.top;
         let states = self.states();
-        self.kept = self.join.best(&states, &self.entries, keep, pool, control)?;
-        let worst = if self.kept.len() == keep { self.kept[keep - 1].0 } else { f64::INFINITY };
+        self.best_rows = self.join.best(&states, &self.entries, keep, pool, control)?;
+        let worst = if self.best_rows.len() == keep { self.best_rows[keep - 1].0 } else { f64::INFINITY };
         self.pending_spans = self.join.unresolved_spans(&states, &self.entries, worst, self.limit_factor, control)?;
         self.limit_factor *= FIRST_LIMIT;
         self.total += self.pending_spans.iter().map(|span| (span.last - span.first) as u64).sum::<u64>();

@@ -52,13 +52,13 @@ pub fn joint_multistart(
 ) -> PyResult<JointMultistart> {
     let (free, (threads, memory)) = (Arc::clone(&problem.inner), means);
     let source = source(&free, &runs)?.with_memory_limit(usize::try_from(memory).unwrap_or(usize::MAX));
-    let reached = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
+    let candidates = run_with_progress(py, stop, progress.as_ref(), move |stop, report| {
         let starts = OrderGrids::new(&source, threads, memory, stop);
         let sizes = OutputScale::of_recordings(&source)?;
         let sought = FitProblem { free: &free, source: &source, starts: &starts, sizes: &sizes, stop };
         sought.run_multistart(threads, &mut FitProgress::new(&report))
     })?;
-    Ok(JointMultistart { inner: Arc::new(reached) })
+    Ok(JointMultistart { inner: Arc::new(candidates) })
 }
 
 /// Initial guess near an earlier fit: (values of the free parameters, noise of each output, pulses per sampling
@@ -114,7 +114,7 @@ fn tables<'py>(py: Python<'py>, runs: &[Vec<Vec<f64>>]) -> PyResult<Vec<Table<'p
 }
 
 fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'_, PyDict>> {
-    let JointFit { finished, reached, growth } = found;
+    let JointFit { optimum, candidates, stability } = found;
     let OptimumStatistics {
         attempt,
         weights,
@@ -125,7 +125,7 @@ fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'
         noise,
         residuals,
         robust,
-    } = finished;
+    } = optimum;
     let OptimizationResult { iterate: place, cost, initial, .. } = &attempt;
     let dict = PyDict::new(py);
     dict.set_item("shares", weights.robust_weights.map(|shares| tables(py, &shares)).transpose()?)?;
@@ -141,17 +141,14 @@ fn fit_to_dict(py: Python<'_>, found: JointFit, size: usize) -> PyResult<Bound<'
     dict.set_item("cost", cost)?;
     dict.set_item("status", status(attempt.status))?;
     dict.set_item("initial_terms", initial.iter().flatten().map(Vec::len).sum::<usize>())?;
-    let starts = reached.iter().flat_map(|runner| {
+    let starts = candidates.iter().flat_map(|runner| {
         std::iter::once(&runner.origin)
             .chain(&runner.duplicates)
             .map(|origin| (runner.cost_per_residual(), origin.clone()))
     });
     dict.set_item("starts", starts.collect::<Vec<_>>())?;
-    let survivors = select_survivors(&reached).into_iter().map(|c| (c.cost_per_residual(), c.result.values()));
+    let survivors = select_survivors(&candidates).into_iter().map(|c| (c.cost_per_residual(), c.result.values()));
     dict.set_item("survivors", survivors.collect::<Vec<_>>())?;
-    dict.set_item(
-        "growth",
-        growth.map(|growth| (growth.keeps_unstable, growth.residual_excess, growth.at_stability_limit)),
-    )?;
+    dict.set_item("growth", stability.map(|c| (c.keeps_unstable, c.residual_excess, c.at_stability_limit)))?;
     Ok(dict)
 }

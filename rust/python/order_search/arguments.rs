@@ -185,7 +185,7 @@ pub fn law_lattice(
 pub fn counts_to_dict<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("candidates", counts.candidates)?;
-    dict.set_item("kept", counts.kept)?;
+    dict.set_item("kept", counts.table_rows)?;
     dict.set_item("beaten", counts.beaten)?;
     dict.set_item("bound", counts.excluded_by_bound)?;
     dict.set_item("stopped early", counts.stopped)?;
@@ -223,7 +223,7 @@ pub fn part_of(part: Part) -> PartArg {
         match c.excluded_by_box {
             0 => CountsArg::Plain((
                 c.candidates,
-                c.kept,
+                c.table_rows,
                 c.beaten,
                 c.excluded_by_bound,
                 c.stopped,
@@ -232,7 +232,7 @@ pub fn part_of(part: Part) -> PartArg {
             )),
             n => CountsArg::Boxed((
                 c.candidates,
-                c.kept,
+                c.table_rows,
                 c.beaten,
                 c.excluded_by_bound,
                 c.stopped,
@@ -263,7 +263,7 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
             .collect(),
         counts: Counts {
             candidates,
-            kept: retained,
+            table_rows: retained,
             beaten,
             excluded_by_bound: bounded,
             excluded_by_box: boxed,

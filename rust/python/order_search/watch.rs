@@ -195,5 +195,5 @@ pub fn run_with_progress<T: Send + 'static>(
 /// Progress: candidates done, total, and pruned.
 fn state(control: &Control) -> (u64, u64, u64) {
     let read = |x: &AtomicU64| x.load(Ordering::Relaxed);
-    (read(&control.done), read(&control.total), read(&control.pruned))
+    (read(&control.finished_count), read(&control.total), read(&control.pruned))
 }

@@ -294,7 +294,7 @@ fn fit_frictionless_equations(
         let (alone, source) = with_measured_inputs(structure, course.source, vec![item.clone()])?;
         let alone = ParametricStructure { laws: Vec::new(), ..alone };
         let alone = ParameterSet::from_structure(alone.with_orders(orders)?)?;
-        let reached = run_on(&alone, &source, MultistartContext { weights: &[weight], told: None, ..course })?;
+        let reached = run_on(&alone, &source, MultistartContext { weights: &[weight], listener: None, ..course })?;
         if let Some(best) = reached.first() {
             values.extend(alone.coefficients_by_name(&best.result.iterate.point.coefficients));
         }

@@ -36,7 +36,7 @@ const SAME_ORDER_RELATIVE_TOLERANCE: f64 = 1e-5;
 pub(super) struct RungExecutor<'a> {
     pub starts: usize,
     pub threads: usize,
-    pub told: Option<&'a ProgressListener<'a>>,
+    pub listener: Option<&'a ProgressListener<'a>>,
 }
 
 impl RungExecutor<'_> {
@@ -71,7 +71,7 @@ impl RungExecutor<'_> {
         let mut heard = || {
             let so_far = count.min(self.starts.saturating_sub(1));
             count += 1;
-            self.told.map_or(Ok(()), |listener| listener(so_far, self.starts))
+            self.listener.map_or(Ok(()), |listener| listener(so_far, self.starts))
         };
         if self.threads.min(runners.len()) <= 1 {
             let each = runners.iter().map(|runner| {

@@ -49,20 +49,20 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
     for source in &sources {
         let of_source = course.starts.for_recordings(source);
         if structure.has_friction() {
-            let own = MultistartContext { source, starts: of_source.as_ref(), told: None, ..course };
+            let own = MultistartContext { source, starts: of_source.as_ref(), listener: None, ..course };
             let candidates = none_if_invalid_model(run_friction_multistart(&linear, own))?.unwrap_or_default();
             starts.extend(embed(free, &linear, &candidates)?);
             continue;
         }
         starts.extend(none_if_invalid_model(of_source.initial_guesses(&linear))?.unwrap_or_default());
     }
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
     let mut ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
     while ranked.is_empty() && grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE {
         grid = grid.finer()?;
         ranked = merge_duplicates(&laps.run(free, &grid, &starts, 0)?, is_same_iterate);
     }
-    let laps = RungExecutor { told: None, ..laps };
+    let laps = RungExecutor { listener: None, ..laps };
     let is_at_noise = |reached: &[Candidate]| {
         reached.first().is_some_and(|best| best.cost_per_residual() <= NOISE_FLOOR_FACTOR * course.floor)
     };
@@ -88,12 +88,12 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
         let others = if structure.has_friction() { &[][..] } else { &sources };
         for source in others {
             let starts = course.starts.for_recordings(source);
-            let own = MultistartContext { source, starts: starts.as_ref(), told: None, ..course };
+            let own = MultistartContext { source, starts: starts.as_ref(), listener: None, ..course };
             let candidates = none_if_invalid_model(run_multistart(&linear, own))?.unwrap_or_default();
             more.extend(embed(free, &linear, &candidates)?);
         }
         if let Some(less) = without_nonlinear_terms(structure) {
-            let own = MultistartContext { told: None, ..course };
+            let own = MultistartContext { listener: None, ..course };
             let candidates = none_if_invalid_model(run_friction_multistart(&less, own))?.unwrap_or_default();
             more.extend(embed(free, &less, &candidates)?);
         }

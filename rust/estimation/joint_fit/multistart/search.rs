@@ -60,13 +60,13 @@ pub struct MultistartContext<'a> {
     /// Number of threads; results do not depend on it.
     pub threads: usize,
     /// Progress callback of (starts done, all starts); None in a nested multistart.
-    pub told: Option<&'a ProgressListener<'a>>,
+    pub listener: Option<&'a ProgressListener<'a>>,
 }
 
 impl<'a> MultistartContext<'a> {
     /// Context of a nested multistart.
     fn for_submodel(self) -> Self {
-        Self { told: None, ..self }
+        Self { listener: None, ..self }
     }
 
     fn time_scaling(self, free: &ParameterSet) -> TimeScaling {
@@ -101,7 +101,7 @@ fn integer_order_multistart(
     let sampling = Sampling { leading_intervals, ..Sampling::default() };
     let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
     let Some(starts) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
     let candidates = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
     Ok((!candidates.is_empty()).then_some(candidates))
 }
@@ -127,7 +127,7 @@ struct MultistartState<'a> {
     first: Vec<Candidate>,
     /// Optima with integer orders.
     integer_order_optima: Vec<Candidate>,
-    reached: Vec<Candidate>,
+    candidates: Vec<Candidate>,
 }
 
 /// Multistart of a problem with few initial terms; return the candidates and their grid.
@@ -141,14 +141,14 @@ fn multistart_without_history<'a>(
     let coarse = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
     let integer_order_optima = integer_order_optima(free, course, &coarse, &starts)?;
     starts.extend(integer_order_optima.iter().cloned());
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: course.told };
-    let (first, reached, half) = (Vec::new(), Vec::new(), None);
-    let mut run = MultistartState { free, course, laps, coarse, half, starts, first, integer_order_optima, reached };
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
+    let (first, candidates, half) = (Vec::new(), Vec::new(), None);
+    let mut run = MultistartState { free, course, laps, coarse, half, starts, first, integer_order_optima, candidates };
     run.optimize_starts()?;
     run.add_nested_models()?;
     let total = run.laps.starts;
     let candidates = run.promote_survivors()?;
-    if let Some(heard) = course.told {
+    if let Some(heard) = course.listener {
         heard(total, total)?;
     }
     Ok(candidates)
@@ -186,7 +186,7 @@ fn optimize_submodel(
         return Ok(candidates);
     }
     let Some(starts) = none_if_invalid_model(course.starts.initial_guesses(free))? else { return Ok(Vec::new()) };
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, told: None };
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: None };
     let mut runners = merge_duplicates(&laps.run(free, coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
     runners.truncate(going);
     let ended = laps.run(free, coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
@@ -203,18 +203,18 @@ impl<'a> MultistartState<'a> {
         loop {
             let glanced = self.laps.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
             let glanced = merge_duplicates(&glanced, is_same_iterate);
-            self.reached = self.laps.run(self.free, &self.coarse, &glanced, FIRST_BUDGET_EVALUATIONS)?;
-            self.first.clone_from(&self.reached);
+            self.candidates = self.laps.run(self.free, &self.coarse, &glanced, FIRST_BUDGET_EVALUATIONS)?;
+            self.first.clone_from(&self.candidates);
             if self.coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
                 return Ok(());
             }
             let finer = self.coarse.finer()?;
-            if let Some(best) = self.reached.first() {
+            if let Some(best) = self.candidates.first() {
                 if !self.coarse.is_refinement_significant(&best.result.iterate, &finer)? {
                     self.half = Some(finer);
                     return Ok(());
                 }
-                starts = merge_duplicates(&self.reached, is_same_optimum);
+                starts = merge_duplicates(&self.candidates, is_same_optimum);
                 starts.extend(self.integer_order_optima.iter().cloned());
             }
             self.coarse = finer;
@@ -223,7 +223,7 @@ impl<'a> MultistartState<'a> {
 
     /// Add the optima of submodels as candidates: a coefficient at 0, or a fixed order.
     fn add_nested_models(&mut self) -> Result<()> {
-        if self.reached.is_empty() {
+        if self.candidates.is_empty() {
             return Ok(());
         }
         for less in reduced_problems(self.free) {
@@ -237,8 +237,8 @@ impl<'a> MultistartState<'a> {
     }
 
     fn add(&mut self, runners: Vec<Candidate>) {
-        self.reached.extend(runners);
-        self.reached = sort_by_cost(std::mem::take(&mut self.reached));
+        self.candidates.extend(runners);
+        self.candidates = sort_by_cost(std::mem::take(&mut self.candidates));
     }
 
     /// Evaluate candidates on the grid of this problem and add them.
@@ -266,7 +266,7 @@ impl<'a> MultistartState<'a> {
 
     /// Add the optimum with one order fixed: the full problem must not fit worse.
     fn add_fixed_order_model(&mut self, one: &FixedOrderProblem, unit: &TimeScaling) -> Result<()> {
-        let level = self.reached.first().map_or(0.0, Candidate::cost_per_residual);
+        let level = self.candidates.first().map_or(0.0, Candidate::cost_per_residual);
         if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.course.floor {
             // Bounds may leave no order grid.
             if let Some((ended, _)) =
@@ -279,7 +279,7 @@ impl<'a> MultistartState<'a> {
         }
         // Start from the optima found so far and from those with integer orders.
         let (reached, first) =
-            (merge_duplicates(&self.reached, is_same_optimum), merge_duplicates(&self.first, is_same_optimum));
+            (merge_duplicates(&self.candidates, is_same_optimum), merge_duplicates(&self.first, is_same_optimum));
         let near = reached
             .iter()
             .take(MAX_FINAL_SURVIVORS)
@@ -311,7 +311,7 @@ impl<'a> MultistartState<'a> {
 
     /// Promote the survivors to the second budget; duplicates and candidates far behind do not continue.
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
-        let reached = merge_duplicates(&self.reached, is_same_optimum);
+        let reached = merge_duplicates(&self.candidates, is_same_optimum);
         let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
         let candidates = self.laps.run(self.free, &self.coarse, survivors, SECOND_BUDGET_EVALUATIONS)?;
         let mut candidates = rank_candidates(&self.coarse, self.half, candidates)?;
@@ -347,7 +347,7 @@ fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -
     let few = free.with_initial_terms(free.structure.initial.with_under(Initial::Caputo), false)?;
     let (reached, coarse) = multistart_without_history(&few, course)?;
     let (reached, coarse) = (merge_duplicates(&reached, is_same_optimum), coarse.with_problem(&free.problem));
-    let laps = RungExecutor { starts: reached.len(), threads: course.threads, told: None };
+    let laps = RungExecutor { starts: reached.len(), threads: course.threads, listener: None };
     let ends = laps.run_each(free, &coarse, &reached, 0)?;
     let levels: Vec<f64> =
         ends.iter().map(|end| end.as_ref().map_or(f64::INFINITY, Candidate::cost_per_residual)).collect();
@@ -373,7 +373,7 @@ pub(super) fn optimize_on_coarse_grids(
     starts: &[Candidate],
     threads: usize,
 ) -> Result<Vec<Candidate>> {
-    let laps = RungExecutor { starts: starts.len(), threads, told: None };
+    let laps = RungExecutor { starts: starts.len(), threads, listener: None };
     let mut coarse = coarse.clone();
     let mut ended = laps.run(free, &coarse, starts, FIRST_BUDGET_EVALUATIONS)?;
     while coarse.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && ended.is_empty() {
