@@ -504,3 +504,17 @@ def test_residuals_of_a_warm_start_are_in_units_of_its_noise():
     noisy = {**joint.noise, "y": 1.009 * joint.noise["y"]}
     near = fit_output_error([run], replace(structure, initial="rest"), near=replace(joint, noise=noisy))
     assert np.sqrt(np.mean(near.residuals[0]["y"] ** 2)) == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("mean", [0.0, 50.0])
+def test_runs_in_motion_at_a_level_have_the_gain_of_the_plant(mean):
+    # Sampled 3/(s + 2); without the level, the fit ends at residuals whose color hides it.
+    step, rows, before, pole = 0.05, 800, 637, np.exp(-0.1)
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 3])
+        u = mean + np.cumsum(rng.standard_normal(before + rows))
+        y = lfilter([0.0, 1.5 * (1 - pole)], [1.0, -pole], u)[before:]
+        noisy = y + 20 + 0.02 * np.std(y) * rng.standard_normal(rows)
+        run = ftlm.Run.from_arrays(step=step, inputs={"u": u[before:]}, outputs={"y": noisy})
+        got = ftlm.identify(run, ftlm.equation("D y = a y + b u")).coefficients
+        assert got["b"] / -got["a"] == pytest.approx(1.5, rel=0.05), seed

@@ -263,11 +263,14 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, s
 def _shows_level(fit: Fit) -> bool:
     """Whether a fit with nonzero initial conditions, which rest at a level may have caused, is to be tried with one.
 
-    The mean of an output is large against its deviation, or the residuals are: such an optimum is near no other one.
+    The mean of an output is large against its deviation, or the residuals are, or these have the color of a start that
+    leaves something out: such an optimum is near no other one, and the color of its residuals hides an offset.
     """
     joint = fit.joint
     if joint is None or joint.initial == "rest" or fit.task.structure.initial != "auto":
         return False
+    if has_colored_residuals(joint):
+        return True
     for output, noise in joint.noise.items():
         values = [drop_missing(run[output]) for run in fit.task.runs]
         if any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values):
