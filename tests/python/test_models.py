@@ -206,6 +206,13 @@ def test_equation_is_read(text, output, order, terms):
         ("D^1.5 y = a y + § u", 17, "'§' at character 17 has no meaning there"),
         ("D^1.5 y = a * * y", 15, "expected the name of a signal at character 15, found '*'"),
         ("D^1.5 y = a D D y", 15, "expected the name of a signal at character 15, found 'D'"),
+        # A column called D.
+        (
+            "D D = a D + b u",
+            3,
+            "at character 3, found 'D'; D is the derivative in an equation: give a signal of this name",
+        ),
+        ("D y = a y + b D", 16, "at character 16, found 'the end'; D is the derivative in an equation"),
         ("D^1.5 y = / u", 11, "expected the name of a signal at character 11, found '/'"),
         ("= a y", 1, "expected the name of a signal at character 1, found '='"),
         ("3 y = a u", 0, "its left-hand side has no derivative; write it as in 'D^1.5 y = …'"),

@@ -176,6 +176,11 @@ class EquationParser:
         kind, value, at = self._peek()
         if kind == "symbol" and value in ",:'":
             return self._error(f"{value!r} at character {at + 1} has no meaning there")
+        if value == "D" or (wanted == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
+            return self._error(
+                f"expected {wanted} at character {at + 1}, found {value!r}; D is the derivative in an equation: give a "
+                "signal of this name another one, for column D by -y y=D, or by outputs={'y': 'D'} in Python"
+            )
         return self._error(
             f"expected {wanted} at character {at + 1}, found {value!r}; "
             "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
