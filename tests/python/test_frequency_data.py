@@ -696,6 +696,8 @@ def test_impedances_are_read_as_instruments_write_them(tmp_path, form):
 def test_two_tables_in_a_file_are_refused_with_the_line_of_the_second(tmp_path):
     table = "freq,re,im\n" + "".join(f"{k},1,-{k}\n" for k in range(1, 9))
     (tmp_path / "two.csv").write_text(f"{table}\n{table}")
-    words = "a table ends above line 11, and line 12 is a row of another one; keep one table in a file"
+    words = (
+        "a table ends above line 11, and line 12 is a row of another one; save the lines from 11 on as a second file"
+    )
     with pytest.raises(ftlm.DataError, match=words):
         ftlm.load_frequency(tmp_path / "two.csv")

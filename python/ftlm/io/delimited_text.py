@@ -308,8 +308,8 @@ def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
     cells = split_cells([line], found.separator, source, at)[0]
     if len(cells) == found.width and all(is_number(c, comma=found.comma, mark=found.mark) for c in cells):
         raise DataError(
-            f"{source}: a table ends above line {rows.footer[0]}, and line {at} is a row of another one; keep one "
-            "table in a file"
+            f"{source}: a table ends above line {rows.footer[0]}, and line {at} is a row of another one; save the "
+            f"lines from {rows.footer[0]} on as a second file, and give both files as two runs"
         )
 
 
