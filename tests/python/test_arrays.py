@@ -12,6 +12,7 @@ import public
 from ftlm import analysis, control, kernels, plot, rig
 from ftlm.data.sampling import NonuniformSamples
 from ftlm.sklearn import FractionalRegressor
+from ftlm.svg.figure import Figure
 from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, as_array, as_complex, as_floats
 
 N, STEP, FILL = 64, 0.05, 9999.0
@@ -165,18 +166,18 @@ CALLS = {
     "plot.bode": [(lambda x: plot.bode(MODEL, x), W)],
     "plot.impulse": [(lambda x: plot.impulse(MODEL, x), T)],
     "plot.step": [(lambda x: plot.step(MODEL, x), T)],
-    "plot.svg_bar_chart": [
-        (lambda x: plot.svg_bar_chart([str(k) for k in range(N)], [("a", x)], title="", x_label="y"), T)
+    "plot.BarChart.__init__": [
+        (lambda x: plot.BarChart([str(k) for k in range(N)], [("a", x)], title="", x_label="y"), T)
     ],
     "plot.svg_bode_charts": [(lambda x: plot.svg_bode_charts(MODEL, x), W)],
-    "plot.svg_correlation_map": [(lambda x: plot.svg_correlation_map(["a", "b"], x, title=""), np.eye(2))],
+    "plot.CorrelationMap.__init__": [(lambda x: plot.CorrelationMap(["a", "b"], x, title=""), np.eye(2))],
     "plot.svg_histogram": [(lambda x: plot.svg_histogram(x, title="", x_label="x"), U)],
-    "plot.svg_line_chart": [
-        (lambda x: plot.svg_line_chart(x, [("y", U)], title="", x_label="x", y_label="y"), T),
-        (lambda x: plot.svg_line_chart(T, [("y", x)], title="", x_label="x", y_label="y"), U),
-        (lambda x: plot.svg_line_chart(T, [("y", U)], title="", x_label="x", y_label="y", bands=[(x, U)]), U),
+    "plot.LineChart.__init__": [
+        (lambda x: plot.LineChart(x, [("y", U)], title="", x_label="x", y_label="y"), T),
+        (lambda x: plot.LineChart(T, [("y", x)], title="", x_label="x", y_label="y"), U),
+        (lambda x: plot.LineChart(T, [("y", U)], title="", x_label="x", y_label="y", bands=[(x, U)]), U),
     ],
-    "plot.svg_plane_chart": [(lambda x: plot.svg_plane_chart(x, title="", x_label="x", y_label="y"), -1 + 1j * W)],
+    "plot.PlaneChart.__init__": [(lambda x: plot.PlaneChart(x, title="", x_label="x", y_label="y"), -1 + 1j * W)],
     "rig.Rig.run": [(commanded, np.zeros((5, 2)))],
     "rig.Streaming.push": [(stream, np.stack([U, T], axis=1))],
     "rig.control": [(lambda x: rig.control(lambda *_: (0.1, 0.0), x), np.zeros((50, 2)))],
@@ -215,6 +216,8 @@ def answer(call, values):
         found = call(values)
     except ValueError as error:
         return type(error).__name__
+    if isinstance(found, Figure):
+        return [found.svg, found.narrow, found.note]
     if isinstance(found, ftlm.Run):
         readings = found.sample_times.data if isinstance(found.sample_times, NonuniformSamples) else {}
         return [[found[n] for n in found.signals], [readings[n] for n in readings]]

@@ -52,7 +52,11 @@ def test_a_fit_is_the_comparison(found, small_run):
 
 def test_residuals_are_the_tests(found):
     figure = saved(ftlm.plot.residuals(found))
-    assert [a.get_title().partition(":")[0] for a in figure.axes] == ["y with itself", "y with u"]
+    tests = found.residuals.outputs["y"]
+    assert [a.get_title() for a in figure.axes] == [
+        f"Residual of y with itself, {tests.whiteness.verdict}",
+        f"Residual of y with u, {tests.inputs['u'].verdict}",
+    ]
     segments = figure.axes[1].collections[0].get_segments()
     np.testing.assert_allclose([s[1][1] for s in segments], found.residuals.outputs["y"].inputs["u"].values)
     assert len(ftlm.plot.residuals(found.residuals).axes) == 2

@@ -23,10 +23,10 @@ from ftlm.report.html_report import settings_table
 from ftlm.report.typesetting import equation_html, parameter_table
 from ftlm.reproduction.demo import PaperRow, paper_row, paper_table, paper_table_text
 from ftlm.svg import figure as axes
-from ftlm.svg.charts import bar_chart, correlation_map, heat_map, histogram, plane_chart
+from ftlm.svg.charts import BarChart, CorrelationMap, PlaneChart, histogram
 from ftlm.svg.figure import LINE_HEIGHT_PX
 from ftlm.svg.html_page import ReportMixin
-from ftlm.svg.line_chart import line_figure
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils import formatting as words
 from ftlm.utils.formatting import number
 from ftlm.validation.comparison import errors_table
@@ -211,7 +211,7 @@ def test_hostile_names_are_inert(tmp_path, page):
     assert "square " + HOSTILE in " ".join(Page(page).text)
     assert page.count("<script") == 1
     assert "onload=alert(1)>" not in page
-    chart = line_figure([0, 1], [(HOSTILE, [0, 1])], title=HOSTILE, x_label=HOSTILE, y_label=HOSTILE)
+    chart = LineChart([0, 1], [(HOSTILE, [0, 1])], title=HOSTILE, x_label=HOSTILE, y_label=HOSTILE)
     table = report.Table(HOSTILE, (HOSTILE, "n"), [(HOSTILE, 1.0)], ((HOSTILE, 2),), {0: HOSTILE}, HOSTILE)
     section = report.Section(HOSTILE, [HOSTILE], [HOSTILE], [table], [chart])
     text = written(tmp_path, section, lead=HOSTILE)
@@ -287,9 +287,8 @@ def test_the_landscape_is_the_search(small_run, with_noise):
         assert drawn.scores[i, j] == row.score
     finite = np.isfinite(drawn.scores)
     assert finite.sum() == sum(np.isfinite(r.score) for r in found.table)
-    chart = heat_map(drawn)
-    Page(chart.svg)
-    assert "Best: α = " in chart.caption
+    Page(drawn.svg)
+    assert "Best: α = " in drawn.caption
     with pytest.raises(ftlm.ModelError, match="two different orders"):
         landscape(run, structure, found, lattice, orders=("alpha", "alpha"))
 
@@ -569,7 +568,7 @@ def paths_of(svg):
 def test_drawn_line_is_the_data():
     x = np.linspace(0, 10, 400)
     y = np.sin(x) * np.exp(-x / 5)
-    chart = line_figure(x, [("y", y)], title="t", x_label="x", y_label="y")
+    chart = LineChart(x, [("y", y)], title="t", x_label="x", y_label="y")
     (strokes,) = paths_of(chart.svg)
     assert len(strokes) == 1
     drawn = strokes[0]
@@ -577,7 +576,7 @@ def test_drawn_line_is_the_data():
     fitted = np.polyfit(drawn[:, 1], y, 1)
     np.testing.assert_allclose(np.polyval(fitted, drawn[:, 1]), y, atol=2e-3)
     assert fitted[0] < 0  # up is up
-    assert not chart.caption
+    assert not chart.note
 
 
 def test_what_is_not_finite_leaves_a_gap_and_is_said():
@@ -585,20 +584,20 @@ def test_what_is_not_finite_leaves_a_gap_and_is_said():
     y = x.copy()
     y[40:50], y[70] = np.nan, np.inf
     y[90:] = 1e305  # beyond what can be drawn
-    chart = line_figure(x, [("y", y)], title="t", x_label="time [s]", y_label="y", caption="Words.")
+    chart = LineChart(x, [("y", y)], title="t", x_label="time [s]", y_label="y", caption="Words.")
     (strokes,) = paths_of(chart.svg)
     assert [len(s) for s in strokes] == [40, 20, 19]
-    assert chart.caption.startswith("Words. y: 21 of 100 values are not finite (first at time [s] = 40)")
+    assert chart.note.startswith("Words. y: 21 of 100 values are not finite (first at time [s] = 40)")
     assert "nan" not in chart.svg
     assert "inf" not in chart.svg
-    nothing = line_figure(x, [("y", np.full(100, np.nan))], title="t", x_label="x", y_label="y")
+    nothing = LineChart(x, [("y", np.full(100, np.nan))], title="t", x_label="x", y_label="y")
     assert paths_of(nothing.svg) == []
     assert "no finite value to draw" in nothing.svg
-    assert "100 of 100" in nothing.caption
+    assert "100 of 100" in nothing.note
 
 
 def test_a_lone_point_is_a_dot():
-    chart = line_figure([0, 1, 2], [("y", [np.nan, 1, np.nan])], title="t", x_label="x", y_label="y")
+    chart = LineChart([0, 1, 2], [("y", [np.nan, 1, np.nan])], title="t", x_label="x", y_label="y")
     assert [len(s) for s in paths_of(chart.svg)[0]] == [1]
 
 
@@ -618,7 +617,7 @@ def test_a_slider_has_samples_and_the_largest_difference_among_them(n):
     rng = np.random.default_rng(n)
     x = 3.0 + np.arange(n) * 0.0017
     y, z = 1e-6 * rng.standard_normal(n), 1e-6 * rng.standard_normal(n)
-    chart = line_figure(
+    chart = LineChart(
         x, [("measured", y), ("simulated", z)], title="t", x_label="time [s]", y_label="y [m]", slider=True
     )
     assert "data-readings" not in chart.narrow
@@ -637,23 +636,23 @@ def test_a_slider_has_samples_and_the_largest_difference_among_them(n):
 def test_a_slider_has_nothing_where_there_is_nothing():
     t, gaps = np.arange(5.0), np.array([1.0, np.nan, np.inf, -1e300, 2e5])
     drawn = {"x_label": "time [s]", "y_label": "y", "title": "t", "slider": True}
-    at, lines, told = read_out(line_figure(t, [("measured", gaps), ("simulated", np.full(5, np.nan))], **drawn))
+    at, lines, told = read_out(LineChart(t, [("measured", gaps), ("simulated", np.full(5, np.nan))], **drawn))
     assert at.tolist() == t.tolist()
     assert np.isnan(lines["simulated"]).all()
     assert np.isnan(lines["measured"]).tolist() == [False, True, True, False, False]
     assert lines["measured"][3] == -1e300
     assert (told["apart"], told["y"]) == (False, "")
     for other in ({"log_x": True}, {"log_y": True}, {"slider": False}):
-        assert "data-readings" not in line_figure(t + 1, [("", t + 1)], **{**drawn, **other}).svg
+        assert "data-readings" not in LineChart(t + 1, [("", t + 1)], **{**drawn, **other}).svg
 
 
 def test_a_run_that_strays_does_not_flatten_the_measured_one():
     x = np.linspace(0, 10, 500)
     measured = np.sin(x)
-    chart = line_figure(x, [("measured", measured), ("simulated", np.exp(3 * x))], title="t", x_label="x", y_label="y")
+    chart = LineChart(x, [("measured", measured), ("simulated", np.exp(3 * x))], title="t", x_label="x", y_label="y")
     heights = np.concatenate(paths_of(chart.svg)[0])[:, 1]
     assert np.ptp(heights) > 100  # tenths of a pixel
-    assert "simulated leaves the axis (to 1.07×10¹³)" in chart.caption
+    assert "simulated leaves the axis (to 1.07×10¹³)" in chart.note
     assert len(chart.svg) < 20_000
 
 
@@ -661,21 +660,21 @@ def test_logarithmic_axis():
     x = np.arange(1, 1001)
     y = 1e4 / x**2.0
     y[5] = 0.0
-    chart = line_figure(x, [("p = 7", y)], title="t", x_label="x", y_label="y", log_y=True)
+    chart = LineChart(x, [("p = 7", y)], title="t", x_label="x", y_label="y", log_y=True)
     (strokes,) = paths_of(chart.svg)
     assert [len(s) for s in strokes] == [5, 994]
     drawn, kept = np.concatenate(strokes), np.delete(y, 5)
     fitted = np.polyfit(drawn[:, 1], np.log10(kept), 1)
     np.testing.assert_allclose(np.polyval(fitted, drawn[:, 1]), np.log10(kept), atol=0.01)
-    assert "0 or less" in chart.caption
+    assert "0 or less" in chart.note
     for low, high in ((0.1, 1000.0), (3.1, 3.9), (2.0, 60.0), (1e-30, 1e40)):
-        small = line_figure([0, 1], [("y", [low, high])], title="t", x_label="x", y_label="y", log_y=True)
+        small = LineChart([0, 1], [("y", [low, high])], title="t", x_label="x", y_label="y", log_y=True)
         assert len(re.findall('text-anchor="end">', small.svg)) >= 3
 
 
 def test_lines_are_told_apart_without_colour():
     lines = [("measured", [0, 1])] + [(f"p = {p}", [p, p]) for p in (1, 3, 5, 7)]
-    chart = line_figure([0, 1], lines, title="t", x_label="x", y_label="y")
+    chart = LineChart([0, 1], lines, title="t", x_label="x", y_label="y")
     assert len(set(re.findall(r'stroke-dasharray="([\d ]+)"', chart.svg))) >= 3
     for name, _ in lines:
         assert f">{name}</text>" in chart.svg
@@ -688,18 +687,18 @@ def test_lines_are_told_apart_without_colour():
 
 def test_extreme_data_still_draw():
     for y in ([0, 0], [5, 5], [-1e299, 1e299], [1e-300, 2e-300], [1, 1 + 1e-15], [0, 5e-324]):
-        chart = line_figure([0, 1], [("y", y)], title="t", x_label="x", y_label="y")
+        chart = LineChart([0, 1], [("y", y)], title="t", x_label="x", y_label="y")
         assert "nan" not in chart.svg
         Page(chart.svg)
-    chart = line_figure([0], [("measured", [1])], title="t", x_label="x", y_label="y")
+    chart = LineChart([0], [("measured", [1])], title="t", x_label="x", y_label="y")
     Page(chart.svg)
 
 
 def test_charts_refuse_what_does_not_fit():
     with pytest.raises(ftlm.DataError, match="at least one line"):
-        line_figure([0, 1], [], title="t", x_label="x", y_label="y")
+        LineChart([0, 1], [], title="t", x_label="x", y_label="y")
     with pytest.raises(ftlm.DataError, match="one length"):
-        line_figure([0, 1], [("y", [1, 2, 3])], title="t", x_label="x", y_label="y")
+        LineChart([0, 1], [("y", [1, 2, 3])], title="t", x_label="x", y_label="y")
 
 
 def test_convergence_and_error_charts(square, identified):
@@ -742,26 +741,26 @@ def test_a_pole_map_has_every_pole_and_its_sector():
     assert "−2.00 + 0j" in slow.svg
     assert pole_charts(ftlm.Model(ftlm.equation("D^2 y = -3 D y + 6 u - 0.5*sign(D y)"))) == []
     with pytest.raises(ftlm.errors.DataError, match="point 1 of 2 is not finite"):
-        plane_chart([1j, complex("nan")], title="t", x_label="x", y_label="y")
+        PlaneChart([1j, complex("nan")], title="t", x_label="x", y_label="y")
     for bad in (0.0, 4.0, -1.0):
         with pytest.raises(ftlm.errors.DataError, match="not an angle"):
-            plane_chart([1j], title="t", x_label="x", y_label="y", sector=bad)
+            PlaneChart([1j], title="t", x_label="x", y_label="y", sector=bad)
 
 
 def test_a_correlation_map_has_every_number():
     values = np.array([[1.0, -0.5], [-0.5, 1.0]])
-    figure = correlation_map(["alpha", HOSTILE], values, title="t")
+    figure = CorrelationMap(["alpha", HOSTILE], values, title="t")
     assert figure.svg.count("−.50") == 2
     assert HOSTILE not in figure.svg
     assert "The largest" in figure.svg
-    assert "–" in correlation_map(["a", "b"], [[1, np.nan], [np.nan, 1]], title="t").svg
+    assert "–" in CorrelationMap(["a", "b"], [[1, np.nan], [np.nan, 1]], title="t").svg
     for names, bad, message in (
         (["a"], values, "shape"),
         ([], np.zeros((0, 0)), "shape"),
         (["a", "b"], 3 * values, "beyond 1"),
     ):
         with pytest.raises(ftlm.errors.DataError, match=message):
-            correlation_map(names, bad, title="t")
+            CorrelationMap(names, bad, title="t")
 
 
 def test_a_histogram_counts_every_value():
@@ -791,7 +790,7 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
     assert HOSTILE not in figures[0].svg
     widths = [float(w) for w in re.findall(r'<rect class="shade1"[^>]* width="([\d.]+)"', figures[1].svg)]
     assert widths[0] == widths[1] > 0
-    below = bar_chart(["a", "b"], [("fit", [-50.0, np.nan])], title="t", x_label="x", high=100.0)
+    below = BarChart(["a", "b"], [("fit", [-50.0, np.nan])], title="t", x_label="x", high=100.0)
     assert "−50.00" in below.svg
     assert "–" in below.svg
     for bad, message in (
@@ -802,7 +801,7 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
             compared_bars(bad)
     for names, groups in (([], [("a", [])]), (["x"], []), (["x"], [("a", [1.0])] * 6), (["x"], [("a", [1.0, 2.0])])):
         with pytest.raises(ftlm.errors.DataError, match=r"names|shape"):
-            bar_chart(names, groups, title="t", x_label="x")
+            BarChart(names, groups, title="t", x_label="x")
 
 
 def test_residuals_over_time_are_those_of_the_comparison(identified):

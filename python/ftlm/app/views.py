@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -222,10 +223,10 @@ def model_summary(made: FittedModel) -> dict[str, Any]:
     }
 
 
-def figure_markup(figures: list[Figure]) -> list[dict[str, str]]:
+def figure_markup(figures: Sequence[Figure]) -> list[dict[str, str]]:
     """Return the markup of figures for wide and narrow screens."""
     return [
-        {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.caption}
+        {"title": f.title, "wide": str(f.svg), "narrow": str(f.narrow), "caption": f.note}
         for f in figures[:MAX_FIGURES]
     ]
 

@@ -26,10 +26,10 @@ from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter, parameter_estimates, parameter_frame
 from ftlm.structure.circuit import Circuit
 from ftlm.structure.order import MAX_IMPROPER_ORDER
-from ftlm.svg.charts import locus_chart
+from ftlm.svg.charts import PlaneChart
 from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.html_page import Section, Table, write_page
-from ftlm.svg.line_chart import LineChart, line_figure
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import Cell, attributes, format_bound, number, symbol, wrap_text
 from ftlm.utils.parameters import choose_text, parameter
@@ -85,13 +85,15 @@ def frequency_chart(
     return LineChart(
         omega,
         lines,
-        title,
+        title=title,
         x_label="frequency [rad/s]",
         y_label=label,
         caption="" if half_width is None else "Shade: 95 % band, from the covariance of the fit.",
         bands=[] if half_width is None else [(values - half_width, values + half_width)],
         log_x=True,
         dots=("measured",),
+        width=SMALL_WIDTH_PX,
+        height=220,
     )
 
 
@@ -132,30 +134,27 @@ def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineCh
     )
 
 
-def nyquist_curves(model: Model | Circuit, record: FrequencyData) -> tuple[Complex, Complex, str, str]:
-    """Return the responses of the model and a record and both axis labels; impedances have -Im upwards."""
-    response = model_response(model, record, curve_frequencies(record))
+def nyquist_chart(model: Model | Circuit, record: FrequencyData) -> PlaneChart:
+    """Return the Nyquist chart of a record and the model; impedances have -Im upwards."""
+    response, measured = model_response(model, record, curve_frequencies(record)), record.response
     unit = f" [{record.unit}]" if record.unit else ""
-    if is_impedance(record):
-        return response.conj(), record.response.conj(), f"Re Z{unit}", f"−Im Z{unit}"
-    return response, record.response, f"real part{unit}", f"imaginary part{unit}"
-
-
-def nyquist_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
-    """Return the Nyquist chart of a record and the model."""
-    curve, points, x_label, y_label = nyquist_curves(model, record)
-    title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: Nyquist"
-    return locus_chart(curve, points, title=title, x_label=x_label, y_label=y_label)
+    impedance = is_impedance(record)
+    return PlaneChart(
+        measured.conj() if impedance else measured,
+        curve=response.conj() if impedance else response,
+        title=f"{symbol(record.output)} from {symbol(record.input)}, {record.name}: Nyquist",
+        x_label=f"Re Z{unit}" if impedance else f"real part{unit}",
+        y_label=f"−Im Z{unit}" if impedance else f"imaginary part{unit}",
+    )
 
 
 def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
     """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
-    bode = [chart.small_figure() for chart in record_charts(model, record)]
-    nyquist = nyquist_figure(model, record)
+    bode, nyquist = record_charts(model, record), nyquist_chart(model, record)
     return [nyquist, *bode] if is_impedance(record) else [*bode, nyquist]
 
 
-def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> Figure:
+def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> LineChart:
     """Return the chart of the residuals relative to the measured response, by frequency."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
@@ -163,7 +162,7 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> F
     size = np.abs(record.response[order])
     missed = 100.0 * (response - record.response[order]) / np.where(size > 0, size, np.max(size) or 1.0)
     hertz = is_impedance(record)
-    return line_figure(
+    return LineChart(
         omega / (2.0 * math.pi) if hertz else omega,
         [("real part", missed.real), ("imaginary part", missed.imag)],
         log_x=True,

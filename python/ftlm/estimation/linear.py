@@ -29,8 +29,7 @@ from ftlm.simulation.discretization import (
 from ftlm.simulation.nonlinear_columns import has_derivative_channels
 from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Initial, Structure
-from ftlm.svg.figure import Figure
-from ftlm.svg.line_chart import line_figure
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Floats, check_integer
@@ -284,7 +283,7 @@ def multi_innovation_trace(
 
 
 @check_arguments
-def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> Figure:
+def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> LineChart:
     """Draw the simulation error (45) after every step of the recursion (44), as in Figure 4(b).
 
     Parameters
@@ -309,7 +308,7 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
             raise DataError(
                 f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same {parameter('every')}"
             )
-    return line_figure(
+    return LineChart(
         steps,
         [(name, trace.error) for name, trace in traces],
         title=title,

@@ -29,14 +29,15 @@ from ftlm.plot.matplotlib_figures import (
 from ftlm.plot.model_charts import bode_charts as svg_bode_charts
 from ftlm.plot.model_charts import pole_charts as svg_pole_charts
 from ftlm.plot.model_charts import response_charts as svg_response_charts
-from ftlm.svg.charts import bar_chart as svg_bar_chart
-from ftlm.svg.charts import correlation_map as svg_correlation_map
-from ftlm.svg.charts import heat_map as svg_heat_map
+from ftlm.svg.charts import BarChart, CorrelationMap, PlaneChart
 from ftlm.svg.charts import histogram as svg_histogram
-from ftlm.svg.charts import plane_chart as svg_plane_chart
-from ftlm.svg.line_chart import line_figure as svg_line_chart
+from ftlm.svg.line_chart import LineChart
 
 __all__ = [
+    "BarChart",
+    "CorrelationMap",
+    "LineChart",
+    "PlaneChart",
     "bode",
     "correlated_orders",
     "correlation",
@@ -52,19 +53,14 @@ __all__ = [
     "response",
     "run",
     "step",
-    "svg_bar_chart",
     "svg_bode_charts",
     "svg_compared_bars",
     "svg_comparison_charts",
-    "svg_correlation_map",
     "svg_error_chart",
-    "svg_heat_map",
     "svg_histogram",
     "svg_input_charts",
     "svg_landscape",
-    "svg_line_chart",
     "svg_output_error_landscape",
-    "svg_plane_chart",
     "svg_pole_charts",
     "svg_residual_charts",
     "svg_residual_series",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -12,9 +11,9 @@ from ftlm.analysis.frequency_response import covariance_of, parameter_vector, wi
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError
 from ftlm.model.model import Model
-from ftlm.svg.charts import bar_chart, histogram
-from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figure, Figures
-from ftlm.svg.line_chart import LineChart, line_figure
+from ftlm.svg.charts import BarChart, histogram
+from ftlm.svg.figure import MAX_LINE_POINTS, SMALL_WIDTH_PX, Figures
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.statistics import NORMAL_95
@@ -43,7 +42,7 @@ def comparison_charts(
     label: str = "",
     points: int = MAX_LINE_POINTS,
     bands: Mapping[str, Band] | None = None,
-) -> list[Figure]:
+) -> list[LineChart]:
     """Chart measured and simulated output, for every output of every run.
 
     Parameters
@@ -61,7 +60,7 @@ def comparison_charts(
     """
     known = bands or {}
     return [
-        line_figure(
+        LineChart(
             pulse_times(comparison, k),
             [("measured", comparison.measured[name][k]), ("simulated", comparison.simulated[name][k])],
             title=f"{symbol(name)}, {f'{label}: ' if label else ''}{run}",
@@ -85,7 +84,7 @@ def _behind_measured(band: Band) -> list[Band]:
 
 
 @check_arguments
-def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = MAX_LINE_POINTS) -> list[Figure]:
+def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = MAX_LINE_POINTS) -> list[LineChart]:
     """Inputs of every run, to stand below its outputs.
 
     Parameters
@@ -97,26 +96,29 @@ def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = M
     points
         Most points of a line.
     """
-    return [
-        line_figure(
-            run.time,
-            [(f"input {symbol(name)}", run[name])],
-            x_label="time [s]",
-            title=f"Input {symbol(name)}, {run.name}",
-            y_label=with_unit(symbol(name), run.units, name),
-            points=points,
-            height=180,
-        )
-        for run in runs
-        for name in signals
-        if name in run.inputs
-    ]
+    return [signal_chart(run, name, points=points) for run in runs for name in signals if name in run.inputs]
+
+
+def signal_chart(run: Run, name: str, *, points: int = MAX_LINE_POINTS) -> LineChart:
+    """Return the chart of one signal of a run over time."""
+    is_input = name in run.inputs
+    return LineChart(
+        run.time,
+        [("", run[name])],
+        title=f"{symbol(name)}, {'input' if is_input else 'output'} of {run.name}",
+        x_label="time [s]",
+        y_label=with_unit(symbol(name), run.units, name),
+        points=points,
+        height=180 if is_input else 240,
+        # A command is held until the next row: a straight line to it was never sent.
+        steps=run.intersample.get(name) == "zoh",
+    )
 
 
 @check_arguments
 def residual_series(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
-) -> list[Figure]:
+) -> list[LineChart]:
     """Chart residuals of the simulation over time and their histogram, for every output of every run.
 
     Parameters
@@ -124,35 +126,42 @@ def residual_series(
     comparison, units, label, points
         See :func:`comparison_charts`.
     """
-    figures = []
+    rows = residual_rows(comparison, units=units, label=label, points=points)
+    return [chart for row in rows for chart in row]
+
+
+def residual_rows(
+    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
+) -> list[list[LineChart]]:
+    """Return the charts of :func:`residual_series`, a row for every output of every run."""
+    rows = []
     suffix = f", {label}" if label else ""
     for k, (run, _, _) in enumerate(comparison.per_run):
         for name in comparison.output_error:
             missed = comparison.measured[name][k] - comparison.simulated[name][k]
             what = f"Residual of {symbol(name)}{suffix}, {run}"
             axis = with_unit(f"residual of {symbol(name)}", units, name)
-            figures.append(
-                line_figure(
-                    pulse_times(comparison, k),
-                    [("", missed)],
-                    title=f"{what}: over time",
-                    x_label="time [s]",
-                    y_label=axis,
-                    points=points,
-                    width=SMALL_WIDTH_PX,
-                    height=190,
-                )
+            over_time = LineChart(
+                pulse_times(comparison, k),
+                [("", missed)],
+                title=f"{what}: over time",
+                x_label="time [s]",
+                y_label=axis,
+                points=points,
+                width=SMALL_WIDTH_PX,
+                height=190,
             )
+            rows.append([over_time])
             if np.sum(np.isfinite(missed)) >= 2:
                 words = "Line: the normal curve of the same mean and deviation."
-                figures.append(histogram(missed, title=f"{what}: how often", x_label=axis, caption=words))
-    return figures
+                rows[-1].append(histogram(missed, title=f"{what}: how often", x_label=axis, caption=words))
+    return rows
 
 
 @check_arguments
 def compared_bars(
     compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the simulation"
-) -> list[Figure]:
+) -> list[BarChart]:
     """Chart the fits of several models side by side, for every output.
 
     Parameters
@@ -176,7 +185,7 @@ def compared_bars(
         if [kind for kind, _ in parts] != kinds or any(list(c.output_error) != outputs for _, c in parts):
             raise DataError(f"model {name!r} has other outputs or data than {first[0]!r}; compare like with like")
     return [
-        bar_chart(
+        BarChart(
             [name for name, _ in compared],
             [(kind, [parts[i][1].output_error[o].fit for _, parts in compared]) for i, kind in enumerate(kinds)],
             title=f"{title} of {symbol(o)}",
@@ -198,7 +207,7 @@ def error_chart(
     title: str = "",
     units: Mapping[str, str] | None = None,
     points: int = MAX_LINE_POINTS,
-) -> Figure:
+) -> LineChart:
     """Chart the absolute simulation errors of several models on one run, as in the paper's Figure 4(a).
 
     Parameters
@@ -233,7 +242,7 @@ def error_chart(
             raise DataError(f"comparison {name!r} has no run {short_repr(run)}; give 0 to {count - 1}")
     run = index or 0
     errors = [(name, np.abs(c.measured[output][run] - c.simulated[output][run])) for name, c in compared]
-    return line_figure(
+    return LineChart(
         pulse_times(compared[0][1], run),
         errors,
         title=title or f"{symbol(output)}: absolute error of the simulation",
@@ -250,7 +259,7 @@ def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
 
 
 @check_arguments
-def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
+def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
     """Chart autocorrelation and cross-correlations of the residuals of every output, with 99 % bands.
 
     Parameters
@@ -260,39 +269,27 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
     label
         Role of the data, such as "validation".
     """
-    suffix = f", {label}" if label else ""
-    return [
-        replace(chart, title=f"Residual of {chart.title}{suffix}").small_figure(190)
-        for charts in correlation_charts(tests)
-        for chart, _ in charts
-    ]
+    return [correlation_chart(*each, label=label) for each in tests.tests]
 
 
-def correlation_charts(tests: Residuals) -> list[list[tuple[LineChart, CorrelationTest]]]:
-    """Return the charts of the correlations of every output's residuals with themselves and each input."""
-    return [
-        [_correlation_chart(output, *each) for each in [("itself", judged.whiteness), *judged.inputs.items()]]
-        for output, judged in tests.outputs.items()
-    ]
-
-
-def _correlation_chart(output: str, name: str, test: CorrelationTest) -> tuple[LineChart, CorrelationTest]:
-    own = name == "itself"
+def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label: str = "") -> LineChart:
+    """Return the chart of the correlations of an output's residual with a signal; an empty signal is itself."""
     # Lag 0 of an autocorrelation is 1 and says nothing.
-    keep = test.lags != 0 if own else np.ones(test.lags.size, dtype=bool)
-    lags, values = test.lags[keep].astype(np.float64), test.values[keep]
-    band = np.full(lags.size, test.band)
-    chart = LineChart(
-        lags,
+    keep = test.lags != 0 if not signal else np.ones(test.lags.size, dtype=bool)
+    values = test.values[keep]
+    band = np.full(values.size, test.band)
+    return LineChart(
+        test.lags[keep].astype(np.float64),
         [("", values)],
-        f"{symbol(output)} with {'itself' if own else symbol(name)}",
+        title=f"Residual of {symbol(output)} with {symbol(signal) or 'itself'}{f', {label}' if label else ''}",
         x_label="lag [samples]",
         y_label="correlation",
-        caption=_residual_caption(test, values, "" if own else symbol(name)),
+        caption=_residual_caption(test, values, symbol(signal)),
         bands=[(-band, band)],
         stems=True,
+        width=SMALL_WIDTH_PX,
+        height=190,
     )
-    return chart, test
 
 
 def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
@@ -318,26 +315,7 @@ def run_charts(run: Run, *signals: str) -> Figures:
     unknown = [name for name in signals if name not in run]
     if unknown:
         raise DataError(f"signal {unknown[0]!r} is not in run {run.name!r}; its signals are {', '.join(run.signals)}")
-    charts = []
-    for name in signals or (*run.outputs, *run.inputs):
-        unit = run.units[name]
-        role = "input" if name in run.inputs else "output"
-        # A command is held until the next row: a straight line to it was never sent.
-        times, values = run.time, run[name]
-        if run.intersample.get(name) == "zoh":
-            times, values = times.repeat(2)[1:], values.repeat(2)[:-1]
-        charts.append(
-            line_figure(
-                times,
-                [("", values)],
-                title=f"{symbol(name)}, {role} of {run.name}",
-                x_label="time [s]",
-                y_label=f"{symbol(name)} [{unit}]" if unit else symbol(name),
-                points=MAX_LINE_POINTS,
-                height=240 if role == "output" else 180,
-            )
-        )
-    return Figures(charts)
+    return Figures(signal_chart(run, name) for name in signals or (*run.outputs, *run.inputs))
 
 
 def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str, Band]:

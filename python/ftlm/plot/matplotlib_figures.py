@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib
 import io
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import groupby, islice
 from typing import Any
 
 import numpy as np
@@ -20,35 +22,36 @@ from ftlm.estimation.frequency_result import (
     FrequencyIdentification,
     FrequencyValidation,
     assign_signals,
-    nyquist_curves,
+    nyquist_chart,
     record_charts,
 )
 from ftlm.estimation.result import Identification
 from ftlm.experiment_design.result import DesignedInput
 from ftlm.model.model import Model
 from ftlm.order_search.search import landscape as scores_of
-from ftlm.plot.comparison_charts import correlation_charts, pulse_times, with_unit
-from ftlm.plot.model_charts import (
-    TimeResponse,
-    bode_curves,
-    bode_line_charts,
-    pole_points,
-    response_frequencies,
-    response_line_chart,
+from ftlm.plot.comparison_charts import (
+    comparison_charts,
+    correlation_chart,
+    residual_rows,
+    signal_chart,
 )
+from ftlm.plot.model_charts import TimeResponse, bode_charts, pole_charts, response_chart
 from ftlm.structure.circuit import Circuit
-from ftlm.svg.charts import Landscape
+from ftlm.svg.charts import BarChart, CorrelationMap, Landscape, PlaneChart
+from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import LINE_STYLES, LineChart, line_styles
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import optional_module
-from ftlm.utils.validation import as_array, as_floats
+from ftlm.utils.validation import as_array
 from ftlm.validation.comparison import Comparison
 from ftlm.validation.residual_tests import Residuals
 
 #: Width of a figure and height of one row of axes [inch]; the width is a journal's double column.
 FIGURE_WIDTH_INCH, ROW_HEIGHT_INCH = 7.0, 2.2
+#: Height of a legend over the lines, as a share of the plot.
+LEGEND_HEIGHT_SHARE = 0.25
 #: Resolution in a notebook.
 NOTEBOOK_DPI = 110
 
@@ -85,42 +88,136 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     return given[0].figure, given.reshape(rows, columns)
 
 
+def draw_figure(rows: Sequence[Sequence[Figure]], ax: Any, **options: Any) -> Any:
+    """Draw rows of charts into the given axes or a new figure, and return the figure."""
+    figure, axes = axes_for(ax, max(len(rows), 1), max((len(row) for row in rows), default=1), **options)
+    for row, charts in zip(axes, rows, strict=False):
+        for axis, chart in zip(row, charts, strict=False):
+            draw_chart(axis, chart)
+        for axis in row[len(charts) :]:
+            axis.set_axis_off()
+    return figure
+
+
 def escape_math(text: str) -> str:
-    """Escape text for matplotlib's math mode."""
-    return text.replace("$", r"\$")
+    """Return text for matplotlib, whose math mode is used for powers alone."""
+    return re.sub(r"((?<!\w)\w|)\^([\d.]+)", r"$\1^{\2}$", text.replace("$", r"\$"))
 
 
-def label_of(name: str, units: Mapping[str, str]) -> str:
-    """Return a signal's symbol with its unit."""
-    return escape_math(with_unit(symbol(name), units, name))
+def draw_chart(axis: Any, chart: Figure) -> None:
+    """Draw a chart of a page into axes."""
+    axis.set_title(escape_math(chart.title), fontsize="small")
+    if isinstance(chart, LineChart):
+        _draw_lines(axis, chart)
+    elif isinstance(chart, PlaneChart):
+        _draw_plane(axis, chart)
+    elif isinstance(chart, BarChart):
+        _draw_bars(axis, chart)
+    elif isinstance(chart, CorrelationMap):
+        _draw_correlations(axis, chart)
+    elif isinstance(chart, Landscape):
+        _draw_landscape(axis, chart)
 
 
-def draw_chart(axis: Any, chart: LineChart) -> None:
-    """Draw a chart of lines into axes."""
+def _draw_lines(axis: Any, chart: LineChart) -> None:
     styles = line_styles(name for name, _ in chart.lines)
+    x = np.asarray(chart.x)
+    if chart.bars is not None:
+        edges, heights = chart.bars
+        axis.bar(edges[:-1], heights, np.diff(edges), align="edge", color=LINE_STYLES[2][0], alpha=0.55)
     # Measured points are below the curves.
     below_first = sorted(zip(chart.lines, styles, strict=True), key=lambda line: line[0][0] not in chart.dots)
     for (name, values), style in below_first:
-        color, label = LINE_STYLES[style][0], escape_math(name) or None
+        color, _, dashes = LINE_STYLES[style]
+        label = escape_math(name) or None
         if chart.stems:
-            axis.vlines(chart.x, 0, values, color=color, linewidth=1.2)
+            axis.vlines(x, 0, values, color=color, linewidth=1.2)
             axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
         elif name in chart.dots:
             there = np.isfinite(values)
-            axis.plot(chart.x[there], values[there], "o", fillstyle="none", markersize=4, color=color, label=label)
+            dots = {"fillstyle": "none", "markersize": 4, "color": color, "label": label}
+            axis.plot(x[there], np.asarray(values)[there], "o", **dots)
         else:
-            axis.plot(chart.x, values, color=color, linewidth=1.2, label=label)
+            dash = (0, [float(length) for length in dashes.split()]) if dashes else "-"
+            drawn = {"drawstyle": "steps-post"} if chart.steps else {}
+            # The measured line is wide enough to show on both sides of one that follows it exactly.
+            width = 2.2 if style == 0 and len(styles) > 1 else 1.0
+            axis.plot(x, values, color=color, linewidth=width, linestyle=dash, label=label, **drawn)
     for (low, high), style in zip(chart.bands, styles, strict=False):
-        axis.fill_between(chart.x, low, high, color=LINE_STYLES[style][0], alpha=0.25, linewidth=0)
-    scales = {"xscale": "log" if chart.log_x else "linear", "yscale": "log" if chart.log_y else "linear"}
-    label_axes(axis, chart.title, xlabel=escape_math(chart.x_label), ylabel=escape_math(chart.y_label), **scales)
+        axis.fill_between(x, low, high, color=LINE_STYLES[style][0], alpha=0.25, linewidth=0)
+    left, right, bottom, top = chart.frame
+    # The legend has its own place above the lines.
+    top += LEGEND_HEIGHT_SHARE * (top - bottom) if any(name for name, _ in chart.lines) else 0.0
+    xlim, ylim = (10.0**left, 10.0**right) if chart.log_x else (left, right), (bottom, top)
+    axis.set(xscale="log" if chart.log_x else "linear", yscale="log" if chart.log_y else "linear")
+    axis.set(xlim=xlim, ylim=(10.0**bottom, 10.0**top) if chart.log_y else ylim)
+    _label_axes(axis, chart.x_label, chart.y_label, loc="upper right", ncols=len(styles))
 
 
-def label_axes(axis: Any, title: str, **labels: Any) -> None:
-    """Set title, labels and grid of one of several axes."""
-    axis.set(**labels)
-    axis.set_title(escape_math(title), fontsize="small")
+def _label_axes(axis: Any, x_label: str, y_label: str, **legend: Any) -> None:
+    """Set the labels, the grid, and a legend of named lines."""
+    axis.set(xlabel=escape_math(x_label), ylabel=escape_math(y_label))
     axis.grid(visible=True, alpha=0.3)
+    axis.set_axisbelow(True)
+    if axis.get_legend_handles_labels()[1]:
+        axis.legend(fontsize="small", **legend)
+
+
+def _draw_plane(axis: Any, chart: PlaneChart) -> None:
+    points, (low, high) = chart.values, chart.corners
+    if chart.line is None:
+        corner = np.array(chart.sector_outline(high.real))
+        axis.fill(corner.real, corner.imag, color=LINE_STYLES[1][0], alpha=0.16, linewidth=0, label="not stable")
+        axis.plot(points.real, points.imag, "x", color=LINE_STYLES[2][0], markersize=8, markeredgewidth=2)
+    else:
+        measured = {"fillstyle": "none", "markersize": 4, "color": LINE_STYLES[0][0], "label": "measured"}
+        axis.plot(points.real, points.imag, "o", **measured)
+        axis.plot(chart.line.real, chart.line.imag, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
+    axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
+    axis.axvline(0, color=LINE_STYLES[0][0], linewidth=0.6)
+    axis.set(xlim=(low.real, high.real), ylim=(low.imag, high.imag))
+    axis.set_aspect("equal")
+    _label_axes(axis, chart.x_label, chart.y_label)
+
+
+def _draw_bars(axis: Any, chart: BarChart) -> None:
+    height, (low, high) = 0.8 / len(chart.tables), chart.ends
+    for i, (name, values) in enumerate(chart.tables):
+        places = np.arange(values.size) + (i - (len(chart.tables) - 1) / 2) * height
+        inside = np.clip(np.nan_to_num(values, nan=low), low, high) - low
+        label = escape_math(name) if len(chart.tables) > 1 else None
+        bars = axis.barh(places, inside, height, low, color=LINE_STYLES[1 + i][0], label=label)
+        axis.bar_label(bars, [f"{v:.4g}" for v in values], fontsize="small", padding=3)
+    axis.set_yticks(range(len(chart.names)), [escape_math(n) for n in chart.names])
+    axis.invert_yaxis()
+    # Beside the longest bar there is room for its number.
+    axis.set(xlim=(low, low + 1.12 * (high - low)))
+    _label_axes(axis, chart.x_label, "")
+
+
+def _draw_correlations(axis: Any, chart: CorrelationMap) -> None:
+    drawn = axis.imshow(chart.matrix, vmin=-1, vmax=1, cmap="RdBu_r")
+    labels = [escape_math(symbol(n)) for n in chart.names]
+    axis.set_xticks(range(len(labels)), labels)
+    axis.set_yticks(range(len(labels)), labels)
+    for i, j in np.ndindex(chart.matrix.shape):
+        if i != j:
+            value = chart.matrix[i, j]
+            ink = "white" if abs(value) > 0.6 else "black"
+            axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize="x-small", color=ink)
+    axis.figure.colorbar(drawn, ax=axis, label="correlation")
+
+
+def _draw_landscape(axis: Any, chart: Landscape) -> None:
+    norm = importlib.import_module("matplotlib.colors").LogNorm()
+    drawn = axis.pcolormesh(chart.x, chart.y, chart.valid_scores, norm=norm, cmap="viridis", shading="nearest")
+    axis.set_facecolor("0.8")
+    row, column = chart.best
+    ring = {"markersize": 9, "fillstyle": "none", "color": LINE_STYLES[1][0], "markeredgewidth": 2}
+    axis.plot(chart.x[column], chart.y[row], "o", **ring)
+    xlabel, ylabel = (escape_math(f"order {symbol(name)}") for name in chart.names)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    axis.figure.colorbar(drawn, ax=axis, label=f"{chart.score} (grey: no candidate, or diverged)")
 
 
 #: Height of a residual plot relative to the fit plot above it.
@@ -173,39 +270,20 @@ def fit(
             comparison = result.comparison
         else:
             raise ModelError("a model alone has nothing to be compared with; give runs")
-    drawn: list[tuple[int, str, str]] = []
     shown = _runs_of(result, runs) if inputs else []
+    pairs = zip(comparison_charts(comparison, units=units), residual_rows(comparison, units=units), strict=True)
+    charts, heights = [], []
     for k in range(len(comparison.per_run)):
-        drawn += [(k, name, kind) for name in comparison.output_error for kind in ("fit", "residual")]
-        drawn += [(k, name, "input") for name in (shown[k].inputs if inputs else ())]
-    heights = [RESIDUAL_HEIGHT_SHARE if kind == "residual" else 1.0 if kind == "fit" else 0.7 for _, _, kind in drawn]
-    figure, axes = axes_for(ax, len(drawn), row=ROW_HEIGHT_INCH * 0.75, height_ratios=heights)
-    upper = None
-    for axis, (k, name, kind) in zip(axes[:, 0], drawn, strict=True):
-        if kind == "input":
-            _line_of(axis, shown[k], name)
-            continue
-        run, _, figures = comparison.per_run[k]
-        time = pulse_times(comparison, k)
-        measured, simulated = comparison.measured[name][k], comparison.simulated[name][k]
-        if kind == "fit":
-            upper = axis
-            label = f"simulated, fit {figures[name].fit:.4g} %"
-            axis.plot(time, measured, color=LINE_STYLES[0][0], linewidth=2.2, label="measured")
-            axis.plot(time, simulated, color=LINE_STYLES[1][0], linewidth=1.0, label=label)
-            # A run that runs away would flatten what it is to be compared with.
-            height = float(np.ptp(measured)) or 1.0
-            low, high = float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height
-            axis.set(ylim=(low, high), ylabel=label_of(name, units))
-            axis.set_title(escape_math(run), fontsize="medium", loc="left")
-            axis.legend(loc="upper right", fontsize="small", ncols=2)
-            axis.tick_params(labelbottom=False)
-            continue
-        if ax is None:
-            axis.sharex(upper)
-        axis.plot(time, measured - simulated, color=LINE_STYLES[2][0], linewidth=0.7)
-        axis.set(ylabel="residual", xlabel="time [s]")
-    return figure
+        for fitted, (lower, *_) in islice(pairs, len(comparison.output_error)):
+            charts += [
+                replace(fitted, title=f"{fitted.title}. {fitted.caption}"),
+                replace(lower, title="", y_label="residual"),
+            ]
+            heights += [1.0, RESIDUAL_HEIGHT_SHARE]
+        own = [signal_chart(shown[k], name) for name in shown[k].inputs] if inputs else []
+        charts += own
+        heights += [0.7] * len(own)
+    return draw_figure([[chart] for chart in charts], ax, row=ROW_HEIGHT_INCH * 0.75, height_ratios=heights)
 
 
 def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None) -> list[Run]:
@@ -216,20 +294,6 @@ def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[R
     if task is None:
         raise ModelError(f"{parameter('inputs', True)} needs the runs; give them")
     return list(task.runs)
-
-
-def _line_of(axis: Any, run: Run, name: str) -> None:
-    """Plot one signal of a run; zero-order-hold inputs as steps."""
-    held = run.intersample.get(name) == "zoh"
-    axis.plot(
-        run.time,
-        run[name],
-        color=LINE_STYLES[2 if name in run.inputs else 0][0],
-        linewidth=1.0,
-        drawstyle="steps-post" if held else "default",
-    )
-    axis.set(ylabel=label_of(name, run.units), xlabel="time [s]")
-    axis.grid(visible=True, alpha=0.3)
 
 
 @check_arguments
@@ -253,12 +317,8 @@ def run(run: Run, *, ax: Any = None) -> Any:
     ModelError
         Something that is not a run, axes that are none or too many or few, or no matplotlib.
     """
-    names = [*run.outputs, *run.inputs]
-    figure, axes = axes_for(ax, len(names), row=ROW_HEIGHT_INCH * 0.6)
-    for axis, name in zip(axes[:, 0], names, strict=True):
-        _line_of(axis, run, name)
-    axes[0, 0].set_title(escape_math(run.name), fontsize="medium", loc="left")
-    return figure
+    charts = [[signal_chart(run, name)] for name in (*run.outputs, *run.inputs)]
+    return draw_figure(charts, ax, row=ROW_HEIGHT_INCH * 0.6)
 
 
 @check_arguments
@@ -285,14 +345,11 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     found = tests.residuals if isinstance(tests, Identification) else tests
     if found is None:
         raise ModelError("the runs were too short for residual tests, so there is nothing to draw")
-    rows = correlation_charts(found)
-    figure, axes = axes_for(ax, len(rows), max(map(len, rows)))
-    for row, charts in zip(axes, rows, strict=True):
-        for axis, (chart, test) in zip(row, charts, strict=False):
-            draw_chart(axis, replace(chart, title=f"{chart.title}: {test.verdict}"))
-        for axis in row[len(charts) :]:
-            axis.set_axis_off()
-    return figure
+    rows = [
+        [correlation_chart(*each, label=each[-1].verdict) for each in tests_of_one]
+        for _, tests_of_one in groupby(found.tests, key=lambda each: each[0])
+    ]
+    return draw_figure(rows, ax)
 
 
 @check_arguments
@@ -332,21 +389,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         found = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
     if found is None:
         raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
-    figure, axes = axes_for(ax, 1, row=3.2)
-    axis = axes[0, 0]
-    scores = np.where(np.isfinite(found.scores) & (found.scores > 0), found.scores, np.nan)
-    if np.all(np.isnan(scores)):
-        raise ModelError("no candidate of this order grid has a finite score; widen it")
-    norm = importlib.import_module("matplotlib.colors").LogNorm()
-    drawn = axis.pcolormesh(found.x, found.y, scores, norm=norm, cmap="viridis", shading="nearest")
-    axis.set_facecolor("0.8")
-    row, column = divmod(int(np.nanargmin(scores)), scores.shape[1])
-    ring = {"markersize": 9, "fillstyle": "none", "color": LINE_STYLES[1][0], "markeredgewidth": 2}
-    axis.plot(found.x[column], found.y[row], "o", **ring)
-    xlabel, ylabel = (escape_math(f"order {symbol(name)}") for name in found.names)
-    axis.set(xlabel=xlabel, ylabel=ylabel)
-    figure.colorbar(drawn, ax=axis, label=f"{found.score} (grey: no candidate, or diverged)")
-    return figure
+    return draw_figure([[found]], ax, row=3.2)
 
 
 @check_arguments
@@ -374,13 +417,8 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     DataError
         Frequencies that are not finite numbers from 0.
     """
-    found = _model_of(model)
-    omega = response_frequencies(found) if w is None else as_floats("w", w)
-    charts = bode_line_charts(omega, bode_curves(found, omega))
-    figure, axes = axes_for(ax, max(len(charts) // 2, 1), 2)
-    for axis, chart in zip(axes.flat, charts, strict=False):
-        draw_chart(axis, chart)
-    return figure
+    charts = bode_charts(_model_of(model), w)
+    return draw_figure([charts[k : k + 2] for k in range(0, len(charts), 2)] or [[], []], ax)
 
 
 def _model_of(model: Model | Identification) -> Model:
@@ -408,25 +446,10 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     ModelError
         Something that is not a model, one with friction or without poles, axes that are none, or no matplotlib.
     """
-    found = _model_of(model)
-    q, points = pole_points(found)
-    if not points.size:
+    charts = pole_charts(_model_of(model))
+    if not charts:
         raise ModelError("this model has no poles to draw: it has friction, or it only integrates")
-    figure, axes = axes_for(ax, 1, row=4.0)
-    axis = axes[0, 0]
-    reach = 1.18 * float(np.max(np.abs(points)))
-    angle = np.linspace(-q * np.pi / 2, q * np.pi / 2, 61)
-    corner = 4 * reach * np.concatenate([[0.0], np.exp(1j * angle)])
-    axis.fill(corner.real, corner.imag, color=LINE_STYLES[1][0], alpha=0.16, linewidth=0, label="not stable")
-    axis.plot(points.real, points.imag, "x", color=LINE_STYLES[2][0], markersize=8, markeredgewidth=2)
-    plane = "s" if q == 1 else f"s^{{{q:.4g}}}"
-    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel=f"real part of ${plane}$", ylabel="imaginary part")
-    axis.set_aspect("equal")
-    axis.axhline(0, color=LINE_STYLES[0][0], linewidth=0.6)
-    axis.axvline(0, color=LINE_STYLES[0][0], linewidth=0.6)
-    axis.grid(visible=True, alpha=0.3)
-    axis.legend(loc="upper left", fontsize="small")
-    return figure
+    return draw_figure([charts], ax, row=4.0)
 
 
 @check_arguments
@@ -464,10 +487,9 @@ def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax:
 
 
 def _response_figure(found: TimeResponse, ax: Any) -> Any:
-    figure, axes = axes_for(ax, len(found.outputs), max(len(found.inputs), 1))
-    for i, j in np.ndindex(axes.shape) if found.inputs else ():
-        draw_chart(axes[i, j], response_line_chart(found, i, j, found.units))
-    return figure
+    inputs = range(len(found.inputs))
+    charts = [[response_chart(found, i, j, found.units) for j in inputs] for i in range(len(found.outputs))]
+    return draw_figure(charts, ax)
 
 
 @check_arguments
@@ -494,19 +516,8 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
         raise ModelError(
             f"method {result.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
         )
-    names, values = result.joint.names, result.joint.correlation
-    figure, axes = axes_for(ax, 1, row=4.0)
-    axis = axes[0, 0]
-    drawn = axis.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
-    labels = [escape_math(symbol(n)) for n in names]
-    axis.set_xticks(range(len(names)), labels)
-    axis.set_yticks(range(len(names)), labels)
-    for i, j in np.ndindex(values.shape):
-        if i != j:
-            ink = "white" if abs(values[i, j]) > 0.6 else "black"
-            axis.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize="x-small", color=ink)
-    figure.colorbar(drawn, ax=axis, label="correlation")
-    return figure
+    chart = CorrelationMap(result.joint.names, result.joint.correlation, title="Correlations of the estimates")
+    return draw_figure([[chart]], ax, row=4.0)
 
 
 @check_arguments
@@ -532,18 +543,8 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
     """
     comparison = result.comparison if isinstance(result, Identification) else result
     units = result.model.units if isinstance(result, Identification) else {}
-    pairs = [(k, name) for k in range(len(comparison.per_run)) for name in comparison.output_error]
-    figure, axes = axes_for(ax, len(pairs), 2, **({} if ax is not None else {"width_ratios": [2.0, 1.0]}))
-    for (left, right), (k, name) in zip(axes, pairs, strict=True):
-        missed = comparison.measured[name][k] - comparison.simulated[name][k]
-        there = missed[np.isfinite(missed)]
-        left.plot(pulse_times(comparison, k), missed, color=LINE_STYLES[2][0], linewidth=0.7)
-        left.set(xlabel="time [s]", ylabel=label_of(name, units))
-        left.set_title(escape_math(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
-        right.hist(there, bins=31, color=LINE_STYLES[2][0], alpha=0.7)
-        right.set(xlabel=label_of(name, units), ylabel="samples")
-        right.locator_params(axis="x", nbins=3)
-    return figure
+    rows = residual_rows(comparison, units=units)
+    return draw_figure(rows, ax, **({} if ax is not None else {"width_ratios": [3.0, 2.0]}))
 
 
 @check_arguments
@@ -575,25 +576,14 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
             raise ModelError(
                 f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}"
             )
-    figure, axes = axes_for(ax, 1, row=max(ROW_HEIGHT_INCH, 0.4 * len(compared) * len(outputs)))
-    axis, height = axes[0, 0], 0.8 / len(outputs)
-    for i, output in enumerate(outputs):
-        places = np.arange(len(compared)) + (i - (len(outputs) - 1) / 2) * height
-        fits = [c.output_error[output].fit for c in compared.values()]
-        bars = axis.barh(
-            places,
-            np.clip(np.nan_to_num(fits, nan=0.0), 0.0, 100.0),
-            height,
-            color=LINE_STYLES[1 + i % 5][0],
-            label=escape_math(symbol(output)),
-        )
-        axis.bar_label(bars, [f"{v:.4g}" for v in fits], fontsize="small", padding=3)
-    axis.set_yticks(range(len(compared)), [escape_math(n) for n in compared])
-    axis.invert_yaxis()
-    axis.set(xlabel="fit of the simulation [%]", xlim=(0, 112))
-    if len(outputs) > 1:
-        axis.legend(loc="lower right", fontsize="small")
-    return figure
+    chart = BarChart(
+        list(compared),
+        [(symbol(output), [c.output_error[output].fit for c in compared.values()]) for output in outputs],
+        title="Fit of the simulation",
+        x_label="fit [%]",
+        high=100.0,
+    )
+    return draw_figure([[chart]], ax, row=max(ROW_HEIGHT_INCH, 0.4 * len(compared) * len(outputs)))
 
 
 @check_arguments
@@ -617,57 +607,34 @@ def design(result: DesignedInput, *, ax: Any = None) -> Any:
     ModelError
         Another type of result, the wrong number of axes, or no matplotlib.
     """
+    charts = [[_designed_chart(result, name)] for name in (*result.run.inputs, *result.run.outputs)]
+    return draw_figure([*charts, [_spectrum_chart(result)]], ax, row=1.9)
+
+
+def _designed_chart(result: DesignedInput, name: str) -> LineChart:
+    """Return the chart of a signal of the designed run, of the square wave and of its limits."""
     run, square = result.run, result.reference
-    figure, axes = axes_for(ax, len(run.inputs) + len(run.outputs) + 1, row=1.9)
-    limits = {r.name: r.limit for r in result.predicted_extremes}
-    time = run.step * np.arange(run.length)
-    for axis, name in zip(axes[:, 0], (*run.inputs, *run.outputs), strict=False):
-        held = {"drawstyle": "steps-post"} if name in run.inputs else {}
-        axis.plot(time, square[name], color=LINE_STYLES[1][0], linewidth=0.9, label=square.name, **held)
-        axis.plot(time, run[name], color=LINE_STYLES[0][0], linewidth=1.1, label="designed", **held)
-        if math.isfinite(limits[name]):
-            for side in (-1, 1):
-                axis.axhline(
-                    side * limits[name], color="0.5", linewidth=0.8, linestyle=":", label="limit" if side > 0 else None
-                )
-        axis.set(xlabel="time [s]", ylabel=label_of(name, run.units))
-        axis.grid(visible=True, alpha=0.3)
-    axes[0, 0].legend(fontsize="small", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    _draw_spectrum(axes[-1, 0], result)
-    return figure
+    lines = [("designed", run[name]), (square.name, square[name])]
+    limit = next(r.limit for r in result.predicted_extremes if r.name == name)
+    # The shade is what the limits allow.
+    bands = [(np.full(run.length, -limit), np.full(run.length, limit))] if math.isfinite(limit) else []
+    return replace(signal_chart(run, name), lines=lines, bands=bands, steps=name in run.inputs)
 
 
-def _draw_spectrum(axis: Any, result: DesignedInput) -> None:
-    """Plot the cumulative power spectrum, which separates line spectra better than the spectrum itself."""
-    rows = result.run.length - 1
-    frequencies = np.fft.rfftfreq(rows, result.step)
-    for shown, color, label in (
-        (result.reference, LINE_STYLES[1][0], result.reference.name),
-        (result.run, LINE_STYLES[0][0], "designed"),
-    ):
-        power = np.sum([np.abs(np.fft.rfft(shown[n][:rows])) ** 2 for n in shown.inputs], axis=0)
-        axis.plot(frequencies[1:], np.cumsum(power[1:]) / np.sum(power[1:]), color=color, linewidth=1.1, label=label)
-    order = np.argsort(result.spectrum.lines.frequencies)
+def _spectrum_chart(result: DesignedInput) -> LineChart:
+    """Return the chart of the cumulative power, which separates line spectra better than the spectrum itself."""
+    rows, lines = result.run.length - 1, result.spectrum.lines.frequencies
+    every = np.fft.rfftfreq(rows, result.step)
+    shown = (every >= lines.min()) & (every <= lines.max())
+    drawn: list[tuple[str, ArrayLike]] = []
+    for name, run in ((result.reference.name, result.reference), ("designed", result.run)):
+        power = np.sum([np.abs(np.fft.rfft(run[n][:rows])) ** 2 for n in run.inputs], axis=0)
+        drawn.append((name, (np.cumsum(power[1:]) / np.sum(power[1:]))[shown[1:]]))
+    order = np.argsort(lines)
     best = np.cumsum(result.spectrum.power[order])
     if best[-1] > 0:
-        axis.plot(
-            result.spectrum.lines.frequencies[order],
-            best / best[-1],
-            color=LINE_STYLES[2][0],
-            linewidth=0.9,
-            linestyle="--",
-            label="best periodic",
-        )
-    lines = result.spectrum.lines.frequencies
-    axis.set(
-        xscale="log",
-        xlim=(float(lines.min()), float(lines.max())),
-        ylim=(-0.02, 1.02),
-        xlabel="frequency [Hz]",
-        ylabel="power below",
-    )
-    axis.grid(visible=True, alpha=0.3)
-    axis.legend(fontsize="small", loc="lower right")
+        drawn.append(("best periodic", np.interp(every[shown], lines[order], best / best[-1])))
+    return LineChart(every[shown], drawn, title="Spectrum", x_label="frequency [Hz]", y_label="power below", log_x=True)
 
 
 @check_arguments
@@ -698,12 +665,7 @@ def response(
         Data of signals that the model does not have.
     """
     model, records = _model_and_data(result, data)
-    figure, axes = axes_for(ax, len(records), 2)
-    for row, record in zip(axes, records, strict=True):
-        for axis, chart in zip(row, record_charts(model, record), strict=True):
-            draw_chart(axis, chart)
-        row[0].legend(fontsize="small")
-    return figure
+    return draw_figure([record_charts(model, record) for record in records], ax)
 
 
 @check_arguments
@@ -730,16 +692,7 @@ def nyquist(
         Data of signals that the model does not have.
     """
     model, records = _model_and_data(result, data)
-    figure, axes = axes_for(ax, len(records), row=3.4)
-    for axis, record in zip(axes[:, 0], records, strict=True):
-        curve, points, x_label, y_label = nyquist_curves(model, record)
-        measured = {"fillstyle": "none", "markersize": 4, "color": LINE_STYLES[0][0], "label": "measured"}
-        axis.plot(points.real, points.imag, "o", **measured)
-        axis.plot(curve.real, curve.imag, color=LINE_STYLES[1][0], linewidth=1.2, label="model")
-        axis.set_aspect("equal", adjustable="datalim")
-        label_axes(axis, f"{symbol(record.output)} from {symbol(record.input)}", xlabel=x_label, ylabel=y_label)
-        axis.legend(fontsize="small")
-    return figure
+    return draw_figure([[nyquist_chart(model, record)] for record in records], ax, row=3.4)
 
 
 def _model_and_data(

@@ -22,8 +22,8 @@ from ftlm.estimation.frequency_result import DECIBELS_PER_NEPER, frequency_chart
 from ftlm.model.model import Model, check_model
 from ftlm.plot.comparison_charts import with_unit
 from ftlm.simulation.discretization import COULOMB_PREFIX
-from ftlm.svg.charts import plane_chart
-from ftlm.svg.figure import Figure
+from ftlm.svg.charts import PlaneChart
+from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
@@ -44,7 +44,7 @@ def response_frequencies(model: Model, step: float | None = None, duration: floa
 
 
 @check_arguments
-def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
+def bode_charts(model: Model, w: ArrayLike | None = None) -> list[LineChart]:
     """Return gain and phase charts for every pair of output and external input, with 95 % bands if known.
 
     Parameters
@@ -55,10 +55,10 @@ def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
         Frequencies [rad/s]; by default around the corner frequencies of the model.
     """
     omega = response_frequencies(model) if w is None else as_floats("w", w)
-    return [chart.small_figure() for chart in bode_line_charts(omega, bode_curves(model, omega))]
+    return curve_charts(omega, bode_curves(model, omega))
 
 
-def bode_line_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
+def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
     """Return the gain and phase charts of some curves."""
     charts = []
     for curve in curves:
@@ -84,7 +84,7 @@ def pole_points(model: Model) -> tuple[float, Complex]:
 
 
 @check_arguments
-def pole_charts(model: Model) -> list[Figure]:
+def pole_charts(model: Model) -> list[PlaneChart]:
     """Return the pole chart in the plane of s^q, q the highest order over the next integer, with the unstable sector.
 
     Empty for a model with friction or without poles.
@@ -106,7 +106,7 @@ def pole_charts(model: Model) -> list[Figure]:
         caption += f" A relaxation is drawn at −T^−{q:.4g}."
     unit = "rad/s" if q == 1 else f"(rad/s)^{q:.4g}"
     return [
-        plane_chart(
+        PlaneChart(
             points.tolist(),
             title=f"Poles in the plane of {plane}",
             x_label=f"real part of {plane} [{unit}]",
@@ -176,7 +176,7 @@ class Bode:
 
     def figures(self) -> list[Figure]:
         """Return the charts, as in a report."""
-        return [chart.small_figure() for chart in bode_line_charts(self.frequency, self.curves)]
+        return [*curve_charts(self.frequency, self.curves)]
 
     def __str__(self) -> str:
         pairs = ", ".join(f"{c.output} from {c.input}" for c in self.curves) or "no input reaches an output"
@@ -196,7 +196,7 @@ def bode(model: Model, w: ArrayLike | None = None) -> Bode:
 
 
 @check_arguments
-def response_charts(found: Response, *, units: Mapping[str, str] | None = None) -> list[Figure]:
+def response_charts(found: Response, *, units: Mapping[str, str] | None = None) -> list[LineChart]:
     """Return step or impulse response charts of every connected pair of input and output, with 95 % bands.
 
     Parameters
@@ -207,14 +207,14 @@ def response_charts(found: Response, *, units: Mapping[str, str] | None = None) 
         Units of the signals by name.
     """
     return [
-        response_line_chart(found, i, j, units or {}).small_figure()
+        response_chart(found, i, j, units or {})
         for i in range(len(found.outputs))
         for j, signal in enumerate(found.inputs)
         if np.any(found.values[i, j]) and not signal.startswith(COULOMB_PREFIX)
     ]
 
 
-def response_line_chart(found: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
+def response_chart(found: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
     """Return the chart of the response of output i to input j, with its 95 % band."""
     output, values = found.outputs[i], found.values[i, j]
     bands, shade = [], "No covariance, so there is no band."
@@ -224,11 +224,13 @@ def response_line_chart(found: Response, i: int, j: int, units: Mapping[str, str
     return LineChart(
         found.time,
         [("", values)],
-        f"{symbol(output)} after a unit {found.kind} of {symbol(found.inputs[j])}",
+        title=f"{symbol(output)} after a unit {found.kind} of {symbol(found.inputs[j])}",
         x_label="time [s]",
         y_label=with_unit(symbol(output), units, output),
         caption=shade,
         bands=bands,
+        width=SMALL_WIDTH_PX,
+        height=220,
     )
 
 
@@ -249,7 +251,7 @@ class TimeResponse(Response):
 
     def figures(self) -> list[Figure]:
         """Return the charts, as in a report."""
-        return response_charts(self, units=self.units)
+        return [*response_charts(self, units=self.units)]
 
     def __str__(self) -> str:
         lines = [f"{self.kind} response, {self.time.size} samples to {self.time[-1]:.4g} s"]

@@ -48,9 +48,10 @@ from ftlm.plot.model_charts import bode_charts, pole_charts, response_frequencie
 from ftlm.report.text_summary import describe_order, settings_rows
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
-from ftlm.svg.charts import correlation_map, heat_map
+from ftlm.svg.charts import CorrelationMap
 from ftlm.svg.figure import MAX_LINE_POINTS, Figure
 from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import Cell, format_bound, number, symbol, symbol_html
 from ftlm.validation.comparison import (
@@ -344,7 +345,7 @@ def correlation_sections(joint: JointFit | None) -> list[Section]:
         "make together better than each. That matters where a standard error is large as well."
     )
     values = np.clip(joint.correlation, -1.0, 1.0)
-    figure = correlation_map(joint.names, values, title="Correlations of the estimates")
+    figure = CorrelationMap(joint.names, values, title="Correlations of the estimates")
     return [Section("Correlations of the estimates", words, figures=[figure], small=True)]
 
 
@@ -409,22 +410,22 @@ def _search_sections(result: Identification) -> list[Section]:
             f"estimates is {number(around.correlation, 3)}. For white residuals the 95 % region of both ends at a "
             "score of 7."
         )
-        sections.append(Section("Order landscape", words, figures=[heat_map(around)], small=True))
+        sections.append(Section("Order landscape", words, figures=[around], small=True))
     return sections
 
 
 def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
     """Return score maps of the searches over two or more orders; a table suffices for one."""
-    maps = []
+    maps: list[Figure] = []
     for name, search in searches.items():
         part = task.structure if name == "stage" else task.structure.equation(name)
         own = task.part_order_grid(part)
         if sum(len(v) > 1 for v in own.values(part).values()) >= 2:
-            maps.append(heat_map(landscape(task.runs, part, search, own)))
+            maps.append(landscape(task.runs, part, search, own))
     return maps
 
 
-def _traces(result: Identification) -> list[Figure]:
+def _traces(result: Identification) -> list[LineChart]:
     """Return the recursion at the orders found, for the paper's p and the one used.
 
     Empty if the first run does not start at rest.

@@ -26,8 +26,9 @@ from ftlm.reproduction.figures import angle_chart
 from ftlm.reproduction.report import make_section, make_table
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
 from ftlm.structure.structure import Structure
-from ftlm.svg.figure import SMALL_WIDTH_PX, Figure
+from ftlm.svg.figure import SMALL_WIDTH_PX
 from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import Cell, Exact, finite, format_bound, json_value, symbol, symbol_html
 from ftlm.utils.parameters import Placeholder, parameter
@@ -454,7 +455,7 @@ def _verdict(output: str, verdict: Verdict) -> Markup:
     return template.format(verdict_sentence(output, verdict), verdict.words)
 
 
-def validation_charts(found: OrderCrossValidation, deflection: Deflection) -> list[Figure]:
+def validation_charts(found: OrderCrossValidation, deflection: Deflection) -> list[LineChart]:
     """Charts of a deflection and its simulations by both structures on the run after the estimation run."""
     charts, output = [], deflection.output
     names = [run.name or "" for run in found.runs]

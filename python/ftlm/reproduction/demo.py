@@ -29,6 +29,7 @@ from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, INNOVATION_L
 from ftlm.reproduction.report import criteria_cells, fits_text, joint_equations, letters_of, make_table, number_cells
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage import GRID_ALPHA, Candidate, DroppedDerivative, Preset, StageWork
+from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, write_page
 from ftlm.utils.files import check_folder
 from ftlm.utils.formatting import DIVERGED_TEXT, SIGNIFICANT_DIGITS, Cell, json_value, symbol, truncate_text, wrap_text
@@ -395,7 +396,9 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         "output error, sine run": demo.validations[stage],
         "multi-innovation, p = 7, square run": results["p = 7"].comparison,
     }
-    charts = [f for label, c in compared.items() for f in comparison_charts(c, units=best.model.units, label=label)]
+    charts: list[Figure] = [
+        f for label, c in compared.items() for f in comparison_charts(c, units=best.model.units, label=label)
+    ]
     charts += [*pole_charts(best.model), *best.model.step().figures()]
     for output in best.model.outputs:
         title = f"Error (45) of {symbol(output)} after each step of the recursion"

@@ -15,8 +15,8 @@ from ftlm.plot.comparison_charts import error_chart, pulse_times
 from ftlm.reproduction import published_values as printed
 from ftlm.reproduction.checks import ClaimVerdict
 from ftlm.reproduction.stage import MULTI_INNOVATION_LABELS, Candidate, DroppedDerivative, Stage
-from ftlm.svg.figure import Figure
-from ftlm.svg.line_chart import line_figure
+from ftlm.svg.figure import Figure, StaticFigure
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, metrics
@@ -33,10 +33,10 @@ MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
 
 def angle_chart(
     time: Floats, lines: Sequence[tuple[str, Floats]], output: str, title: str, caption: str, **options: Any
-) -> Figure:
+) -> LineChart:
     """Chart of an angle over time by several models; the options are those of a line chart."""
     options = {"points": LINE_POINTS, "caption": caption.replace(" -", " −"), **options}
-    return line_figure(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
+    return LineChart(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
 
 
 def reference_label(*, simulated: bool) -> str:
@@ -46,7 +46,7 @@ def reference_label(*, simulated: bool) -> str:
 
 def fit_chart(
     models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
-) -> Figure:
+) -> LineChart:
     """Chart of an angle and its simulations by some models, without far excursions."""
     first = models[0][1]
     measured, time = first.measured[output][0], pulse_times(first)
@@ -68,7 +68,7 @@ def fit_chart(
 
 def printed_model_charts(found: Reproduction) -> list[Figure]:
     """Charts of the printed hub models under the paper's current, beside an angle of the implied standard deviation."""
-    charts = []
+    charts: list[Figure] = []
     for output in dict.fromkeys(r.output for r in found.ran if r.output.endswith("1")):
         rows = [r for r in found.ran if r.output == output]
         last = rows[-1]
@@ -96,7 +96,7 @@ def share_picture(ruling: ClaimVerdict) -> Markup:
     return Markup("").join([*out, Markup("</svg>")])
 
 
-def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> Figure:
+def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> LineChart:
     """Chart of the error (45) over the steps of the recursion, one line per p."""
     end = max(float(t.error[-1]) for t in traces.values())
     drawn, gaps = [], False
@@ -153,7 +153,7 @@ def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
     """Figures 4-6 or 7-9."""
     first = 4 if stage.number == 1 else 7
     errors = [(f"p = {p}", stage.candidates[f"p = {p}"].estimation) for p in printed.INNOVATION_LENGTHS]
-    figures = []
+    figures: list[Figure] = []
     for place, output in enumerate(stage.outputs, first):
         title = f"Figure {place}(a). {symbol(output)}: absolute error of the free run"
         figures.append(error_chart(errors, output, title=title, units={output: "rad"}, points=LINE_POINTS))
@@ -196,4 +196,4 @@ def flow_chart() -> Figure:
     """Figure 2: from the physics to the model, a drawing for wide and one for narrow screens."""
     files = (Path(__file__).with_name(f"flow_chart_{screen}.svg") for screen in ("wide", "narrow"))
     drawings = (Markup(file.read_text(encoding="utf-8")) for file in files)  # our own files
-    return Figure("Figure 2. From the physics to the identified model", *drawings)
+    return StaticFigure("Figure 2. From the physics to the identified model", *drawings)

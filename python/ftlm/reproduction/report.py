@@ -45,7 +45,6 @@ from ftlm.reproduction.stage import (
     Stage,
 )
 from ftlm.structure.equation import format_equation
-from ftlm.svg.charts import heat_map
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_free
 from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Cell, Exact, number, symbol, symbol_html
@@ -433,7 +432,7 @@ def _sections(found: Reproduction) -> list[Section]:
         make_section("innovation_length", figures=weak, small=True, folded_tables=[saturation_table(found)]),
         make_section("close_orders", figures=near),
         make_section("dropped_derivative", figures=derived),
-        make_section("landscape", *correlated, figures=[*map(heat_map, landscapes.values())], small=True),
+        make_section("landscape", *correlated, figures=[*landscapes.values()], small=True),
         make_section("frequency_response", figures=bode, small=True),
         make_section("parameters", folded_tables=parameter_tables()),
         make_section("description", figures=[figures.flow_chart()], folded_tables=description_tables()),

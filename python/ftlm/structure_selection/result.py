@@ -15,9 +15,8 @@ from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
-from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
-from ftlm.svg.line_chart import line_figure
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, finite
 from ftlm.utils.validation import Floats
@@ -154,7 +153,7 @@ class Selection(ReportMixin):
             "counts effective samples, from the autocorrelation of the best residuals.",
         )
 
-    def figure(self) -> Figure:
+    def figure(self) -> LineChart:
         """Return a chart of the fits of the best candidate with each number of parameters."""
         best: dict[int, Trial] = {}
         for trial in (t for t in self.trials if t.failed is None):
@@ -166,7 +165,7 @@ class Selection(ReportMixin):
             [max(best[n].validation_fit, MIN_FIT_PERCENT) for n in along],
         )
         chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, validation_data, strict=True)]
-        return line_figure(
+        return LineChart(
             [float(n) for n in along],
             [("estimation", seen), ("validation", validation_data), ("chosen", chosen)],
             title="Fit by number of parameters",

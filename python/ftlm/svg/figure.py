@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import unicodedata
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from decimal import Decimal
+from functools import cached_property
 
 import numpy as np
 from markupsafe import Markup
@@ -23,31 +25,53 @@ SMALL_WIDTH_PX = 520
 LETTER_WIDTH_PX, LINE_HEIGHT_PX = 6.7, 15
 
 
-@dataclass(frozen=True)
-class Figure:
-    """Chart of a report; `line_figure` returns one.
+class Figure(ABC):
+    """Description of a chart, which a page draws as SVG and :mod:`ftlm.plot` with matplotlib.
 
-    Parameters
+    Attributes
     ----------
-    title
-        Title.
-    svg
-        Drawing, trusted markup.
-    narrow
-        Drawing for narrow screens, or empty.
-    caption
-        Information that the drawing cannot show, such as non-finite values.
+    title, caption
+        Title, and a sentence below.
     """
 
     title: str
-    svg: Markup
-    narrow: Markup = field(default_factory=Markup)
-    caption: str = ""
+    caption: str
+
+    @abstractmethod
+    def draw(self, *, narrow: bool) -> Markup:
+        """Return the drawing, trusted markup, for wide or for narrow screens."""
+
+    @cached_property
+    def svg(self) -> Markup:
+        """Drawing for wide screens."""
+        return self.draw(narrow=False)
+
+    @cached_property
+    def narrow(self) -> Markup:
+        """Drawing for narrow screens, or empty."""
+        return self.draw(narrow=True)
+
+    @property
+    def note(self) -> str:
+        """Caption, followed by what the drawing cannot show, such as non-finite values."""
+        return self.caption
 
     def _repr_html_(self) -> str:
-        return str(
-            Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, self.title, self.caption)
-        )
+        return str(Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, self.title, self.note))
+
+
+@dataclass(frozen=True)
+class StaticFigure(Figure):
+    """Chart that is drawn already, once for wide and once for narrow screens."""
+
+    title: str
+    wide: Markup
+    small: Markup
+    caption: str = ""
+
+    def draw(self, *, narrow: bool) -> Markup:
+        """Return one of the drawings."""
+        return self.small if narrow else self.wide
 
 
 class Figures(tuple[Figure, ...]):

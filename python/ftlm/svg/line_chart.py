@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import cached_property
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -125,7 +127,7 @@ LINE_STYLES = (
     ("#7a6300", "#e6cb4f", "14 4"),
 )
 #: Name prefixes of lines in the neutral style.
-NEUTRAL_PREFIXES = ("measured", "simulated arm")
+NEUTRAL_PREFIXES = ("measured", "simulated arm", "designed")
 
 
 @dataclass(frozen=True)
@@ -135,34 +137,160 @@ class _Line:
     x: Floats
     y: Floats  # logarithms on a logarithmic axis; not a number where nothing can be drawn
     dots: bool = False
+    band: tuple[Floats, Floats] | None = None
 
 
-@dataclass(frozen=True)
-class _Shade:
-    style: int
-    x: Floats
-    low: Floats
-    high: Floats
+@check_arguments
+@dataclass(frozen=True, eq=False)
+class LineChart(Figure):
+    """Chart of lines over a common axis.
 
+    Parameters
+    ----------
+    x
+        Shape (N,).
+    lines
+        (name, values of shape (N,)); a single line may have an empty name. A line whose name begins with "measured",
+        "simulated arm" or "designed" has the neutral style; the others get colors and dashes in the given order.
+    title, x_label, y_label
+        Text, with units.
+    caption
+        Sentence below; omitted values are added to it.
+    bands
+        (low, high) of a shaded band behind each of the first lines; each of shape (N,).
+    log_x, log_y
+        Logarithmic axes.
+    stems
+        Draw every value as a stem from 0 instead of a line.
+    steps
+        Hold every value until the next one.
+    dots
+        Names of lines that are drawn as dots.
+    bars
+        Edges of bars that stand on 0, shape (M + 1,), and their heights, shape (M,).
+    width, height
+        Size of the wide drawing [px]; it scales.
+    points
+        Most points of a line.
+    slider
+        Include data for a slider that reads out the lines sample by sample; only on linear axes.
+    description
+        Sentences for screen readers; by default the range of every line.
 
-@dataclass(frozen=True)
-class _Chart:
-    """Content of the wide and the narrow drawing."""
+    Raises
+    ------
+    DataError
+        No line, or a line whose length differs from that of x.
+    """
 
+    x: ArrayLike
+    lines: Sequence[tuple[str, ArrayLike]]
+    _: KW_ONLY
     title: str
-    described: str
     x_label: str
     y_label: str
-    lines: list[_Line]
-    shades: list[_Shade]
-    frame: tuple[float, float, float, float]
-    log_x: bool
-    log_y: bool
-    stems: bool
+    caption: str = ""
+    bands: Sequence[tuple[ArrayLike, ArrayLike]] = ()
+    log_x: bool = False
+    log_y: bool = False
+    stems: bool = False
+    steps: bool = False
+    dots: Collection[str] = ()
+    bars: tuple[Floats, Floats] | None = None
+    width: int = 720
+    height: int = 260
+    points: int = MAX_LINE_POINTS
+    slider: bool = False
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        _ = self.content
+
+    @cached_property
+    def content(self) -> tuple[list[_Line], list[str]]:
+        """Lines ready to draw, and notes about values that cannot be drawn."""
+        if not self.lines:
+            raise DataError("a chart needs at least one line; give (name, values) pairs")
+        across = as_floats("x", self.x, gaps=True).copy()
+        drawn, notes = [], []
+        x = _logarithms(across) if self.log_x else across
+        bands: Iterable[Any] = (*self.bands, *(None for _ in self.lines))
+        for (name, values), style, band in zip(self.lines, line_styles(n for n, _ in self.lines), bands, strict=False):
+            y = as_floats(f"line {name!r}", values, gaps=True).copy()
+            if y.ndim != 1 or y.shape != x.shape:
+                raise DataError(f"line {name!r} has shape {y.shape}, x {x.shape}; give arrays of one length")
+            bad = ~(np.isfinite(y) & np.isfinite(x)) | (np.abs(y) > MAX_DRAWN_VALUE)
+            if np.any(bad) and name not in self.dots:
+                first = x[int(np.argmax(bad))]
+                where = f" (first at {self.x_label} = {first:.4g})" if np.isfinite(first) else ""
+                notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
+            y[bad] = np.nan
+            if self.log_y:
+                below = ~bad & (y <= 0)
+                if np.any(below):
+                    notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
+                y = _logarithms(y)
+            edges = None if band is None else (self._edge(name, band[0], x), self._edge(name, band[1], x))
+            drawn.append(_Line(name, style, *self._corners(x, y), name in self.dots, edges))
+        return drawn, notes
+
+    def _corners(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Return the corners of a line."""
+        return (x.repeat(2)[1:], y.repeat(2)[:-1]) if self.steps else (x, y)
+
+    def _edge(self, name: str, edge: ArrayLike, x: Floats) -> Floats:
+        """Return one edge of a band, with gaps at values that cannot be drawn."""
+        values = as_floats("bands", edge, gaps=True).copy()
+        if values.shape != x.shape:
+            raise DataError(f"a band of {name!r} has shape {values.shape}, x {x.shape}; give one length")
+        values = _logarithms(values) if self.log_y else values
+        return self._corners(x, np.where(np.abs(values) < MAX_DRAWN_VALUE, values, np.nan))[1]
+
+    @cached_property
+    def frame(self) -> tuple[float, float, float, float]:
+        """Axis limits: left, right, bottom, top; logarithms on logarithmic axes."""
+        lines = self.content[0]
+        x_low, x_high = limits([lines[0].x[np.isfinite(lines[0].x)]], 0.02 if self.stems else 0.0)
+        if self.bars is not None:
+            return x_low, x_high, 0.0, 1.05 * max(float(np.max(self.bars[1])), float(np.nanmax(lines[0].y)))
+        if not (self.log_x or self.stems):
+            x_low, x_high = snap_limits(x_low, x_high)
+        y_low, y_high, _ = self._y_limits
+        if self.stems:
+            edges = [1.1 * v for line in lines if line.band for v in (np.nanmin(line.band[0]), np.nanmax(line.band[1]))]
+            y_low, y_high = min(y_low, 0.0, *edges), max(y_high, 0.0, *edges)
+        return x_low, x_high, y_low, y_high
+
+    @cached_property
+    def _y_limits(self) -> tuple[float, float, list[tuple[str, float]]]:
+        """Limits of the vertical axis, and lines that exceed them with their farthest values."""
+        lines = self.content[0]
+        every = [line.y[np.isfinite(line.y)] for line in lines]
+        # Bands widen the axis and are never said to have left it.
+        bands = [] if self.stems else [e[np.isfinite(e)] for line in lines if line.band for e in line.band]
+        low, high = limits([*every, *bands], 0.05)
+        neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
+        if not neutral:
+            return low, high, []
+        # A simulation that runs away would flatten what it is to be compared with.
+        bottom, top = limits(neutral, 0.0)
+        reach = MAX_STRAY_HEIGHTS * (top - bottom)
+        floor, ceiling = bottom - reach, top + reach
+        strays = []
+        for y, line in zip(every, lines, strict=True):
+            if y.size and (np.min(y) < floor or np.max(y) > ceiling):
+                middle = (bottom + top) / 2
+                strays.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
+        return max(low, floor), min(high, ceiling), strays
 
     @property
-    def named_lines(self) -> list[_Line]:
-        return [line for line in self.lines if line.name]
+    def note(self) -> str:
+        """Caption, followed by values and lines that are not drawn."""
+        strays = [
+            f"{name} leaves the axis (to {number(10.0**far if self.log_y else far, 3)})."
+            for name, far in self._y_limits[2]
+        ]
+        return " ".join(part for part in (self.caption, *self.content[1], *strays) if part)
 
     def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
         """Ticks of the horizontal and the vertical axis."""
@@ -170,117 +298,87 @@ class _Chart:
         across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
 
+    def small(self, height: int = 220) -> LineChart:
+        """Return the chart in a size of which two stand side by side; the height is in pixels."""
+        return replace(self, width=SMALL_WIDTH_PX, height=height)
 
-@check_arguments
-def line_figure(
-    x: ArrayLike,
-    lines: Sequence[tuple[str, ArrayLike]],
-    *,
-    title: str,
-    x_label: str,
-    y_label: str,
-    width: int = 720,
-    height: int = 260,
-    log_x: bool = False,
-    log_y: bool = False,
-    caption: str = "",
-    points: int = MAX_LINE_POINTS,
-    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (),
-    stems: bool = False,
-    dots: Collection[str] = (),
-    slider: bool = False,
-) -> Figure:
-    """Return a chart of lines over a common axis.
+    def draw(self, *, narrow: bool) -> Markup:
+        """Return the drawing."""
+        lines = self.content[0]
+        width, height = (NARROW_WIDTH_PX, 240) if narrow else (self.width, self.height)
+        across, upward = self.ticks(narrow=narrow)
+        named = [line for line in lines if line.name]
+        legend = _legend(named, width) if narrow else []
+        left = max(30.0, 10 + max(map(text_width, upward.labels)))
+        # Beside the lines: a gap, a swatch, the label.
+        side = max((text_width(truncate_text(line.name, MAX_LABEL_CHARACTERS)) for line in named), default=0.0)
+        right = 14.0 if narrow or not named else 34 + side
+        top = 26.0 + (LINE_HEIGHT_PX * (legend[-1][2] + 1) + 5 if legend else 0)
+        if narrow:
+            height += int(top - 26)
+        plot = PlotArea(left, top, width - left - right, height - top - 40.0, self.frame)
+        parts = [*plot.grid(across, upward), *self._curves(plot, narrow=narrow), TEXT_GROUP]
+        parts += plot.labels((across, upward), (self.x_label, self.y_label), width)
+        if not any(np.isfinite(line.y).any() for line in lines):
+            middle = plot.left + plot.width / 2, plot.top + plot.height / 2
+            parts.append(svg_text(*middle, "no finite value to draw", "middle"))
+        if named:
+            parts += _legend_marks(legend) if narrow else _end_labels(named, plot)
+        parts.append(Markup("</g>"))
+        told = Markup("") if self.log_x or self.log_y or self.stems else _zoomable(plot, across, upward)
+        if self.slider and not (narrow or self.log_x or self.log_y):
+            # A page of many charts has few points a line, and room for as few to be read out.
+            values = [(line.name, line.style, line.y) for line in lines]
+            read = slider_readout(lines[0].x, values, self.x_label, self.y_label, max(2, self.points // 2))
+            told += Markup(' data-readings="{}"').format(read)
+        described = self.description or self._describe()
+        return svg(width, height, self.title, described, parts, narrow=narrow, attributes=told)
 
-    Parameters
-    ----------
-    x
-        Shape (N,).
-    lines
-        (name, values of shape (N,)); a single line may have an empty name. A line whose name begins with "measured" or
-        "simulated arm" has the neutral style; the others get colors and dashes in the given order.
-    title, x_label, y_label
-        Text, with units.
-    width, height
-        Size of the wide drawing [px]; it scales.
-    log_x, log_y
-        Logarithmic axes.
-    caption
-        Sentence below; omitted values are added to it.
-    points
-        Most points of a line.
-    bands
-        (low, high) of a shaded band behind each of the first lines; each of shape (N,).
-    stems
-        Draw every value as a stem from 0 instead of a line.
-    dots
-        Names of lines that are drawn as dots.
-    slider
-        Include data for a slider that reads out the lines sample by sample; only on linear axes.
+    def _describe(self) -> str:
+        """Describe the axes and the range of every line."""
+        described = f"Line chart. {self.y_label} against {self.x_label}"
+        described += "; logarithmic vertical axis" if self.log_y else ""
+        described += "; logarithmic horizontal axis. " if self.log_x else ". "
+        return described + " ".join(_describe_line(line, self.log_y) for line in self.content[0])
 
-    Returns
-    -------
-    Figure
-        With a second drawing for narrow screens.
-
-    Raises
-    ------
-    DataError
-        No line, or a line whose length differs from that of x.
-    """
-    drawn, notes = _prepare_lines(x, lines, x_label, log_x, log_y, dots)
-    x_low, x_high = limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.02 if stems else 0.0)
-    if not (log_x or stems):
-        x_low, x_high = snap_limits(x_low, x_high)
-    shades = [_shade(drawn[k], low, high, log_y) for k, (low, high) in enumerate(bands[: len(drawn)])]
-    # Edges of shades widen the axis and are never told to have left it, so they are lines of no name and no neutral.
-    edges = [_Line("", 1, b.x, y) for b in shades for y in (b.low, b.high) if np.isfinite(y).any()]
-    y_low, y_high, strays = _y_limits(drawn if stems else [*drawn, *edges])
-    if stems:
-        around_zero = [0.0, *(float(np.nanmax(b.high)) for b in shades), *(float(np.nanmin(b.low)) for b in shades)]
-        y_low, y_high = min(y_low, *(1.1 * v for v in around_zero)), max(y_high, *(1.1 * v for v in around_zero))
-    notes += [f"{name} leaves the axis (to {number(10.0**far if log_y else far, 3)})." for name, far in strays]
-    described = f"Line chart. {y_label} against {x_label}" + ("; logarithmic vertical axis" if log_y else "")
-    described += "; logarithmic horizontal axis. " if log_x else ". "
-    described += " ".join(_describe_line(line, log_y) for line in drawn)
-    chart = _Chart(
-        title, described, x_label, y_label, drawn, shades, (x_low, x_high, y_low, y_high), log_x, log_y, stems
-    )
-    read = ""
-    if slider and not (log_x or log_y):
-        # A page of many charts has few points a line, and room for as few to be read out.
-        values = [(line.name, line.style, line.y) for line in drawn]
-        read = slider_readout(drawn[0].x, values, x_label, y_label, max(2, points // 2))
-    wide = _draw_chart(chart, width, height, points, narrow=False, read=read)
-    small = _draw_chart(chart, NARROW_WIDTH_PX, 240, max(4, points // 2), narrow=True)
-    return Figure(title, wide, small, " ".join(([caption] if caption else []) + notes))
-
-
-@dataclass(frozen=True)
-class LineChart:
-    """Description of a chart of lines over a common axis, which SVG here and matplotlib in ``ftlm.plot`` draw.
-
-    Parameters
-    ----------
-    x, lines, title, x_label, y_label, caption, bands, log_x, log_y, stems, dots
-        See :func:`line_figure`.
-    """
-
-    x: Floats
-    lines: Sequence[tuple[str, Floats]]
-    title: str
-    x_label: str
-    y_label: str
-    caption: str = ""
-    bands: Sequence[tuple[Floats, Floats]] = ()
-    log_x: bool = False
-    log_y: bool = False
-    stems: bool = False
-    dots: Collection[str] = ()
-
-    def small_figure(self, height: int = 220) -> Figure:
-        """Return the chart as SVG, two of which stand side by side; the height is in pixels."""
-        return line_figure(**vars(self), width=SMALL_WIDTH_PX, height=height)
+    def _curves(self, plot: PlotArea, *, narrow: bool) -> list[Markup]:
+        """Bars, bands and lines in a nested drawing, which clips them and has integer coordinates."""
+        points = max(4, self.points // 2) if narrow else self.points
+        out = [
+            Markup(
+                '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
+                'viewBox="0 0 {:.0f} {:.0f}">'
+            ).format(
+                plot.left,
+                plot.top,
+                plot.width,
+                plot.height,
+                plot.width * TENTHS_PER_PIXEL,
+                plot.height * TENTHS_PER_PIXEL,
+            )
+        ]
+        zero = round(float(plot.y_pixels(0.0) - plot.top) * TENTHS_PER_PIXEL)
+        if self.bars is not None:
+            edges, heights = self.bars
+            xs, ys = plot.tenths(edges, np.append(heights, 0.0))
+            rectangle = Markup(
+                '<rect class="shade2" x="{}" y="{}" width="{}" height="{}" fill="{}" fill-opacity=".55"/>'
+            )
+            for x, end, y in zip(xs[:-1], xs[1:], ys[:-1], strict=True):
+                out.append(rectangle.format(x, y, max(end - x - 8, 4), zero - y, LINE_STYLES[2][0]))
+        shaded = Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>')
+        for line in self.content[0]:
+            if d := _outline(line, plot, points):
+                out.append(shaded.format(line.style, LINE_STYLES[line.style][0], d))
+        if self.stems:
+            axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {}h{:.0f}"/>')
+            out.append(axis.format(zero, plot.width * TENTHS_PER_PIXEL))
+        # The neutral line lies beneath the others.
+        for line in sorted(self.content[0], key=lambda item: item.style != 0 or item.dots):
+            if d := _stem_path(line, plot) if self.stems else _path(line, plot, points):
+                stroke = _stroke(line.style, dots=line.dots)
+                out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(stroke, d))
+        return [*out, Markup("</svg>")]
 
 
 def line_styles(names: Iterable[str]) -> list[int]:
@@ -295,65 +393,6 @@ def _logarithms(values: Floats) -> Floats:
         return np.log10(np.where(values > 0, values, np.nan))
 
 
-def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
-    """Edges of a band behind a line, with gaps at non-finite values."""
-    edges = []
-    for edge in (low, high):
-        values = as_floats("bands", edge, gaps=True).copy()
-        if values.shape != line.x.shape:
-            raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
-        values = _logarithms(values) if log_y else values
-        edges.append(np.where(np.abs(values) < MAX_DRAWN_VALUE, values, np.nan))
-    return _Shade(line.style, line.x, *edges)
-
-
-def _prepare_lines(
-    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool, dots: Collection[str]
-) -> tuple[list[_Line], list[str]]:
-    """Return lines ready to draw, and notes about values that cannot be drawn."""
-    if not lines:
-        raise DataError("a chart needs at least one line; give (name, values) pairs")
-    across = as_floats("x", x, gaps=True).copy()
-    across = _logarithms(across) if log_x else across
-    drawn, notes = [], []
-    for (name, values), style in zip(lines, line_styles(name for name, _ in lines), strict=True):
-        y = as_floats(f"line {name!r}", values, gaps=True).copy()
-        if y.ndim != 1 or y.shape != across.shape:
-            raise DataError(f"line {name!r} has shape {y.shape}, x {across.shape}; give arrays of one length")
-        bad = ~(np.isfinite(y) & np.isfinite(across)) | (np.abs(y) > MAX_DRAWN_VALUE)
-        if np.any(bad) and name not in dots:
-            first = across[int(np.argmax(bad))]
-            where = f" (first at {x_label} = {first:.4g})" if np.isfinite(first) else ""
-            notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
-        y[bad] = np.nan
-        if log_y:
-            below = ~bad & (y <= 0)
-            if np.any(below):
-                notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
-            y = _logarithms(y)
-        drawn.append(_Line(name, style, across, y, name in dots))
-    return drawn, notes
-
-
-def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]]:
-    """Return limits of the vertical axis, and lines that exceed them with their farthest values."""
-    every = [line.y[np.isfinite(line.y)] for line in lines]
-    low, high = limits(every, 0.05)
-    neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
-    if not neutral:
-        return low, high, []
-    # A simulation that runs away would flatten what it is to be compared with.
-    bottom, top = limits(neutral, 0.0)
-    reach = MAX_STRAY_HEIGHTS * (top - bottom)
-    floor, ceiling = bottom - reach, top + reach
-    strays = []
-    for y, line in zip(every, lines, strict=True):
-        if y.size and (np.min(y) < floor or np.max(y) > ceiling):
-            middle = (bottom + top) / 2
-            strays.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
-    return max(low, floor), min(high, ceiling), strays
-
-
 def _describe_line(line: _Line, log_y: bool) -> str:
     finite = line.y[np.isfinite(line.y)]
     if finite.size == 0:
@@ -361,58 +400,6 @@ def _describe_line(line: _Line, log_y: bool) -> str:
     ends = [float(np.min(finite)), float(np.max(finite)), float(finite[-1])]
     low, high, last = (number(10.0**v if log_y else v, 4) for v in ends)
     return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
-
-
-def _draw_chart(chart: _Chart, width: int, height: int, points: int, *, narrow: bool, read: str = "") -> Markup:
-    across, upward = chart.ticks(narrow=narrow)
-    named = chart.named_lines
-    legend = _legend(named, width) if narrow else []
-    left = max(30.0, 10 + max(map(text_width, upward.labels)))
-    # Beside the lines: a gap, a swatch, the label.
-    side = max((text_width(truncate_text(line.name, MAX_LABEL_CHARACTERS)) for line in named), default=0.0)
-    right = 14.0 if narrow or not named else 34 + side
-    top = 26.0 + (LINE_HEIGHT_PX * (legend[-1][2] + 1) + 5 if legend else 0)
-    if narrow:
-        height += int(top - 26)
-    plot = PlotArea(left, top, width - left - right, height - top - 40.0, chart.frame)
-    parts = [*plot.grid(across, upward), *_curves(chart, plot, points), TEXT_GROUP]
-    parts += plot.labels((across, upward), (chart.x_label, chart.y_label), width)
-    if not any(np.isfinite(line.y).any() for line in chart.lines):
-        middle = plot.left + plot.width / 2, plot.top + plot.height / 2
-        parts.append(svg_text(*middle, "no finite value to draw", "middle"))
-    if named:
-        parts += _legend_marks(legend) if narrow else _end_labels(named, plot)
-    parts.append(Markup("</g>"))
-    told = Markup("") if chart.log_x or chart.log_y or chart.stems else _zoomable(plot, across, upward)
-    if read:
-        told += Markup(' data-readings="{}"').format(read)
-    return svg(width, height, chart.title, chart.described, parts, narrow=narrow, attributes=told)
-
-
-def _curves(chart: _Chart, plot: PlotArea, points: int) -> list[Markup]:
-    """Bands and lines in a nested drawing, which clips them and has integer coordinates."""
-    out = [
-        Markup(
-            '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
-            'viewBox="0 0 {:.0f} {:.0f}">'
-        ).format(
-            plot.left, plot.top, plot.width, plot.height, plot.width * TENTHS_PER_PIXEL, plot.height * TENTHS_PER_PIXEL
-        )
-    ]
-    shaded = Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>')
-    for shade in chart.shades:
-        if d := _outline(shade, plot, points):
-            out.append(shaded.format(shade.style, LINE_STYLES[shade.style][0], d))
-    if chart.stems:
-        zero = float(plot.y_pixels(0.0) - plot.top) * TENTHS_PER_PIXEL
-        axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>')
-        out.append(axis.format(zero, plot.width * TENTHS_PER_PIXEL))
-    # The neutral line lies beneath the others.
-    for line in sorted(chart.lines, key=lambda item: item.style != 0 or item.dots):
-        if d := _stem_path(line, plot) if chart.stems else _path(line, plot, points):
-            stroke = _stroke(line.style, dots=line.dots)
-            out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(stroke, d))
-    return [*out, Markup("</svg>")]
 
 
 def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> Markup:
@@ -424,14 +411,17 @@ def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> Markup:
     )
 
 
-def _outline(shade: _Shade, plot: PlotArea, points: int) -> str:
+def _outline(line: _Line, plot: PlotArea, points: int) -> str:
     """Polygon of a band where both edges are finite."""
-    good = np.flatnonzero(np.isfinite(shade.low) & np.isfinite(shade.high) & np.isfinite(shade.x))
+    if line.band is None:
+        return ""
+    low, high = line.band
+    good = np.flatnonzero(np.isfinite(low) & np.isfinite(high) & np.isfinite(line.x))
     if good.size < 2:
         return ""
     good = good[:: max(1, good.size // points)]
-    xs, top = plot.tenths(shade.x[good], shade.high[good])
-    _, bottom = plot.tenths(shade.x[good], shade.low[good])
+    xs, top = plot.tenths(line.x[good], high[good])
+    _, bottom = plot.tenths(line.x[good], low[good])
     there = [f"{x} {y}" for x, y in zip(xs, top, strict=True)]
     back = [f"{x} {y}" for x, y in zip(xs[::-1], bottom[::-1], strict=True)]
     return "M" + "L".join([*there, *back]) + "Z"
