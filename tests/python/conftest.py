@@ -14,6 +14,7 @@ from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 
 import ftlm
+from ftlm.estimation.extensions import ExtensionTests
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "reference"
@@ -44,6 +45,17 @@ class ByFile(LoadScopeScheduling):
 def pytest_xdist_make_scheduler(config, log):
     """Groups of pytest-xdist 3.8 are marked in names that pytest 9.2 no longer reads."""
     return ByFile(config, log)
+
+
+@pytest.fixture(scope="module")
+def no_extension_tests():
+    """Fits without the fits of extended structures, most of the time of a fit whose residuals are colored.
+
+    For files whose tests are about parameters and not about findings.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ftlm.estimation.identify.run_extension_tests", lambda fit, tests: ExtensionTests([]))
+        yield
 
 
 @pytest.fixture(scope="session")

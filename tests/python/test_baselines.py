@@ -12,6 +12,8 @@ from ftlm.estimation.genetic import GeneticAlgorithm, genetic_search, polynomial
 from ftlm.simulation.discretization import prepare
 from ftlm.validation.comparison import compare_means
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 EQUATION = "D^alpha y = a D^nu y + c y + b u"
 BOUNDS = {"a": (-10.0, 0.0), "c": (-20.0, 0.0), "b": (0.0, 10.0)}
 LATTICE = ftlm.order_grid(increment=0.1, alpha=(1.3, 1.9))

@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm.cli.main import app
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 STEP = 0.02
 TIME = STEP * np.arange(600)
 INPUT = np.where(np.sin(1.3 * TIME) + np.sin(3.1 * TIME + 1) > 0, 1.0, -1.0)

@@ -10,6 +10,8 @@ from ftlm.estimation.cost_surface import correlated_orders, output_error_landsca
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 WORDS = "D^alpha y = a D^nu y + c y + b u"
 
 

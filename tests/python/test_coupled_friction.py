@@ -13,6 +13,8 @@ from ftlm import _core
 from ftlm.errors import DataError, ModelError
 from numbered_problem import NumberedProblem
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 #: Hub (a, d, b) and link (k, c): D^2 x = a q + d Dq + b Dx + u - friction, D^2 q = - D^2 x - k q - c Dq.
 HUB, LINK = (30.0, 0.4, -1.5), (90.0, 1.2)
 WORDS = "D^2 x = a q + d D q - b D x + g u - fc*sign(D x); D^2 q = - 1 D^2 x - k q - e D q"

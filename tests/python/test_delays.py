@@ -17,6 +17,8 @@ from ftlm.estimation.free_parameters import FreeProblem, core_arguments
 from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 
 

@@ -9,6 +9,8 @@ from scipy.signal import cont2discrete, lfilter, lsim
 import ftlm
 from ftlm.utils.validation import Floats
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 H = 0.05
 
 

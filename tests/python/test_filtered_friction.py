@@ -8,6 +8,8 @@ import friction
 import ftlm
 from ftlm.errors import ModelError
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 CORNER, DAMPING = 2.0 * np.pi * 2.0, 0.9
 HUB, LINK = (30.0, 0.4, -1.5), (90.0, 1.2)
 WORDS = "D^2 x = a q + d D q - b D x + g u - fc*sign(D x); D^2 q = - D^2 x - k q - e D q"

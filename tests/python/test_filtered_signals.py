@@ -21,6 +21,8 @@ from ftlm.simulation.discretization import recording
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import compare_means
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 STEP, COUNT, FINE = 1e-3, 6001, 4
 OMEGA, ZETA = 2 * np.pi * 1.0, 0.9
 TRUTH = {"a": -9.0, "d": -1.5, "b": 4.0, "p": 2.5}

@@ -11,6 +11,8 @@ from ftlm.order_search.options import SearchSettings
 from ftlm.order_search.search import make_job
 from ftlm.utils.checkpoint_file import RECORD_ENCODER
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 FREE = {1: ("alpha1", "beta2", "alpha2", "gamma1", "mu2"), 2: ("alpha3", "beta4", "alpha4", "gamma3", "mu4")}
 
 

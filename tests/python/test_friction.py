@@ -16,6 +16,8 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.linear import Streaming
 from numbered_problem import NumberedProblem
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 BLOCK = "D^2 y = u - fc*sign(D y)"
 CART = "D^2 y = - v D y + g u - fc*sign(D y)"
 

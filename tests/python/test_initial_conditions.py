@@ -22,6 +22,8 @@ from ftlm.simulation.initial_conditions import history, misfit, misfit_of_fits, 
 from ftlm.simulation.output_samples import with_initial_conditions
 from ftlm.structure.structure import History
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 WORDS = motion.PLANTS["0.7"].words
 
 

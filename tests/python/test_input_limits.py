@@ -12,6 +12,8 @@ from ftlm import cli
 from ftlm.report.typesetting import equation_html, parameter_table
 from ftlm.structure.input_nonlinearity import InputNonlinearity
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 STEP = 0.05
 MATRICES = (np.array([[0.0, 1.0], [-9.0, -1.2]]), np.array([[0.0], [4.5]]), np.eye(2)[:1], np.zeros((1, 1)))
 SYSTEM = signal.cont2discrete(MATRICES, STEP)

@@ -8,6 +8,8 @@ import pytest
 import ftlm
 from ftlm.data.sampling import resample_uniform
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 PLANT = "D^0.8 y = -1.5 y + 1.5 u"
 STEP, ROWS, FINE = 0.05, 600, 20
 

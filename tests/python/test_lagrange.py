@@ -17,6 +17,8 @@ from lagrange import INPUTS, clean_run, model, structure, truth
 from plants import with_noise
 from test_derivation import Stage, deriv, vanishes
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 STAGES = pytest.mark.parametrize("stage", [1, 2])
 
 

@@ -12,6 +12,8 @@ from ftlm.estimation.output_error import fit_output_error
 from ftlm.reproduction.simulated_arm import demo_plant
 from oracles import fit
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 ARM = plants.truth("A")
 
 

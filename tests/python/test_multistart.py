@@ -15,6 +15,8 @@ from ftlm.estimation.output_error import fit_output_error
 from oracles import held_response
 from plants import resonant_plant
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 
 def test_what_only_a_coarse_grid_carries_gives_way_to_another_optimum() -> None:
     # The samples' own grid is lowest where finer ones lead to two orders in one, 3 % above what is contained.

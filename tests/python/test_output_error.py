@@ -15,6 +15,8 @@ from ftlm.estimation.output_error import fit_output_error
 from ftlm.reproduction.simulated_arm import demo_plant
 from ftlm.utils.statistics import is_white
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
 
 

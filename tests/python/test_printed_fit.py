@@ -11,6 +11,8 @@ from ftlm.validation.comparison import compare_means
 from measured import DATA, needs_data
 from plants import resonant_plant
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 
 def commands(rows, seed, hold=4):
     """A command that changes at random every few rows."""

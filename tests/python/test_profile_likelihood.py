@@ -27,6 +27,8 @@ from measured import DATA, needs_data
 from profile_oracle import likelihood_of, nonlinear_parameters
 from profile_oracle import profile_intervals as intervals_in_python
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 THRESHOLD = 1.959963984540054**2
 STEP = 0.05
 

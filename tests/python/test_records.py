@@ -25,6 +25,8 @@ from ftlm.simulation.discretization import (
 from ftlm.simulation.initial_conditions import history
 from ftlm.structure.structure import History
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 
 def make_run(outputs=None, inputs=None, step=0.1, **options):
     n = len(next(iter((outputs or inputs).values())))

@@ -12,6 +12,8 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.model_checks import multistart_findings
 from ftlm.estimation.objective import Objective
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 RANDLES = "D^(alpha+0.5) U = a D^alpha U + b D^0.5 U + r D^(alpha+0.5) I + c D^alpha I + d D^0.5 I + e I"
 ARC = "D^alpha U = -a U + r D^alpha I + b I"
 

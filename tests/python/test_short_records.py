@@ -7,6 +7,8 @@ import pytest
 
 import ftlm
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 #: Errors that a record may end in.
 IN_WORDS = (ftlm.DataError, ftlm.ModelError, ftlm.ConvergenceError)
 LINEAR = ftlm.equation("D y = a0 y + b0 u")

@@ -14,6 +14,8 @@ from ftlm.errors import DataError, ModelError
 from numbered_problem import NumberedProblem
 from test_friction import level_and_rate, motion, run_of
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 NEAR = "- fs*exp(-(D y/vs)^2)*sign(D y)"
 BLOCK = f"D^2 y = u - fc*sign(D y) {NEAR}"
 #: A sledge that a spring pulls: a slow one stops and jumps.

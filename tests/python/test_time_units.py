@@ -8,6 +8,8 @@ import ftlm
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, minimize_cost
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 #: Of a lag of first order two orders and an own term too many: along the bottom of a valley nothing tells them.
 FLAT = "D^alpha y = d D^mu y + a y + b u"
 UNITS = {"s": 1.0, "ms": 1e3, "min": 1.0 / 60.0}

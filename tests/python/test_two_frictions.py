@@ -11,6 +11,8 @@ from ftlm import _core
 from ftlm.errors import DataError, ModelError
 from numbered_problem import NumberedProblem
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 #: D^2 x = - k (x - y) - c (Dx - Dy) + u - friction, D^2 y = r k (x - y) + r c (Dx - Dy) - p y - friction.
 SPRINGS, DAMPERS = ((-40.0, 40.0), (32.0, -50.0)), np.array(((-1.5, 1.0), (0.8, -1.2)))
 WORDS = "D^2 x = - a x + b y - c D x + d D y + g u - fx*sign(D x); D^2 y = e x - h y + i D x - j D y - fy*sign(D y)"

@@ -22,6 +22,8 @@ from ftlm.estimation.objective import covariance_of, propagated_errors
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.report.html_report import model_page
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 
 def digits_of(jacobian: np.ndarray, squares: float) -> np.ndarray:
     """Classical covariance from the normal equations, in 60 digits."""

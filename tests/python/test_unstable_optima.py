@@ -21,6 +21,8 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective
 from measured import DATA, needs_data
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
 
 

@@ -11,6 +11,8 @@ from ftlm.cli.main import app
 from ftlm.estimation.free_parameters import FreeProblem, values_of_model, warm_starts
 from plants import noisy_run, resonant_plant, structure
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 RICH = "D^alpha y = d D^mu y + a y + b u"
 
 
