@@ -200,7 +200,7 @@ def test_a_run_that_forgets_its_parameters_is_said():
 
 
 def test_a_fit_to_chaotic_motion_has_no_intervals():
-    step, rows = 0.02, 3000
+    step, rows = 0.02, 1500
     blank = ftlm.Run.from_arrays(
         step=step, inputs={"u": np.cos(1.2 * step * np.arange(rows))}, outputs={"y": np.zeros(rows)}
     )

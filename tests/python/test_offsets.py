@@ -20,6 +20,8 @@ from ftlm.estimation.nuisance_parameters import offset_test
 from ftlm.simulation.output_samples import initial_exponents
 from measured import DATA, needs_data
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 WORDS = "D^0.8 y = -a y + b u + c"
 TRUTH = {"a": 0.7, "b": 1.4}
 
