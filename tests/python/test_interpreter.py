@@ -14,8 +14,6 @@ import pytest
 import ftlm
 from ftlm.estimation import objective
 
-pytestmark = pytest.mark.usefixtures("no_extension_tests")
-
 PACKAGE = str(Path(ftlm.__file__).parent)
 #: Functions that the core reports its progress to.
 DRIVERS = (
