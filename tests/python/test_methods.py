@@ -14,6 +14,8 @@ from ftlm.estimation.fit import Fit
 from ftlm.estimation.methods import METHODS_BY_NAME, OrderSearchMethod, method_with_options
 from ftlm.order_search.options import SearchSettings
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 FREE = "D^alpha y = a D^0.6 y + c y + b u"
 FIXED = "D^1.6 y = a D^0.6 y + c y + b u"
 GRID = ftlm.order_grid(increment=0.1, alpha=(1.4, 1.8))

@@ -6,6 +6,8 @@ from scipy.linalg import expm
 
 import ftlm
 
+pytestmark = pytest.mark.usefixtures("no_extension_tests")
+
 STEP = 0.01
 
 
