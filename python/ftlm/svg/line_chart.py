@@ -221,7 +221,7 @@ class LineChart(Figure):
                 raise DataError(f"line {name!r} has shape {y.shape}, x {x.shape}; give arrays of one length")
             bad = ~(np.isfinite(y) & np.isfinite(x)) | (np.abs(y) > MAX_DRAWN_VALUE)
             if np.any(bad) and name not in self.dots:
-                first = x[int(np.argmax(bad))]
+                first = across[int(np.argmax(bad))]
                 where = f" (first at {self.x_label} = {first:.4g})" if np.isfinite(first) else ""
                 notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
             y[bad] = np.nan
