@@ -58,7 +58,7 @@ fn main() -> Result<()> {
         println!("no start has a finite simulation");
         return Ok(());
     };
-    let [alpha, a, b] = found.finished.estimate[..] else { return Ok(()) };
+    let [alpha, a, b] = found.optimum.estimate[..] else { return Ok(()) };
     println!("D^{alpha:.4} y = {a:.3} y + {b:.3} u, with u {DELAY} s late");
 
     // What the model says where nothing was read.
