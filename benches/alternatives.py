@@ -68,25 +68,25 @@ def weights(order: float, n: int) -> np.ndarray:
     return np.concatenate([[1.0], np.cumprod((k - 1 - order) / k)])
 
 
-def simulated(told: dict[str, float], u: np.ndarray, step: float) -> np.ndarray:
+def simulated(values: dict[str, float], u: np.ndarray, step: float) -> np.ndarray:
     """The free run of Grünwald and Letnikov, from rest: what each step of a held input has come to at its end."""
     n = u.size
-    left = step ** -told["alpha"] * weights(told["alpha"], n)
-    if "mu" in told:
-        left = left - told["a1"] * step ** -told["mu"] * weights(told["mu"], n)
-    left[0] -= told["a0"]
-    return np.asarray(lfilter([told["b0"]], left, u))
+    lhs = step ** -values["alpha"] * weights(values["alpha"], n)
+    if "mu" in values:
+        lhs = lhs - values["a1"] * step ** -values["mu"] * weights(values["mu"], n)
+    lhs[0] -= values["a0"]
+    return np.asarray(lfilter([values["b0"]], lhs, u))
 
 
-def sampled(told: dict[str, float], u: np.ndarray, step: float, finer: int = 1) -> np.ndarray:
+def sampled(values: dict[str, float], u: np.ndarray, step: float, finer: int = 1) -> np.ndarray:
     """Readings under a held input, each step cut into finer ones."""
-    fine = simulated(told, np.repeat(u, finer), step / finer)
+    fine = simulated(values, np.repeat(u, finer), step / finer)
     return np.concatenate([[0.0], fine[finer - 1 : -1 : finer]])
 
 
-def fit(measured: np.ndarray, run: np.ndarray) -> float:
+def fit(output: np.ndarray, run: np.ndarray) -> float:
     """In percent, as MATLAB defines it."""
-    return 100 * (1 - float(np.linalg.norm(measured - run) / np.linalg.norm(measured - measured.mean())))
+    return 100 * (1 - float(np.linalg.norm(output - run) / np.linalg.norm(output - output.mean())))
 
 
 def by_scipy(plant: Plant, u: np.ndarray, y: np.ndarray, starts: Sequence[dict[str, float]]) -> tuple[dict, dict]:
@@ -98,17 +98,17 @@ def by_scipy(plant: Plant, u: np.ndarray, y: np.ndarray, starts: Sequence[dict[s
             e = sampled(dict(zip(names, v, strict=True)), u, plant.step) - y
         return np.nan_to_num(np.clip(e, -1e6, 1e6), nan=1e6)
 
-    best = min((least_squares(residual, [s[n] for n in names]) for s in starts), key=lambda found: found.cost)
+    best = min((least_squares(residual, [s[n] for n in names]) for s in starts), key=lambda result: result.cost)
     spread = 2 * best.cost / (y.size - len(names))
     covariance = spread * np.linalg.pinv(best.jac.T @ best.jac)
     return dict(zip(names, best.x, strict=True)), dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
 
 
-def spent(work: Callable[[], object]) -> tuple[float, object]:
+def processor_time(work: Callable[[], object]) -> tuple[float, object]:
     """Processor time of all threads, and what came of it."""
-    begun = time.process_time()
-    made = work()
-    return time.process_time() - begun, made
+    start_time = time.process_time()
+    result = work()
+    return time.process_time() - start_time, result
 
 
 def measure(plant: Plant, seeds: int) -> list[str]:
@@ -123,12 +123,12 @@ def measure(plant: Plant, seeds: int) -> list[str]:
         y = clean + NOISE * np.std(clean) * rng.standard_normal(SAMPLES)
         run = ftlm.Run.from_arrays(step=plant.step, inputs={"u": square}, outputs={"y": y})
         unseen = ftlm.Run.from_arrays(step=plant.step, inputs={"u": chirp}, outputs={"y": other})
-        seconds, found = spent(lambda run=run, plant=plant: ftlm.identify(run, ftlm.equation(plant.words)))
-        assert isinstance(found, ftlm.Identification)
-        held = sum(low <= plant.truth[n] <= high for n, (low, high) in found.intervals.items() if n in plant.truth)
-        off = abs({**found.orders, **found.coefficients}["alpha"] - plant.alpha)
+        seconds, result = processor_time(lambda run=run, plant=plant: ftlm.identify(run, ftlm.equation(plant.words)))
+        assert isinstance(result, ftlm.Identification)
+        hits = sum(low <= plant.truth[n] <= high for n, (low, high) in result.intervals.items() if n in plant.truth)
+        off = abs({**result.orders, **result.coefficients}["alpha"] - plant.alpha)
         ways.setdefault("ftlm, no start", []).append(
-            (seconds, found.model.compare(unseen).output_error["y"].fit, held, off)
+            (seconds, result.model.compare(unseen).output_error["y"].fit, hits, off)
         )
         spread = [
             {
@@ -138,18 +138,18 @@ def measure(plant: Plant, seeds: int) -> list[str]:
             for _ in range(5)
         ]
         for name, starts in (("SciPy, one start", [plant.first]), ("SciPy, best of six", [plant.first, *spread])):
-            seconds, (values, errors) = spent(lambda s=starts, y=y, p=plant: by_scipy(p, square, y, s))
-            held = sum(abs(values[n] - plant.truth[n]) <= 1.96 * errors[n] for n in plant.truth)
+            seconds, (values, errors) = processor_time(lambda s=starts, y=y, p=plant: by_scipy(p, square, y, s))
+            hits = sum(abs(values[n] - plant.truth[n]) <= 1.96 * errors[n] for n in plant.truth)
             model = fit(other, sampled(values, chirp, plant.step))
-            ways.setdefault(name, []).append((seconds, model, held, abs(values["alpha"] - plant.alpha)))
+            ways.setdefault(name, []).append((seconds, model, hits, abs(values["alpha"] - plant.alpha)))
     count = len(plant.truth)
     rows = []
     for name, each in ways.items():
-        seconds, fits, held, off = (np.array(v) for v in zip(*each, strict=True))
+        seconds, fits, hits, off = (np.array(v) for v in zip(*each, strict=True))
         ratio = float(np.median(seconds) / np.median([s for s, *_ in ways["ftlm, no start"]]))
         rows.append(
             f"| {plant.name} | {name} | {np.median(fits):.1f} | {np.min(fits):.1f} | {np.median(off):.3f} | "
-            f"{100 * np.sum(held) / (count * seeds):.0f} | {ratio:.2g} |"
+            f"{100 * np.sum(hits) / (count * seeds):.0f} | {ratio:.2g} |"
         )
     return rows
 

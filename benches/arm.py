@@ -19,7 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
 import ftlm
-from arm_measured import gains, hubs, left_out, measured, orders, rival, steps
+from arm_measured import gains, hubs, left_out, measurements, orders, rival, steps
 from lagrange import INPUTS, clean_run, structure, truth
 from plants import with_noise
 from results import heading, save
@@ -29,9 +29,9 @@ NORMAL_95 = 1.959963984540054
 
 def recovery(seeds: range, levels: list[float]) -> None:
     """Every fit as it is known, and after every seed what is known of each input and level."""
-    found: dict[tuple[int, str, float], list[np.ndarray]] = {}
-    held: dict[tuple[int, str, float], list[list[bool]]] = {}
-    lost: dict[tuple[int, str, float], int] = {}
+    scores_by_case: dict[tuple[int, str, float], list[np.ndarray]] = {}
+    hits: dict[tuple[int, str, float], list[list[bool]]] = {}
+    failures: dict[tuple[int, str, float], int] = {}
     for seed in seeds:
         for key in ((stage, shape, level) for stage in (1, 2) for shape in INPUTS for level in levels):
             stage, shape, level = key
@@ -40,17 +40,19 @@ def recovery(seeds: range, levels: list[float]) -> None:
             try:
                 fit = ftlm.identify(run, structure(stage), method="output-error", threads=1).joint
             except ftlm.FtlmError as error:
-                lost[key] = lost.get(key, 0) + 1
+                failures[key] = failures.get(key, 0) + 1
                 print(*key, seed, error, flush=True)
                 continue
-            known = truth(stage)
+            true_values = truth(stage)
             values = dict(zip(fit.names, fit.values.tolist(), strict=True))
-            z = np.array([(values[n] - v) / fit.standard_errors[n] for n, v in known.items()])
-            inside = [fit.intervals[n][0] <= v <= fit.intervals[n][1] for n, v in known.items()]
-            found.setdefault(key, []).append(z)
-            held.setdefault(key, []).append(inside)
+            z = np.array([(values[n] - v) / fit.standard_errors[n] for n, v in true_values.items()])
+            inside = [fit.intervals[n][0] <= v <= fit.intervals[n][1] for n, v in true_values.items()]
+            scores_by_case.setdefault(key, []).append(z)
+            hits.setdefault(key, []).append(inside)
             outside = ", ".join(
-                f"{n} {values[n]:.5g} for {v:.5g}" for (n, v), i in zip(known.items(), inside, strict=True) if not i
+                f"{n} {values[n]:.5g} for {v:.5g}"
+                for (n, v), i in zip(true_values.items(), inside, strict=True)
+                if not i
             )
             print(
                 *key,
@@ -62,18 +64,18 @@ def recovery(seeds: range, levels: list[float]) -> None:
             )
         print("| stage | input | dB | largest |z| < 5 | in 95 % intervals | within 1.96 errors | largest |z| |")
         print("| --- | --- | --- | --- | --- | --- | --- |")
-        for key, scores in found.items():
+        for key, scores in scores_by_case.items():
             z = np.abs(np.stack(scores))
             near = int(np.sum(z.max(axis=1) < 5.0))
             print(
-                f"| {key[0]} | {key[1]} | {key[2]:g} | {near} of {len(z) + lost.get(key, 0)} | "
-                f"{100.0 * np.mean(held[key]):.1f} | {100.0 * np.mean(z < NORMAL_95):.1f} | {z.max():.1f} |",
+                f"| {key[0]} | {key[1]} | {key[2]:g} | {near} of {len(z) + failures.get(key, 0)} | "
+                f"{100.0 * np.mean(hits[key]):.1f} | {100.0 * np.mean(z < NORMAL_95):.1f} | {z.max():.1f} |",
                 flush=True,
             )
 
 
 SECTIONS: dict[str, Callable[[], Iterator[str]]] = {
-    "measured": measured,
+    "measured": measurements,
     "orders": orders,
     "gains": gains,
     "hubs": hubs,
@@ -91,16 +93,18 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--levels", default="20,40,60,80")
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
-    given = parser.parse_args()
-    if given.what == "recovery":
-        recovery(range(given.first, given.first + given.seeds), [float(v) for v in given.levels.split(",")])
+    arguments = parser.parse_args()
+    if arguments.what == "recovery":
+        recovery(
+            range(arguments.first, arguments.first + arguments.seeds), [float(v) for v in arguments.levels.split(",")]
+        )
         return
     lines = [f"{heading()}:", ""]
     print(lines[0])
-    for line in SECTIONS[given.what]():
+    for line in SECTIONS[arguments.what]():
         lines.append(line)
         print(line, flush=True)
-    if given.write:
+    if arguments.write:
         save(lines)
 
 

@@ -184,54 +184,58 @@ OTHERS = [
 ]
 
 
-def numbers(found: ftlm.Identification, asked: Sequence[str] = ()) -> str:
+def numbers(result: ftlm.Identification, names: Sequence[str] = ()) -> str:
     """Values with standard errors, orders with intervals."""
-    joint = found.joint
+    joint = result.joint
     assert joint is not None
     out = []
     for name, value in zip(joint.names, joint.values.tolist(), strict=True):
-        if name in found.orders:
+        if name in result.orders:
             low, high = joint.intervals[name]
             out.append(f"{name} {value:.3f} ({low:.3f} to {high:.3f})")
-        elif not asked or name in asked:
+        elif not names or name in names:
             out.append(f"{name} {value:.4g} ± {joint.standard_errors[name]:.2g}")
     return ", ".join(out)
 
 
-def fitted(runs: Sequence[ftlm.Run], made: ftlm.Structure) -> ftlm.Identification:
+def fit_quadratic(runs: Sequence[ftlm.Run], structure: ftlm.Structure) -> ftlm.Identification:
     """A joint fit on one thread."""
-    return ftlm.identify(list(runs), made, method=ftlm.OutputError(intervals="quadratic"), threads=1)
+    return ftlm.identify(list(runs), structure, method=ftlm.OutputError(intervals="quadratic"), threads=1)
 
 
-def judged(
-    runs: dict[str, ftlm.Run], made: ftlm.Structure, uses: Sequence[tuple[str, ...]]
+def validation_rows(
+    runs: dict[str, ftlm.Run], structure: ftlm.Structure, uses: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[str, ...]]:
     """Fitted on some of the runs, the fit on each of them, its numbers, processor time."""
-    output = made.outputs[0]
-    for used in uses:
-        begun = time.process_time()
+    output = structure.outputs[0]
+    for names in uses:
+        start_time = time.process_time()
         try:
-            found = fitted([runs[u] for u in used], made)
-            fits = {n: found.model.compare(r).fit[output] for n, r in runs.items()}
+            result = fit_quadratic([runs[u] for u in names], structure)
+            fits = {n: result.model.compare(r).fit[output] for n, r in runs.items()}
         except ftlm.FtlmError as error:
-            yield "+".join(used), str(error), "", ""
+            yield "+".join(names), str(error), "", ""
             continue
-        told = ", ".join(f"{v:.1f}" if n in used else f"**{v:.1f}**" for n, v in fits.items())
-        yield "+".join(used), told, numbers(found), f"{time.process_time() - begun:.0f} s"
+        fits_text = ", ".join(f"{v:.1f}" if n in names else f"**{v:.1f}**" for n, v in fits.items())
+        yield "+".join(names), fits_text, numbers(result), f"{time.process_time() - start_time:.0f} s"
 
 
 ONE_AND_BOTH = (("psf",), ("lqr",), ("psf", "lqr"))
 
 
-def measured() -> Iterator[str]:
+def measurements() -> Iterator[str]:
     """Physics piece by piece, whole orders; the run that was not fitted to in bold."""
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
     yield "| output | physics | fitted on | psf, lqr | numbers | time |"
     yield "| --- | --- | --- | --- | --- | --- |"
-    rows = [(o, name, words(o, text), seen, zero) for o, stages in STAGES.items() for name, text, seen, zero in stages]
-    rows += [(text[4:11], name, text, seen, zero) for name, text, seen, zero in OTHERS]
-    for output, name, text, seen, zero in rows:
-        for row in judged(runs, structure(text, seen, zero), ONE_AND_BOTH):
+    rows = [
+        (o, name, words(o, text), filtered, zero)
+        for o, stages in STAGES.items()
+        for name, text, filtered, zero in stages
+    ]
+    rows += [(text[4:11], name, text, filtered, zero) for name, text, filtered, zero in OTHERS]
+    for output, name, text, filtered, zero in rows:
+        for row in validation_rows(runs, structure(text, filtered, zero), ONE_AND_BOTH):
             yield f"| {output} | {name} | {' | '.join(row)} |"
 
 
@@ -241,12 +245,12 @@ def orders(outputs: Sequence[str] = ("theta12", "theta22")) -> Iterator[str]:
     yield "| output | physics so far | order free | fitted on | psf, lqr | the order, 95 % |"
     yield "| --- | --- | --- | --- | --- | --- |"
     for output, stages in ((o, STAGES[o]) for o in outputs):
-        for name, text, seen, zero in stages:
+        for name, text, filtered, zero in stages:
             for freed in FREED:
-                made = structure(words(output, text, freed), seen, zero)
-                for used, told, values, _ in judged(runs, made, ONE_AND_BOTH[:2]):
+                model_structure = structure(words(output, text, freed), filtered, zero)
+                for names, fits_text, values, _ in validation_rows(runs, model_structure, ONE_AND_BOTH[:2]):
                     order = next((v for v in values.split(", ") if v.startswith(("beta", "mu", "gamma"))), "")
-                    yield f"| {output} | {name} | {freed} | {used} | {told} | {order} |"
+                    yield f"| {output} | {name} | {freed} | {names} | {fits_text} | {order} |"
 
 
 #: Equations whose gauges are compared: what the hubs' motion drives, in which the own gauge's gain stands, and what
@@ -265,35 +269,37 @@ def gains() -> Iterator[str]:
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
     yield "| output | fitted on | judged on | as fitted | with its gains | own gain | ratio |"
     yield "| --- | --- | --- | --- | --- | --- | --- |"
-    seen = ("theta12", "theta22")
+    filtered = ("theta12", "theta22")
     for output, (hubs, other) in GAUGES.items():
         driving = " ".join(f"+ {c} D^{m} {n}" if c else f"- D^{m} {n}" for n, m, c in (*hubs, *other))
-        made = structure(f"D^2 {output} = a {output} + d D {output} {driving}".replace("D^0 ", ""), seen, offset=True)
-        for used, judge in (("psf", "lqr"), ("lqr", "psf")):
-            found = fitted([runs[used]], made)
-            known, run = found.coefficients, runs[judge]
+        model_structure = structure(
+            f"D^2 {output} = a {output} + d D {output} {driving}".replace("D^0 ", ""), filtered, offset=True
+        )
+        for name, judge in (("psf", "lqr"), ("lqr", "psf")):
+            result = fit_quadratic([runs[name]], model_structure)
+            coefficients, run = result.coefficients, runs[judge]
             # SciPy's responses of the fitted link: the two gains are linear in them.
             table = lsim_link.columns(
                 {n: np.asarray(run[n]) for n in ANGLES},
                 run.step,
-                known["a"],
-                known["d"],
+                coefficients["a"],
+                coefficients["d"],
                 [(n, m) for n, m, _ in (*hubs, *other)],
-                seen,
+                filtered,
                 offset=True,
             )
-            parts = [known[c] if c else -1.0 for *_, c in (*hubs, *other)]
+            parts = [coefficients[c] if c else -1.0 for *_, c in (*hubs, *other)]
             shares = table[:, : len(hubs)] @ parts[: len(hubs)], table[:, len(hubs) : len(parts)] @ parts[len(hubs) :]
             columns = np.column_stack((*shares, table[:, len(parts) :]))
             size = np.linalg.norm(columns, axis=0)
             gain = np.linalg.lstsq(columns / size, run[output], rcond=1e-12)[0] / size
             free = run[output] - np.column_stack(shares).sum(axis=1)
             rest = columns[:, 2:]
-            left = free - rest @ np.linalg.lstsq(rest, free, rcond=1e-12)[0]
-            fits = [lsim_link.fit(run[output], e) for e in (left, run[output] - columns @ gain)]
-            ours = found.model.compare(run).fit[output]
+            residual = free - rest @ np.linalg.lstsq(rest, free, rcond=1e-12)[0]
+            fits = [lsim_link.fit(run[output], e) for e in (residual, run[output] - columns @ gain)]
+            ours = result.model.compare(run).fit[output]
             yield (
-                f"| {output} | {used} | {judge} | **{ours:.1f}** (SciPy {fits[0]:.1f}) | {fits[1]:.1f} | "
+                f"| {output} | {name} | {judge} | **{ours:.1f}** (SciPy {fits[0]:.1f}) | {fits[1]:.1f} | "
                 f"{gain[0]:.3f} | {gain[1]:.3f} |"
             )
 
@@ -335,19 +341,19 @@ def hubs() -> Iterator[str]:
     sensor = ftlm.SensorFilter.low_pass(["theta12", "theta22"])
     for name, more in (("own damping", ("", "")), ("and rates of the other", RATES)):
         words = [text + rate for text, rate in zip(LINKS, more, strict=True)]
-        made = ftlm.equation("\n".join(words), sensor_filter=sensor, offset="constant", initial="caputo")
-        made = replace(made, coupling="simulated")
-        for used in ("psf", "lqr"):
+        structure = ftlm.equation("\n".join(words), sensor_filter=sensor, offset="constant", initial="caputo")
+        structure = replace(structure, coupling="simulated")
+        for run_name in ("psf", "lqr"):
             start = NEAR | ({"w2": 0.0, "w4": 0.0} if more[0] else {})
-            found = ftlm.identify(
-                runs[used], made, method=ftlm.OutputError(intervals="quadratic", start=start), threads=1
+            result = ftlm.identify(
+                runs[run_name], structure, method=ftlm.OutputError(intervals="quadratic", start=start), threads=1
             )
-            fits = {n: found.model.compare(r).fit for n, r in runs.items()}
-            told = " | ".join(
-                ", ".join(f"{f[y]:.1f}" if n == used else f"**{f[y]:.1f}**" for n, f in fits.items())
-                for y in made.outputs
+            fits = {n: result.model.compare(r).fit for n, r in runs.items()}
+            fits_text = " | ".join(
+                ", ".join(f"{f[y]:.1f}" if n == run_name else f"**{f[y]:.1f}**" for n, f in fits.items())
+                for y in structure.outputs
             )
-            yield f"| {name} | {used} | {told} | {numbers(found)} |"
+            yield f"| {name} | {run_name} | {fits_text} | {numbers(result)} |"
 
 
 def rival() -> Iterator[str]:
@@ -391,12 +397,12 @@ def steps() -> Iterator[str]:
     yield "| θ₁₂ | five fitted | four other LQG | nine LQR | all thirteen | numbers |"
     yield "| --- | --- | --- | --- | --- | --- |"
     for name, (text, freed, zero) in SINGLE.items():
-        found = fitted([runs[n] for n in FIVE], structure(words("theta12", text, freed), ["theta12"], zero))
-        fits = {n: found.model.compare(r).fit["theta12"] for n, r in runs.items()}
+        result = fit_quadratic([runs[n] for n in FIVE], structure(words("theta12", text, freed), ["theta12"], zero))
+        fits = {n: result.model.compare(r).fit["theta12"] for n, r in runs.items()}
         own = [fits[n] for n in FIVE]
         lqg = [v for n, v in fits.items() if n.startswith("lqg") and n not in FIVE]
         lqr = [v for n, v in fits.items() if n.startswith("lqr")]
-        yield f"| {name} | {spread(own)} | {spread(lqg)} | {spread(lqr)} | {spread(lqg + lqr)} | {numbers(found)} |"
+        yield f"| {name} | {spread(own)} | {spread(lqg)} | {spread(lqr)} | {spread(lqg + lqr)} | {numbers(result)} |"
 
 
 def left_out() -> Iterator[str]:
@@ -406,11 +412,11 @@ def left_out() -> Iterator[str]:
     yield f"| left out | {' | '.join(kinds)} |"
     yield "| --- | --- | --- |"
     fits: dict[str, list[float]] = {k: [] for k in kinds}
-    for left, run in runs.items():
+    for name, run in runs.items():
         for kind in kinds:
             text, freed, zero = SINGLE[kind]
-            made = structure(words("theta12", text, freed), ["theta12"], zero)
-            found = fitted([r for n, r in runs.items() if n != left], made)
-            fits[kind].append(found.model.compare(run).fit["theta12"])
-        yield f"| {left} | {' | '.join(f'{v[-1]:.1f}' for v in fits.values())} |"
+            model_structure = structure(words("theta12", text, freed), ["theta12"], zero)
+            result = fit_quadratic([r for n, r in runs.items() if n != name], model_structure)
+            fits[kind].append(result.model.compare(run).fit["theta12"])
+        yield f"| {name} | {' | '.join(f'{v[-1]:.1f}' for v in fits.values())} |"
     yield f"| median (least) | {' | '.join(spread(v) for v in fits.values())} |"

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 import ftlm
-from state_space import ABSENT, SEEDS, LinearModel, Scale, best, fitted, judged
+from state_space import ABSENT, SEEDS, LinearModel, Scale, best, fit_percent, train
 
 ORDERS = (2, 4, 6)
 
@@ -27,19 +27,19 @@ def rows(runs: dict[str, ftlm.Run], uses: dict[str, tuple[str, ...]]) -> Iterato
     for output, inputs in uses.items():
         all_of = {n: signals(run, output, inputs) for n, run in runs.items()}
         for order in ORDERS:
-            for used in (("psf",), ("lqr",), ("psf", "lqr")):
-                begun = time.process_time()
-                scale = Scale.of([all_of[n] for n in used])
-                seen = [scale.scaled(all_of[n]) for n in used]
-                model = best([fitted(seen, order, seed) for seed in range(SEEDS)])
+            for names in (("psf",), ("lqr",), ("psf", "lqr")):
+                start_time = time.process_time()
+                scale = Scale.of([all_of[n] for n in names])
+                training = [scale.scaled(all_of[n]) for n in names]
+                model = best([train(training, order, seed) for seed in range(SEEDS)])
                 if model is None:
-                    yield output, str(order), "", "+".join(used), "no start has a finite free run", ""
+                    yield output, str(order), "", "+".join(names), "no start has a finite free run", ""
                     continue
-                fits = {n: judged(model, scale, run) for n, run in all_of.items()}
-                told = [f"{fit:.1f}" if n in used else f"**{fit:.1f}**" for n, fit in fits.items()]
+                fits = {n: fit_percent(model, scale, run) for n, run in all_of.items()}
+                fits_text = [f"{fit:.1f}" if n in names else f"**{fit:.1f}**" for n, fit in fits.items()]
                 count = order * order + order * (len(inputs) + 1) + len(inputs)
-                taken = f"{time.process_time() - begun:.0f} s"
-                yield output, str(order), str(count), "+".join(used), ", ".join(told), taken
+                time_text = f"{time.process_time() - start_time:.0f} s"
+                yield output, str(order), str(count), "+".join(names), ", ".join(fits_text), time_text
 
 
 def signals(run: ftlm.Run, output: str, inputs: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 import ftlm
 from automatic_plants import NOISE_RATIOS, PLANTS, drawn_plants
 from measured import DATA
-from results import Kept, heading, save
+from results import ResultStore, heading, save
 
 #: Orders that the rivals try, and block rows of the subspace method.
 ORDERS, BLOCK_ROWS = range(1, 7), 15
@@ -36,8 +36,8 @@ ORDERS, BLOCK_ROWS = range(1, 7), 15
 DRAWN_SEED = 2026
 
 #: A state space (A, B, C, D) from input and output.
-Fitted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-Rival = Callable[[np.ndarray, np.ndarray, int], Fitted]
+StateSpace = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Rival = Callable[[np.ndarray, np.ndarray, int], StateSpace]
 
 
 def percent(y: np.ndarray, free: np.ndarray) -> float:
@@ -45,7 +45,7 @@ def percent(y: np.ndarray, free: np.ndarray) -> float:
     return 100 * (1 - float(np.linalg.norm(y - free) / np.linalg.norm(y - y.mean())))
 
 
-def by_subspace(u: np.ndarray, y: np.ndarray, order: int) -> Fitted:
+def by_subspace(u: np.ndarray, y: np.ndarray, order: int) -> StateSpace:
     """State space by nfoursid."""
     import pandas as pd  # noqa: PLC0415
     from nfoursid.nfoursid import NFourSID  # noqa: PLC0415
@@ -54,11 +54,11 @@ def by_subspace(u: np.ndarray, y: np.ndarray, order: int) -> Fitted:
         pd.DataFrame({"u": u, "y": y}), input_columns=["u"], output_columns=["y"], num_block_rows=BLOCK_ROWS
     )
     method.subspace_identification()
-    found, _ = method.system_identification(rank=order)
-    return found.a, found.b, found.c, found.d
+    system, _ = method.system_identification(rank=order)
+    return system.a, system.b, system.c, system.d
 
 
-def by_state_space(u: np.ndarray, y: np.ndarray, order: int) -> Fitted:
+def by_state_space(u: np.ndarray, y: np.ndarray, order: int) -> StateSpace:
     """State space by jax-sysid: L-BFGS on the simulation error."""
     import jax  # noqa: PLC0415
     from jax_sysid.models import LinearModel  # noqa: PLC0415
@@ -73,12 +73,12 @@ def by_state_space(u: np.ndarray, y: np.ndarray, order: int) -> Fitted:
     return a, b / sizes[0], c * sizes[1], d * sizes[1] / sizes[0]
 
 
-def simulate(fitted: Fitted, u: np.ndarray) -> np.ndarray:
+def simulate(system: StateSpace, u: np.ndarray) -> np.ndarray:
     """Simulate from rest."""
-    return np.ravel(dlsim((*fitted, 1.0), u[:, None])[1])
+    return np.ravel(dlsim((*system, 1.0), u[:, None])[1])
 
 
-def rival(method: Rival, u: np.ndarray, y: np.ndarray) -> Fitted:
+def rival(method: Rival, u: np.ndarray, y: np.ndarray) -> StateSpace:
     """Fit with the order that predicts the last quarter best."""
     part = 3 * u.size // 4
     scores = {}
@@ -101,23 +101,23 @@ RIVALS: dict[str, tuple[str, Rival]] = {
 def compare(run: ftlm.Run, other: ftlm.Run, after: int) -> dict[str, Any]:
     """Fit of each method on the rows of another run from `after` on, and its processor time [s]."""
     row: dict[str, Any] = {}
-    y, begun = other["y"][after:], time.process_time()
-    found = ftlm.select(run, "auto", threads=1)
-    row["ftlm"] = [0.0, time.process_time() - begun]
-    row["ftlm"][0] = percent(y, ftlm.compare(found.best.model, other).simulated["y"][0][after:])
-    row["chosen"] = found.winner.name
+    y, start_time = other["y"][after:], time.process_time()
+    selection = ftlm.select(run, "auto", threads=1)
+    row["ftlm"] = [0.0, time.process_time() - start_time]
+    row["ftlm"][0] = percent(y, ftlm.compare(selection.best.model, other).simulated["y"][0][after:])
+    row["chosen"] = selection.winner.name
     u0, y0 = (float(run[n][0]) for n in "uy") if run.name == "heating" else (0.0, 0.0)
     for name, (package, method) in RIVALS.items():
         if find_spec(package) is None:
             continue
-        begun = time.process_time()
-        fitted = rival(method, run["u"] - u0, run["y"] - y0)
-        spent = time.process_time() - begun
-        row[name] = [percent(y, y0 + simulate(fitted, other["u"] - u0)[after:]), spent]
+        start_time = time.process_time()
+        system = rival(method, run["u"] - u0, run["y"] - y0)
+        seconds = time.process_time() - start_time
+        row[name] = [percent(y, y0 + simulate(system, other["u"] - u0)[after:]), seconds]
     return row
 
 
-def measured(name: str) -> tuple[ftlm.Run, ftlm.Run, int]:
+def measurement(name: str) -> tuple[ftlm.Run, ftlm.Run, int]:
     """First half of a measured record, all of it, and the row from which it is judged."""
     if name == "robot_arm":
         table = np.loadtxt(DATA / "robot_arm" / "robot_arm.dat")
@@ -143,15 +143,15 @@ def cases(groups: list[str], seeds: int) -> Iterator[tuple[str, str, Callable[[]
                 other = plant.run(6000 + seed, noise=0.0, name=f"{name}, unseen")
                 yield f"{group} plants", f"{name}, seed {seed}", functools.partial(compare, run, other, 0)
     for name in ("robot_arm", "heating") if "measured" in groups else ():
-        yield name, name, functools.partial(compare, *measured(name))
+        yield name, name, functools.partial(compare, *measurement(name))
 
 
-def summarize(found: list[list[float]]) -> str:
+def summarize(rows: list[list[float]]) -> str:
     """Median and least fit, and median processor time."""
-    if not found:
+    if not rows:
         return ""
-    fits, spent = zip(*found, strict=True)
-    return f"median {np.median(fits):.2f} %, least {min(fits):.2f} %, {np.median(spent):.1f} s"
+    fits, seconds = zip(*rows, strict=True)
+    return f"median {np.median(fits):.2f} %, least {min(fits):.2f} %, {np.median(seconds):.1f} s"
 
 
 def main() -> None:
@@ -161,14 +161,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--kept", type=Path, help="file of records that are done, to go on from")
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     warnings.simplefilter("ignore")
-    kept, methods = Kept(given.kept), ["ftlm", *RIVALS]
+    store, methods = ResultStore(arguments.kept), ["ftlm", *RIVALS]
     lines = [heading(), "", "| record | " + " | ".join(methods) + " |", "|" + " --- |" * (1 + len(methods))]
     print("\n".join(lines), flush=True)
     groups: dict[str, list[dict[str, Any]]] = {}
-    for group, name, measure in cases(given.plants.split(","), given.seeds):
-        row = kept.row(name, measure)
+    for group, name, measure in cases(arguments.plants.split(","), arguments.seeds):
+        row = store.row(name, measure)
         groups.setdefault(group, []).append(row)
         cells = [f"{row[m][0]:.2f} %, {row[m][1]:.1f} s" if m in row else "" for m in methods]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
@@ -178,7 +178,7 @@ def main() -> None:
         cells = [summarize([row[m] for row in rows if m in row]) for m in methods]
         summary.append(f"| {group} | " + " | ".join(cells) + " |")
     print("\n".join(summary))
-    if given.write:
+    if arguments.write:
         save([*summary, *lines])
 
 

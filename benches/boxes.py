@@ -56,22 +56,22 @@ def main() -> None:
         for step in arguments.steps:
             lattice = ftlm.order_grid(increment=step, alpha=tuple(arguments.alpha))
             wall, cpu = time.perf_counter(), time.process_time()
-            found = ftlm.search_orders(run, equation, lattice, **options)
+            result = ftlm.search_orders(run, equation, lattice, **options)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-            grown = ""
+            growth = ""
             if before is not None:
-                exponent = math.log(cpu / before[1]) / math.log(found.candidates / before[0])
-                grown = f", growth as candidates^{exponent:.2f}"
-            before = found.candidates, cpu
-            searches.append({"run": name, "step": step, "candidates": found.candidates, "processor": round(cpu, 2)})
-            best = ", ".join(f"{n} {v:g}" for n, v in found.table[0].orders.items())
+                exponent = math.log(cpu / before[1]) / math.log(result.candidates / before[0])
+                growth = f", growth as candidates^{exponent:.2f}"
+            before = result.candidates, cpu
+            searches.append({"run": name, "step": step, "candidates": result.candidates, "processor": round(cpu, 2)})
+            best = ", ".join(f"{n} {v:g}" for n, v in result.table[0].orders.items())
             lines.append(
-                f"{name}, step {step:g}: {found.candidates} candidates, {cpu:.1f} s of processors, {wall:.1f} s, "
-                f"{cpu / found.candidates * 1e9:.1f} ns each{grown}; bound {found.exclusion_counts['bound']} "
-                f"({found.excluded_by_box} in boxes), stopped early "
-                f"{found.exclusion_counts['stopped early']}, beaten {found.exclusion_counts['beaten']}; best "
-                f"{found.table[0].score:.6g} "
-                f"({best}), last kept {found.table[-1].score:.6g}"
+                f"{name}, step {step:g}: {result.candidates} candidates, {cpu:.1f} s of processors, {wall:.1f} s, "
+                f"{cpu / result.candidates * 1e9:.1f} ns each{growth}; bound {result.exclusion_counts['bound']} "
+                f"({result.excluded_by_box} in boxes), stopped early "
+                f"{result.exclusion_counts['stopped early']}, beaten {result.exclusion_counts['beaten']}; best "
+                f"{result.table[0].score:.6g} "
+                f"({best}), last kept {result.table[-1].score:.6g}"
             )
             print(lines[-1], flush=True)
             if arguments.against_brute_force:
@@ -80,7 +80,7 @@ def main() -> None:
                 cpu = time.process_time() - cpu
                 # Every candidate was run: what is not kept was beaten, or has no score.
                 followed = len(brute.table) + sum(brute.exclusion_counts[k] for k in ("beaten", "singular", "diverged"))
-                same = found.table == brute.table and followed == brute.candidates == found.candidates
+                same = result.table == brute.table and followed == brute.candidates == result.candidates
                 lines.append(
                     f"{name}, step {step:g}: all {followed} candidates run to their end in {cpu:.0f} s of processors, "
                     f"{cpu / followed * 1e6:.1f} us each; the {len(brute.table)} kept rows (index, score, orders, "
@@ -91,8 +91,8 @@ def main() -> None:
                     raise SystemExit("the search and brute force disagree")
     if arguments.write:
         save([f"- {line}" for line in lines])
-        measured = {"commit": commit(), "machine": machine(), "load": os.getloadavg()[0], "searches": searches}
-        GROWTH.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+        content = {"commit": commit(), "machine": machine(), "load": os.getloadavg()[0], "searches": searches}
+        GROWTH.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

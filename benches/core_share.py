@@ -22,24 +22,24 @@ class CoreClock:
     """Wall time during which at least one thread computes in the core."""
 
     def __init__(self) -> None:
-        self.inside, self._depth, self._begun, self._lock = 0.0, 0, 0.0, threading.Lock()
+        self.inside, self._depth, self._start_time, self._lock = 0.0, 0, 0.0, threading.Lock()
 
-    def note(self, _frame: object, event: str, called: object) -> None:
+    def note(self, _frame: object, event: str, function: object) -> None:
         """Count calls of the core: a profile function."""
         if event not in ("c_call", "c_return", "c_exception"):
             return
-        owner = getattr(called, "__self__", None)
-        names = getattr(owner, "__name__", ""), type(owner).__module__, getattr(called, "__module__", "")
+        owner = getattr(function, "__self__", None)
+        names = getattr(owner, "__name__", ""), type(owner).__module__, getattr(function, "__module__", "")
         if "ftlm._core" not in names:
             return
         with self._lock:
             now = time.perf_counter()
             if event == "c_call":
-                self._begun = now if self._depth == 0 else self._begun
+                self._start_time = now if self._depth == 0 else self._start_time
                 self._depth += 1
             else:
                 self._depth -= 1
-                self.inside += now - self._begun if self._depth == 0 else 0.0
+                self.inside += now - self._start_time if self._depth == 0 else 0.0
 
 
 def main() -> None:
@@ -51,13 +51,13 @@ def main() -> None:
     rows = ["| equation | wall [s] | outside the core [s] | share |", "| --- | --- | --- | --- |"]
     for name, words in WORDS.items():
         structure = ftlm.equation(words, sensor_filter=ftlm.SensorFilter.low_pass(FILTERED))
-        clock, begun = CoreClock(), time.perf_counter()
+        clock, start_time = CoreClock(), time.perf_counter()
         threading.setprofile(clock.note)
         sys.setprofile(clock.note)
         ftlm.identify(runs, structure)
         sys.setprofile(None)
         threading.setprofile(None)
-        wall = time.perf_counter() - begun
+        wall = time.perf_counter() - start_time
         outside = wall - clock.inside
         rows.append(f"| {name} | {wall:.2f} | {outside:.2f} | {100 * outside / wall:.1f} % |")
     print("\n".join(rows))

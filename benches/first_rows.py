@@ -65,14 +65,14 @@ def measure(case: str, initial: str) -> dict[str, object]:
     else:
         run, structure = simulated(source, words), ftlm.equation(SIMULATED[words], initial=initial)
     identify, before = ftlm.identify, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    begun = time.process_time()
-    found = identify(run, structure, threads=1)
-    seconds = time.process_time() - begun
-    taken = str(found.settings["initial"]).partition(",")[0] + (
-        " at a level" if found.settings.get("offset") == "level" else ""
+    start_time = time.process_time()
+    result = identify(run, structure, threads=1)
+    seconds = time.process_time() - start_time
+    initial_text = str(result.settings["initial"]).partition(",")[0] + (
+        " at a level" if result.settings.get("offset") == "level" else ""
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"seconds": seconds, "peak": peak, "before": before, "taken": taken, "fit": min(found.fit.values())}
+    return {"seconds": seconds, "peak": peak, "before": before, "taken": initial_text, "fit": min(result.fit.values())}
 
 
 def apart(case: str, initial: str, repeats: int) -> dict[str, object]:
@@ -92,24 +92,24 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--initial", help=argparse.SUPPRESS)
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
-    given = parser.parse_args()
-    if given.initial:
-        print(json.dumps(measure(given.cases[0], given.initial)))
+    arguments = parser.parse_args()
+    if arguments.initial:
+        print(json.dumps(measure(arguments.cases[0], arguments.initial)))
         return
     lines = [heading(), ""]
     lines += ["| run | from rest: s, MB | default: s, MB | times as long | as much memory | start taken | fit |"]
     lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
     for line in lines:
         print(line)
-    for case in given.cases:
-        rest, auto = (apart(case, initial, given.repeats) for initial in ("rest", "auto"))
+    for case in arguments.cases:
+        rest, auto = (apart(case, initial, arguments.repeats) for initial in ("rest", "auto"))
         lines.append(
             f"| {case} | {rest['seconds']:.2f}, {rest['peak']:.0f} | {auto['seconds']:.2f}, {auto['peak']:.0f} | "
             f"{auto['seconds'] / rest['seconds']:.1f} | {auto['peak'] / rest['peak']:.2f} | {auto['taken']} | "
             f"{rest['fit']:.2f}, {auto['fit']:.2f} |"
         )
         print(lines[-1], flush=True)
-    if given.write:
+    if arguments.write:
         save(lines)
 
 

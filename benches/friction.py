@@ -42,9 +42,9 @@ STICKS = {"v": 0.5, "k": 4.0, "g": 4.0, "fc": 0.5, "fs": 0.5, "vs": 0.2}
 ARM = "D^2 x = a q + d D q - b D x + g u - fc*sign(D x); D^2 q = - 1 D^2 x - k q - e D q"
 ARM_TRUTH = {"a": 30.0, "d": 0.4, "b": 1.5, "g": 1.0, "fc": 4.0, "k": 90.0, "e": 1.2}
 #: Steps that are fitted; the amplifier of the arm clips its command at a limit that the fit is left to find.
-FITTED = ("30", "20", "minus10", "minus20")
-JUDGED = ("10", "minus30", "0_return", "5", "minus5")
-SEEN = ("30", "20", "minus10", "minus30")
+ESTIMATION_STEPS = ("30", "20", "minus10", "minus20")
+VALIDATION_STEPS = ("10", "minus30", "0_return", "5", "minus5")
+SATURATION_STEPS = ("30", "20", "minus10", "minus30")
 SATURATES = "sat(I1, 0.3:3)"
 
 
@@ -66,20 +66,20 @@ def recovery(seeds: int) -> None:
         structure = ftlm.equation(words, initial="caputo", orders=orders)
         names = (*orders, "v", "g", "fc")
         for noise in (0.002, 0.02):
-            scores, taken = [], []
+            scores, times = [], []
             for seed in range(seeds):
-                begun = time.process_time()
-                found = ftlm.identify([cart(2 * seed, noise), cart(2 * seed + 1, noise)], structure, threads=1)
-                taken.append(time.process_time() - begun)
-                values = {**found.orders, **found.coefficients}
-                scores.append([(values[n] - TRUTH[n]) / found.standard_errors[n] for n in names])
+                start_time = time.process_time()
+                result = ftlm.identify([cart(2 * seed, noise), cart(2 * seed + 1, noise)], structure, threads=1)
+                times.append(time.process_time() - start_time)
+                values = {**result.orders, **result.coefficients}
+                scores.append([(values[n] - TRUTH[n]) / result.standard_errors[n] for n in names])
             z = np.array(scores)
             inside = ", ".join(f"{n} {c}" for n, c in zip(names, np.sum(np.abs(z) < 1.96, axis=0), strict=True))
             mean = ", ".join(f"{v:+.2f}" for v in z.mean(axis=0))
             order = "free" if orders else "2"
             print(
                 f"| {order} | {noise:g} | {inside} of {seeds} | {mean} | {np.abs(z).max():.2f} | "
-                f"{statistics.median(taken):.2g} |",
+                f"{statistics.median(times):.2g} |",
                 flush=True,
             )
 
@@ -103,25 +103,25 @@ def covered(
     structure: ftlm.Structure, records: Iterable[list[ftlm.Run]], truth: dict[str, float]
 ) -> tuple[np.ndarray, str, list[float]]:
     """Scores of fits to each of some records, how many intervals hold the truth, and processor time of each."""
-    scores, inside, taken = [], [], []
+    scores, inside, times = [], [], []
     for runs in records:
-        begun = time.process_time()
-        found = ftlm.identify(runs, structure, threads=1)
-        taken.append(time.process_time() - begun)
-        scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in truth.items()])
-        inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in truth.items()])
+        start_time = time.process_time()
+        result = ftlm.identify(runs, structure, threads=1)
+        times.append(time.process_time() - start_time)
+        scores.append([(result.coefficients[n] - v) / result.standard_errors[n] for n, v in truth.items()])
+        inside.append([result.intervals[n][0] <= v <= result.intervals[n][1] for n, v in truth.items()])
     counts = ", ".join(f"{n} {c}" for n, c in zip(truth, np.sum(inside, axis=0), strict=True))
-    return np.array(scores), counts, taken
+    return np.array(scores), counts, times
 
 
 def stribeck(seeds: int) -> None:
     """Coverage of 95 % intervals of a body that sticks and slips, a run a fit."""
     structure = ftlm.equation(SLEDGE, initial="rest")
     for noise in (0.002, 0.005, 0.02):
-        z, counts, taken = covered(structure, ([sledge(seed, noise)] for seed in range(seeds)), STICKS)
+        z, counts, times = covered(structure, ([sledge(seed, noise)] for seed in range(seeds)), STICKS)
         mean = ", ".join(f"{v:+.2f}" for v in z.mean(axis=0))
         print(
-            f"| {noise:g} | {counts} of {seeds} | {mean} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
+            f"| {noise:g} | {counts} of {seeds} | {mean} | {np.abs(z).max():.2f} | {statistics.median(times):.2g} |",
             flush=True,
         )
 
@@ -152,14 +152,14 @@ def coupled(seeds: int) -> None:
     for noise, moving in ((0.003, False), (0.02, False), (0.003, True)):
         more = {"initial": "caputo", "offset": "constant"} if moving else {"initial": "rest"}
         pairs = ((0.5, (0.2, 0.8, 0.02, -0.1)), (-0.3, (0.0, 0.0, 0.03, 0.0)))
-        moved = (
+        moving_runs = (
             [arm(2 * seed + k, noise, offset=o, start=s) for k, (o, s) in enumerate(pairs)] for seed in range(seeds)
         )
         still = ([arm(seed, noise)] for seed in range(seeds))
-        z, counts, taken = covered(ftlm.equation(ARM, **more), moved if moving else still, ARM_TRUTH)
+        z, counts, times = covered(ftlm.equation(ARM, **more), moving_runs if moving else still, ARM_TRUTH)
         kind = "two runs in motion, offsets" if moving else "one run from rest"
         print(
-            f"| {noise:g} | {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
+            f"| {noise:g} | {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(times):.2g} |",
             flush=True,
         )
 
@@ -169,9 +169,9 @@ def two(seeds: int) -> None:
     truth = {**two_frictions.TRUTH, **two_frictions.STRENGTH}
     for start in ((0.0,) * 4, (0.2, 0.8, -0.1, -0.6)):
         structure = ftlm.equation(two_frictions.WORDS, initial="caputo" if any(start) else "rest")
-        z, counts, taken = covered(structure, ([two_frictions.noisy(seed, start)] for seed in range(seeds)), truth)
+        z, counts, times = covered(structure, ([two_frictions.noisy(seed, start)] for seed in range(seeds)), truth)
         kind = "in motion" if any(start) else "from rest"
-        print(f"| {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |", flush=True)
+        print(f"| {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(times):.2g} |", flush=True)
 
 
 def coupled_measured() -> None:
@@ -183,7 +183,7 @@ def coupled_measured() -> None:
     whole = {"alpha1": 2.0, "gamma1": 1.0, "beta2": 0.0, "mu2": 1.0}
     for rubs in (False, True):
         arm1 = ftlm.flexible_link(coupling="simulated", friction=rubs, offset="constant").with_orders(whole)
-        told(replace(arm1, initial="caputo"), [runs["psf"]], runs)
+        print_fit(replace(arm1, initial="caputo"), [runs["psf"]], runs)
 
 
 def speed() -> None:
@@ -200,12 +200,12 @@ def speed() -> None:
 
 def timed(work: Any) -> float:
     """Median of five [s of processor time]."""
-    taken = []
+    times = []
     for _ in range(5):
-        begun = time.process_time()
+        start_time = time.process_time()
         work()
-        taken.append(time.process_time() - begun)
-    return statistics.median(taken)
+        times.append(time.process_time() - start_time)
+    return statistics.median(times)
 
 
 def run_of(path: Path, current: str, *, name: str, **options: Any) -> ftlm.Run:
@@ -226,7 +226,7 @@ def run_of(path: Path, current: str, *, name: str, **options: Any) -> ftlm.Run:
     )
 
 
-def measured() -> None:
+def measurements() -> None:
     """Hubs of the real arm, from the current and the measured deflection."""
     runs = {
         "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", window=(1.1, 19.5)),
@@ -235,14 +235,17 @@ def measured() -> None:
     for words in ("", RUBS):
         structure = ftlm.equation(HUB.format(current="I1", rubs=words), initial="caputo")
         for run in runs.values():
-            told(structure, [run], runs)
-    steps = {n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n) for n in (*FITTED, *JUDGED)}
+            print_fit(structure, [run], runs)
+    steps = {
+        n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n)
+        for n in (*ESTIMATION_STEPS, *VALIDATION_STEPS)
+    }
     # In the first four the command stays below what the amplifier gives; the limit is seen in the step of -30 degrees.
-    for fitted, current in ((FITTED, "I1"), (SEEN, "I1"), (SEEN, SATURATES)):
+    for names, current in ((ESTIMATION_STEPS, "I1"), (SATURATION_STEPS, "I1"), (SATURATION_STEPS, SATURATES)):
         for words in ("", RUBS):
-            told(
+            print_fit(
                 ftlm.equation(HUB.format(current=current, rubs=words), initial="caputo"),
-                [steps[n] for n in fitted],
+                [steps[n] for n in names],
                 steps,
             )
 
@@ -255,27 +258,32 @@ def measured_stribeck() -> None:
     }
     for words in (RUBS, RUBS + FALLS):
         for run in runs.values():
-            told(ftlm.equation(HUB.format(current="I1", rubs=words), initial="caputo"), [run], runs)
-    steps = {n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n) for n in (*FITTED, *JUDGED)}
+            print_fit(ftlm.equation(HUB.format(current="I1", rubs=words), initial="caputo"), [run], runs)
+    steps = {
+        n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n)
+        for n in (*ESTIMATION_STEPS, *VALIDATION_STEPS)
+    }
     for words in (RUBS, RUBS + FALLS):
-        told(
-            ftlm.equation(HUB.format(current=SATURATES, rubs=words), initial="caputo"), [steps[n] for n in SEEN], steps
+        print_fit(
+            ftlm.equation(HUB.format(current=SATURATES, rubs=words), initial="caputo"),
+            [steps[n] for n in SATURATION_STEPS],
+            steps,
         )
 
 
-def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm.Run]) -> None:
+def print_fit(structure: ftlm.Structure, estimation: list[ftlm.Run], runs: dict[str, ftlm.Run]) -> None:
     """Fit, print numbers with standard errors, and judge on every run."""
-    begun = time.process_time()
-    found = ftlm.identify(fitted, structure, threads=1)
-    taken = time.process_time() - begun
-    values = {n: v for n, v in {**found.coefficients, **found.limits}.items() if n in found.standard_errors}
-    numbers = ", ".join(f"{n} {v:.4g} ± {found.standard_errors[n]:.2g}" for n, v in values.items())
-    names = {run.name for run in fitted}
-    print(f"{structure}: {numbers}; {taken:.2g} s", flush=True)
-    for warning in found.warnings:
+    start_time = time.process_time()
+    result = ftlm.identify(estimation, structure, threads=1)
+    seconds = time.process_time() - start_time
+    values = {n: v for n, v in {**result.coefficients, **result.limits}.items() if n in result.standard_errors}
+    numbers = ", ".join(f"{n} {v:.4g} ± {result.standard_errors[n]:.2g}" for n, v in values.items())
+    names = {run.name for run in estimation}
+    print(f"{structure}: {numbers}; {seconds:.2g} s", flush=True)
+    for warning in result.warnings:
         print(f"    ! {warning}", flush=True)
     for name, run in runs.items():
-        there = found.model.compare(run)
+        there = result.model.compare(run)
         fits = ", ".join(f"{n} {v:.2f}" for n, v in there.fit.items())
         print(
             f"    {name} {'fitted' if name in names else 'judged'}: {fits}, "
@@ -292,17 +300,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=WHAT)
     parser.add_argument("--seeds", type=int, default=20)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     {
-        "recovery": lambda: recovery(asked.seeds),
-        "stribeck": lambda: stribeck(asked.seeds),
+        "recovery": lambda: recovery(arguments.seeds),
+        "stribeck": lambda: stribeck(arguments.seeds),
         "speed": speed,
-        "measured": measured,
+        "measured": measurements,
         "measured-stribeck": measured_stribeck,
-        "coupled": lambda: coupled(asked.seeds),
+        "coupled": lambda: coupled(arguments.seeds),
         "coupled-measured": coupled_measured,
-        "two": lambda: two(asked.seeds),
-    }[asked.what]()
+        "two": lambda: two(arguments.seeds),
+    }[arguments.what]()
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ NORMAL_95 = 1.959963984540054
 PROCESSES = 1
 
 
-def told(names: list[str], numbers: np.ndarray, form: str) -> str:
+def cell(names: list[str], numbers: np.ndarray, form: str) -> str:
     """Numbers by name on one line."""
     return ", ".join(f"{n} {v:{form}}" for n, v in zip(names, numbers, strict=True))
 
@@ -45,11 +45,11 @@ def halves(name: str, seed: int) -> tuple[list[list[float]], list[list[float]], 
     first, second = motion.pieces(plant, seed)
     z, values, errors = [], [], []
     for run, initial in ((first, "auto"), (second, "auto"), (second, "caputo")):
-        found = ftlm.identify(run, ftlm.equation(plant.words, initial=initial), threads=1)
-        z.append(list(motion.scores(found, plant).values()))
-        numbers = {**found.orders, **found.coefficients}
+        result = ftlm.identify(run, ftlm.equation(plant.words, initial=initial), threads=1)
+        z.append(list(motion.scores(result, plant).values()))
+        numbers = {**result.orders, **result.coefficients}
         values.append([numbers[n] for n in plant.truth])
-        errors.append([found.standard_errors[n] for n in plant.truth])
+        errors.append([result.standard_errors[n] for n in plant.truth])
     return z, values, errors
 
 
@@ -59,15 +59,15 @@ def intervals(plants: list[str], seeds: int) -> Iterator[str]:
     with ProcessPoolExecutor(PROCESSES) as pool:
         for name in plants:
             z, values, errors = (np.array(x) for x in zip(*pool.map(partial(halves, name), range(seeds)), strict=True))
-            held = np.abs(z) < NORMAL_95
+            hits = np.abs(z) < NORMAL_95
             apart = np.abs(values[:, 0] - values[:, 1]) / np.hypot(errors[:, 0], errors[:, 1]) < NORMAL_95
-            pooled.append((held[:, 0].ravel(), held[:, 1].ravel(), apart.ravel()))
+            pooled.append((hits[:, 0].ravel(), hits[:, 1].ravel(), apart.ravel()))
             names = list(motion.PLANTS[name].truth)
             yield (
-                f"alpha {name}, {seeds} seeds, within 95 % intervals: from rest {told(names, held[:, 0].sum(0), 'd')}; "
-                f"in motion {told(names, held[:, 1].sum(0), 'd')}; with Caputo's terms "
-                f"{told(names, held[:, 2].sum(0), 'd')}; halves agree {told(names, apart.sum(0), 'd')}; standard "
-                f"errors in motion over those from rest {told(names, np.median(errors[:, 1] / errors[:, 0], 0), '.2f')}"
+                f"alpha {name}, {seeds} seeds, within 95 % intervals: from rest {cell(names, hits[:, 0].sum(0), 'd')}; "
+                f"in motion {cell(names, hits[:, 1].sum(0), 'd')}; with Caputo's terms "
+                f"{cell(names, hits[:, 2].sum(0), 'd')}; halves agree {cell(names, apart.sum(0), 'd')}; standard "
+                f"errors in motion over those from rest {cell(names, np.median(errors[:, 1] / errors[:, 0], 0), '.2f')}"
             )
     rest, moving, agree = (100 * np.mean(np.concatenate(part)) for part in zip(*pooled, strict=True))
     yield f"pooled: from rest {rest:.1f} %, in motion {moving:.1f} %, halves agree {agree:.1f} %"
@@ -85,8 +85,8 @@ def after(name: str, wait: int | None, seed: int) -> tuple[list[float], str]:
     y = motion.response(plant, u, step)[lead:]
     y = y + 0.01 * np.std(y) * np.random.default_rng([seed, 2]).standard_normal(rows)
     run = ftlm.Run.from_arrays(step=step, inputs={"u": u[lead:]}, outputs={"y": y})
-    found = ftlm.identify(run, ftlm.equation(plant.words), threads=1)
-    return list(motion.scores(found, plant).values()), str(found.settings["initial"]).partition(",")[0]
+    result = ftlm.identify(run, ftlm.equation(plant.words), threads=1)
+    return list(motion.scores(result, plant).values()), str(result.settings["initial"]).partition(",")[0]
 
 
 def waits(plants: list[str], seeds: int) -> Iterator[str]:
@@ -96,10 +96,10 @@ def waits(plants: list[str], seeds: int) -> Iterator[str]:
             names = list(motion.PLANTS[name].truth)
             for wait in (None, 0, 20, 100, 400, 1600, 6400):
                 z, kinds = zip(*pool.map(partial(after, name, wait), range(seeds)), strict=True)
-                held = np.sum(np.abs(np.array(z)) < NORMAL_95, axis=0)
+                hits = np.sum(np.abs(np.array(z)) < NORMAL_95, axis=0)
                 when = "from rest" if wait is None else f"{wait} samples after a motion of 500"
-                chosen = ", ".join(f"{kind} {kinds.count(kind)}" for kind in sorted(set(kinds)))
-                yield f"alpha {name}, {when}, {seeds} seeds: within {told(names, held, 'd')}; initial terms: {chosen}"
+                terms = ", ".join(f"{kind} {kinds.count(kind)}" for kind in sorted(set(kinds)))
+                yield f"alpha {name}, {when}, {seeds} seeds: within {cell(names, hits, 'd')}; initial terms: {terms}"
 
 
 # ------------------------------------------------------------------------------------------------------ bases
@@ -205,7 +205,9 @@ def octaves(answer: np.ndarray, every: int) -> np.ndarray:
     return np.array([late - early for early, late in itertools.pairwise(after)])
 
 
-def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float, np.ndarray, np.ndarray, int]]:
+def residual_basis(
+    plant: motion.Plant, seed: int, noise: float
+) -> dict[str, tuple[float, np.ndarray, np.ndarray, int]]:
     """Of each basis: misfit over noise, bias and cost of each number in standard errors, and how many terms it has."""
     rows, over, step = 500, 4, 0.05
     m, fine = rows * over, step / over
@@ -231,9 +233,9 @@ def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float,
         for i in range(len(truth)):
             ends = []
             for sign in (1e-4, -1e-4):
-                moved = truth.copy()
-                moved[i] += sign
-                solved, drive = system(moved, m)
+                shifted = truth.copy()
+                shifted[i] += sign
+                solved, drive = system(shifted, m)
                 ends.append(times(solved, times(drive, u[m:]) + past))
             columns.append(samples(ends[0] - ends[1]) / 2e-4)
         return np.array(columns).T
@@ -255,12 +257,12 @@ def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float,
     alone = slopes(np.zeros(m))
     errors = np.sqrt(np.diag(np.linalg.inv(alone.T @ alone)))
     out = {}
-    for name, (made, kept) in BASES.items():
-        basis = made(plant, m, fine)
-        if kept:
-            seen = np.array([samples(times(solved, b)) for b in basis]).T
-            _, sizes, rows_of = np.linalg.svd(seen, full_matrices=False)
-            basis = [sum(v * b for v, b in zip(rows_of[i] / sizes[i], basis, strict=True)) for i in range(kept)]
+    for name, (make_basis, basis_size) in BASES.items():
+        basis = make_basis(plant, m, fine)
+        if basis_size:
+            responses = np.array([samples(times(solved, b)) for b in basis]).T
+            _, sizes, rows_of = np.linalg.svd(responses, full_matrices=False)
+            basis = [sum(v * b for v, b in zip(rows_of[i] / sizes[i], basis, strict=True)) for i in range(basis_size)]
         columns = np.array([samples(times(solved, b)) for b in basis]).T
         size = np.linalg.norm(columns, axis=0)
         spanned, _ = np.linalg.qr(columns / size)
@@ -269,9 +271,9 @@ def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float,
         sensitive -= spanned @ (spanned.T @ sensitive)
         missed = rest - spanned @ (spanned.T @ rest)
         covariance = np.linalg.inv(sensitive.T @ sensitive)
-        found = np.sqrt(np.diag(covariance))
-        bias = covariance @ (sensitive.T @ missed) / (sigma * found)
-        out[name] = (float(np.linalg.norm(missed) / sigma), bias, found / errors, len(basis))
+        deviations = np.sqrt(np.diag(covariance))
+        bias = covariance @ (sensitive.T @ missed) / (sigma * deviations)
+        out[name] = (float(np.linalg.norm(missed) / sigma), bias, deviations / errors, len(basis))
     # A past under a prior, whose size has the largest likelihood on one record with noise.
     columns = past_answers(truth)
     record = rest + sigma * np.random.default_rng([seed, 3]).standard_normal(rest.size)
@@ -282,17 +284,22 @@ def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float,
         x = ratio * np.linalg.solve(inner, columns.T @ record)
         deviance = (record @ record - record @ columns @ x) / sigma**2 + np.linalg.slogdet(inner)[1]
         if deviance < best:
-            best, chosen = deviance, (ratio, inner, x)
-    ratio, inner, x = chosen
+            best, best_point = deviance, (ratio, inner, x)
+    ratio, inner, x = best_point
 
     def whitened(v: np.ndarray) -> np.ndarray:
         return v - columns @ (ratio * np.linalg.solve(inner, columns.T @ v))
 
     sensitive = alone + sensitivities(x)
     covariance = np.linalg.inv(sensitive.T @ whitened(sensitive))
-    found, missed = np.sqrt(np.diag(covariance)), whitened(rest)
-    bias = covariance @ (sensitive.T @ missed) / (sigma * found)
-    out["octaves of the past, prior"] = (float(np.linalg.norm(missed) / sigma), bias, found / errors, columns.shape[1])
+    deviations, missed = np.sqrt(np.diag(covariance)), whitened(rest)
+    bias = covariance @ (sensitive.T @ missed) / (sigma * deviations)
+    out["octaves of the past, prior"] = (
+        float(np.linalg.norm(missed) / sigma),
+        bias,
+        deviations / errors,
+        columns.shape[1],
+    )
     return out
 
 
@@ -303,7 +310,7 @@ def bases(plants: list[str], seeds: int) -> Iterator[str]:
     """
     for name in plants:
         with ProcessPoolExecutor(PROCESSES) as pool:
-            tables = list(pool.map(partial(left, motion.PLANTS[name], noise=0.01), range(seeds)))
+            tables = list(pool.map(partial(residual_basis, motion.PLANTS[name], noise=0.01), range(seeds)))
         for basis in tables[0]:
             misfit, bias, cost, terms = zip(*(table[basis] for table in tables), strict=True)
             worst = float(np.max(np.sqrt(np.mean(np.array(bias) ** 2, axis=0))))
@@ -323,10 +330,10 @@ def main() -> None:
     parser.add_argument("--plants", default="|".join(motion.PLANTS))
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
     arguments = parser.parse_args()
-    measured = {"intervals": intervals, "bases": bases, "waits": waits}[arguments.what]
+    rows_of_part = {"intervals": intervals, "bases": bases, "waits": waits}[arguments.what]
     lines = [f"{heading()}:", ""]
     print(lines[0])
-    for row in measured(arguments.plants.split("|"), arguments.seeds):
+    for row in rows_of_part(arguments.plants.split("|"), arguments.seeds):
         lines.append(f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:

@@ -46,17 +46,17 @@ LONGEST = 500_000
 STARTS = [(-(w**2), -2 * z * w) for w in (3.0, 8.0, 15.0, 25.0, 40.0) for z in (0.01, 0.05, 0.2, 0.5)]
 
 
-def spent(work: Callable[[], object]) -> float:
+def processor_time(work: Callable[[], object]) -> float:
     """Processor time of this process."""
-    begun = time.process_time()
+    start_time = time.process_time()
     work()
-    return time.process_time() - begun
+    return time.process_time() - start_time
 
 
 def transform() -> float:
     """Processor time of one real FFT of 4096 points by NumPy, the least of five hundred times five."""
     x = np.random.default_rng(0).normal(size=4096)
-    return min(spent(lambda: [np.fft.rfft(x) for _ in range(500)]) / 500 for _ in range(5))
+    return min(processor_time(lambda: [np.fft.rfft(x) for _ in range(500)]) / 500 for _ in range(5))
 
 
 def peak() -> float:
@@ -64,32 +64,35 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def told(name: str, seconds: float, before: float, fit: str) -> None:
+def print_row(name: str, seconds: float, before: float, fit: str) -> None:
     """One row."""
     row(name, [seconds], (peak(), before), fit)
 
 
 def row(name: str, seconds: Sequence[float], memory: tuple[float, float], fit: str) -> None:
     """One row; processor times with and without what is left out of the second."""
-    spent, ffts = " / ".join(f"{s:.2f}" for s in seconds), " / ".join(f"{s / transform() / 1000:.0f}" for s in seconds)
-    print(f"| {name} | {spent} | {ffts} | {memory[0]:.0f} | {memory[1]:.0f} | {fit} |")
+    seconds_text, ffts = (
+        " / ".join(f"{s:.2f}" for s in seconds),
+        " / ".join(f"{s / transform() / 1000:.0f}" for s in seconds),
+    )
+    print(f"| {name} | {seconds_text} | {ffts} | {memory[0]:.0f} | {memory[1]:.0f} | {fit} |")
 
 
-def percents(fits: dict[str, float], used: Sequence[str]) -> str:
+def percents(fits: dict[str, float], names: Sequence[str]) -> str:
     """Fits by run, in bold where the run was not fitted to."""
-    return ", ".join(f"{n} {v:.1f} %" if n in used else f"{n} **{v:.1f} %**" for n, v in fits.items())
+    return ", ".join(f"{n} {v:.1f} %" if n in names else f"{n} **{v:.1f} %**" for n, v in fits.items())
 
 
-def arm(name: str, used: Sequence[str] = ("psf", "lqr")) -> None:
+def arm(name: str, names: Sequence[str] = ("psf", "lqr")) -> None:
     """Fitted on both runs of the arm, or on one of them, and judged on each."""
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
     structure = ftlm.equation(WORDS[name], sensor_filter=ftlm.SensorFilter.low_pass(FILTERED))
-    identify, before, found = ftlm.identify, peak(), []
-    seconds = spent(lambda: found.append(identify([runs[n] for n in used], structure, threads=1)))
-    numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in found[0].parameters.values())
-    fits = {n: found[0].model.compare(run).fit["theta22"] for n, run in runs.items()}
-    case = name if len(used) > 1 else f"{name} on {used[0]}"
-    told(case, seconds, before, f"{found[0].fit['theta22']:.2f} %: {percents(fits, used)}; {numbers}")
+    identify, before, results = ftlm.identify, peak(), []
+    seconds = processor_time(lambda: results.append(identify([runs[n] for n in names], structure, threads=1)))
+    numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in results[0].parameters.values())
+    fits = {n: results[0].model.compare(run).fit["theta22"] for n, run in runs.items()}
+    case = name if len(names) > 1 else f"{name} on {names[0]}"
+    print_row(case, seconds, before, f"{results[0].fit['theta22']:.2f} %: {percents(fits, names)}; {numbers}")
 
 
 def state_space(python: str) -> None:
@@ -97,7 +100,7 @@ def state_space(python: str) -> None:
     script = Path(__file__).with_name("state_space.py")
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
     for way in ("as measured", "hub angles filtered"):
-        kept = {}
+        arrays = {}
         for name, run in runs.items():
             signals = [np.asarray(run[n]) for n, _ in TERMS]
             if way != "as measured":
@@ -105,24 +108,24 @@ def state_space(python: str) -> None:
                     s if n in FILTERED else s[0] + response(STOCK[-1:], STOCK, s - s[0], run.step)
                     for s, (n, _) in zip(signals, TERMS, strict=True)
                 ]
-            kept |= {f"{name}.y": run["theta22"][:, None], f"{name}.u": np.stack(signals, axis=1)}
+            arrays |= {f"{name}.y": run["theta22"][:, None], f"{name}.u": np.stack(signals, axis=1)}
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "runs.npz"
-            np.savez(file, **kept)
-            for used in ("psf+lqr", "psf", "lqr"):
-                command = [python, str(script), str(file), used]
-                made = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-                said = json.loads(made.splitlines()[-1])
-                if "absent" in said:
-                    print(f"| jax-sysid | | | | | {said['absent']} |")
+            np.savez(file, **arrays)
+            for names in ("psf+lqr", "psf", "lqr"):
+                command = [python, str(script), str(file), names]
+                output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+                answer = json.loads(output.splitlines()[-1])
+                if "absent" in answer:
+                    print(f"| jax-sysid | | | | | {answer['absent']} |")
                     return
-                first, setting_up = said["seconds"][0], said["setting_up"]
-                fits = percents(said["fits"]["one"], used.split("+"))
-                best = percents(said["fits"]["best"], used.split("+"))
-                words = f"{fits}; best of {len(said['seconds'])} starts {best}; {said['numbers']} numbers"
-                case = f"jax-sysid, order 4, {way}, on {used}"
-                again = float(np.mean(said["seconds"][1:]))
-                row(case, [first, again - setting_up], (said["peak"], said["before"]), words)
+                first, setting_up = answer["seconds"][0], answer["setting_up"]
+                fits = percents(answer["fits"]["one"], names.split("+"))
+                best = percents(answer["fits"]["best"], names.split("+"))
+                words = f"{fits}; best of {len(answer['seconds'])} starts {best}; {answer['numbers']} numbers"
+                case = f"jax-sysid, order 4, {way}, on {names}"
+                again = float(np.mean(answer["seconds"][1:]))
+                row(case, [first, again - setting_up], (answer["peak"], answer["before"]), words)
 
 
 def rival() -> None:
@@ -131,13 +134,13 @@ def rival() -> None:
     signals = [{n: np.asarray(r[n]) for n in r.outputs} for r in runs]
     before, ends = peak(), []
 
-    def left(point: np.ndarray) -> np.ndarray:
+    def residuals(point: np.ndarray) -> np.ndarray:
         pairs = zip(signals, runs, strict=True)
         parts = [projected(s, r.step, "theta22", point, TERMS, filtered=FILTERED)[1] for s, r in pairs]
         return np.concatenate(parts)
 
     def scaled(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        return left(x * scale)
+        return residuals(x * scale)
 
     def all_starts() -> None:
         for start in STARTS:
@@ -145,9 +148,9 @@ def rival() -> None:
             end = least_squares(scaled, np.sign(start), method="lm", max_nfev=60, args=(scale,))
             ends.append((float(end.cost), end.x * scale))
 
-    seconds = spent(all_starts)
+    seconds = processor_time(all_starts)
     cost, point = min(ends, key=lambda e: e[0])
-    told("five, SciPy (terms by run)", seconds, before, f"a {point[0]:.4g}, d {point[1]:.4g}, cost {cost:.4g}")
+    print_row("five, SciPy (terms by run)", seconds, before, f"a {point[0]:.4g}, d {point[1]:.4g}, cost {cost:.4g}")
 
 
 def long(samples: int) -> None:
@@ -159,10 +162,10 @@ def long(samples: int) -> None:
     y = machine.simulate(drive, tolerance=1e-4)["y"]
     y = y + 0.01 * np.std(y) * rng.normal(size=samples)
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y})
-    identify, before, found = ftlm.identify, peak(), []
-    seconds = spent(lambda: found.append(identify(run, ftlm.equation("D^alpha y = a y + b u"), threads=1)))
-    numbers = ", ".join(f"{p.name} {p.value:.6g}" for p in found[0].parameters.values())
-    told(f"{samples} samples", seconds, before, f"{found[0].fit['y']:.2f} %: {numbers}")
+    identify, before, results = ftlm.identify, peak(), []
+    seconds = processor_time(lambda: results.append(identify(run, ftlm.equation("D^alpha y = a y + b u"), threads=1)))
+    numbers = ", ".join(f"{p.name} {p.value:.6g}" for p in results[0].parameters.values())
+    print_row(f"{samples} samples", seconds, before, f"{results[0].fit['y']:.2f} %: {numbers}")
 
 
 def main() -> None:
@@ -173,14 +176,14 @@ def main() -> None:
     parser.add_argument("--jax", default=sys.executable, help="interpreter of an environment with jax-sysid")
     parser.add_argument("--alone", action="store_true", help="measure in this process")
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
-    asked = parser.parse_args()
-    if asked.alone:
-        for case in asked.cases:
+    arguments = parser.parse_args()
+    if arguments.alone:
+        for case in arguments.cases:
             cases = {
-                "long": lambda: long(asked.samples),
+                "long": lambda: long(arguments.samples),
                 "longest": lambda: long(LONGEST),
                 "rival": rival,
-                "jax": lambda: state_space(asked.jax),
+                "jax": lambda: state_space(arguments.jax),
                 "psf": lambda: arm("five", ["psf"]),
                 "lqr": lambda: arm("five", ["lqr"]),
             }
@@ -189,12 +192,21 @@ def main() -> None:
     lines = [heading(), "", "| case | processor s | thousand FFTs | peak MB | before | found |", "| --- " * 6 + "|"]
     print("\n".join(lines), flush=True)
     alone = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    for case in asked.cases:
-        command = [sys.executable, __file__, case, "--samples", str(asked.samples), "--jax", asked.jax, "--alone"]
-        made = subprocess.run(command, capture_output=True, text=True, check=True, env=alone).stdout.strip()
-        print(made, flush=True)
-        lines.append(made)
-    if asked.write:
+    for case in arguments.cases:
+        command = [
+            sys.executable,
+            __file__,
+            case,
+            "--samples",
+            str(arguments.samples),
+            "--jax",
+            arguments.jax,
+            "--alone",
+        ]
+        output = subprocess.run(command, capture_output=True, text=True, check=True, env=alone).stdout.strip()
+        print(output, flush=True)
+        lines.append(output)
+    if arguments.write:
         save(lines)
 
 

@@ -109,7 +109,7 @@ CASES = {
 }
 
 
-def fitted(job: tuple[str, int]) -> dict[str, Any]:
+def fit_of_seed(job: tuple[str, int]) -> dict[str, Any]:
     """Intervals of both kinds at one seed."""
     name, seed = job
     case = CASES[name]
@@ -121,22 +121,22 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
         inputs={"u": u}, outputs={"y": y + case.noise * np.std(y) * e}, step=step, intersample={"u": between}
     )
     begin = time.perf_counter()
-    found = ftlm.identify(
+    result = ftlm.identify(
         run, ftlm.equation(case.words, initial="rest"), threads=1, method=ftlm.OutputError(intervals="quadratic")
     )
     fit = time.perf_counter()
-    bent = nonlinear_parameters(likelihood_of(found), 0.95)
+    bent = nonlinear_parameters(likelihood_of(result), 0.95)
     test = time.perf_counter()
     try:
-        profiles = found.profile(threads=1)
+        profiles = result.profile(threads=1)
     except ftlm.ConvergenceError:
         # What `identify` does by itself where the profile finds a lower optimum.
-        found = ftlm.identify(
+        result = ftlm.identify(
             run, ftlm.equation(case.words, initial="rest"), threads=1, method=ftlm.OutputError(intervals="profile")
         )
-        profiles = found.profiles
+        profiles = result.profiles
     end = time.perf_counter()
-    values, errors = {n: found.parameters[n].value for n in found.names}, found.standard_errors
+    values, errors = {n: result.parameters[n].value for n in result.names}, result.standard_errors
     numbers = {}
     for n, truth in case.truth.items():
         half = NORMAL_95 * errors[n]
@@ -150,7 +150,7 @@ def fitted(job: tuple[str, int]) -> dict[str, Any]:
             "off": off > OFF,
             "runs": own.evaluations,
         }
-    correlation = np.abs(found.joint.correlation) if found.joint is not None else np.zeros((1, 1))
+    correlation = np.abs(result.joint.correlation) if result.joint is not None else np.zeros((1, 1))
     np.fill_diagonal(correlation, 0.0)
     times = (fit - begin, test - fit, end - test)
     return {"numbers": numbers, "correlation": float(np.nanmax(correlation)), "times": times}
@@ -174,17 +174,17 @@ def main() -> None:
     print("\n".join(lines))
     with ProcessPoolExecutor(arguments.workers) as pool:
         for name in arguments.cases:
-            ended = list(pool.map(fitted, [(name, s) for s in range(arguments.seeds)]))
+            ended = list(pool.map(fit_of_seed, [(name, s) for s in range(arguments.seeds)]))
             correlation = np.median([e["correlation"] for e in ended])
-            spent = ", ".join(f"{t:.2f}" for t in np.median([e["times"] for e in ended], axis=0))
+            times_text = ", ".join(f"{t:.2f}" for t in np.median([e["times"] for e in ended], axis=0))
             for number in CASES[name].truth:
                 own = [e["numbers"][number] for e in ended]
                 count = {k: sum(bool(o[k]) for o in own) for k in ("quadratic", "profile", "open", "bent", "off")}
-                told = sum(o["off"] and o["bent"] for o in own)
+                both = sum(o["off"] and o["bent"] for o in own)
                 lines.append(
                     f"| {name} | {correlation:.4f} | {number} | {count['quadratic']} of {len(own)} "
-                    f"| {count['profile']} of {len(own)} | {count['open']} | {count['bent']} | {count['off']} | {told} "
-                    f"| {np.median([o['runs'] for o in own]):.0f} | {spent} |"
+                    f"| {count['profile']} of {len(own)} | {count['open']} | {count['bent']} | {count['off']} | {both} "
+                    f"| {np.median([o['runs'] for o in own]):.0f} | {times_text} |"
                 )
                 print(lines[-1], flush=True)
     if arguments.write:

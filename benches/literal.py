@@ -104,13 +104,13 @@ def evaluate_candidate(
     prior = np.asarray(K0, float)
     coefficients = multi_innovation(Q, Y, p, prior if prior.ndim else prior * np.eye(Q.shape[1]))
 
-    left, right = np.eye(m), np.zeros(m)
+    lhs, right = np.eye(m), np.zeros(m)
     for c, signal, eta, column in zip(coefficients, regressor_signals, steps, columns, strict=True):
         if signal is None:
-            left -= c * P[eta].T
+            lhs -= c * P[eta].T
         else:
             right += c * column
-    output = phi.T @ np.linalg.solve(left, right)
+    output = phi.T @ np.linalg.solve(lhs, right)
     return Candidate(coefficients, output, float(np.abs(y - output).sum()))
 
 
@@ -130,9 +130,9 @@ def main() -> None:
     """Identify the example at M = 64, where the answer is known, and print what came out."""
     m = 64
     y, u, orders, duration = example(m)
-    found = evaluate_candidate(y, [None, None, u], orders, 7, 1e9, m=m, duration=duration)
-    print("coefficients", found.coefficients, "error", found.error)
-    if not np.allclose(found.coefficients, [-0.625, -1.25, 1.25], atol=1e-4):
+    result = evaluate_candidate(y, [None, None, u], orders, 7, 1e9, m=m, duration=duration)
+    print("coefficients", result.coefficients, "error", result.error)
+    if not np.allclose(result.coefficients, [-0.625, -1.25, 1.25], atol=1e-4):
         raise SystemExit("the coefficients should be -0.625, -1.25 and 1.25")
 
 

@@ -33,19 +33,19 @@ def workers() -> int:
     return int(os.environ.get("FTLM_WORKERS", os.cpu_count() or 1))
 
 
-def covered(found: ftlm.Identification, truth: dict[str, float]) -> list[bool]:
+def covered(result: ftlm.Identification, truth: dict[str, float]) -> list[bool]:
     """Whether the 95 % interval of each number holds the truth."""
-    return [found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in truth.items()]
+    return [result.intervals[n][0] <= v <= result.intervals[n][1] for n, v in truth.items()]
 
 
 def one_loop(task: tuple[str, int, str]) -> tuple[list[bool], bool, bool, float]:
     """Coverage, whether the result says that there is a loop, whether it warns of one or of its instrument, alpha."""
     kind, seed, how = task
     method = ftlm.OutputError(reference="r" if how == "reference" else None)
-    found = ftlm.identify(loops.loop(kind, seed), STRUCTURE, method=method, threads=1)
-    said = bool(found.residuals and found.residuals.outputs["y"].feedback)
-    warned = any("closed loop" in w or "weak instrument" in w for w in found.warnings)
-    return covered(found, loops.TRUTH), said, warned, found.orders["alpha"]
+    result = ftlm.identify(loops.loop(kind, seed), STRUCTURE, method=method, threads=1)
+    reports_feedback = bool(result.residuals and result.residuals.outputs["y"].feedback)
+    warned = any("closed loop" in w or "weak instrument" in w for w in result.warnings)
+    return covered(result, loops.TRUTH), reports_feedback, warned, result.orders["alpha"]
 
 
 def closed(seeds: int) -> Iterator[str]:
@@ -66,8 +66,8 @@ def closed(seeds: int) -> Iterator[str]:
 
 def one_instrument(seed: int) -> tuple[list[bool], float]:
     """Coverage by instrumental variables with the order free, on a record in white noise, and alpha."""
-    found = ftlm.identify(loops.open_run(seed, noise=0.05), STRUCTURE, method="instrumental-variables", threads=1)
-    return covered(found, {**loops.TRUTH, "alpha": 1.73}), found.orders["alpha"]
+    result = ftlm.identify(loops.open_run(seed, noise=0.05), STRUCTURE, method="instrumental-variables", threads=1)
+    return covered(result, {**loops.TRUTH, "alpha": 1.73}), result.orders["alpha"]
 
 
 def instruments(seeds: int) -> Iterator[str]:
@@ -88,12 +88,12 @@ def one_offset(task: tuple[str, float, int, str]) -> tuple[bool, bool, list[floa
     kind, constant, seed, offset = task
     run, structure, truth = loops.offset_run(kind, constant, seed)
     start = time.process_time()
-    found = ftlm.identify(run, structure, offset=offset, threads=1)
-    taken = time.process_time() - start
-    values = {n: p.value for n, p in found.parameters.items()}
+    result = ftlm.identify(run, structure, offset=offset, threads=1)
+    seconds = time.process_time() - start
+    values = {n: p.value for n, p in result.parameters.items()}
     errors = [values[n] - v for n, v in truth.items()]
-    told = any("unknown constant" in w for w in found.warnings)
-    return bool(found.comparison.offsets), told, errors, float(np.mean(covered(found, truth))), taken
+    reports_offset = any("unknown constant" in w for w in result.warnings)
+    return bool(result.comparison.offsets), reports_offset, errors, float(np.mean(covered(result, truth))), seconds
 
 
 def offsets(seeds: int) -> Iterator[str]:
@@ -123,9 +123,9 @@ def cell(seeds: int) -> Iterator[str]:
         for seed in range(seeds):
             run = loops.cell_run(50_000, 0.01, hold, seed, noise=0.01)
             start = time.process_time()
-            found = ftlm.identify(run, loops.CELL_STRUCTURE, threads=1)
-            z = [(found.parameters[n].value - v) / found.standard_errors[n] for n, v in truth.items()]
-            ended.append((z, time.process_time() - start, found))
+            result = ftlm.identify(run, loops.CELL_STRUCTURE, threads=1)
+            z = [(result.parameters[n].value - v) / result.standard_errors[n] for n, v in truth.items()]
+            ended.append((z, time.process_time() - start, result))
         z = np.array([e[0] for e in ended])
         last = ended[-1][2]
         words = ", ".join(f"{n} {last.parameters[n].value:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)

@@ -60,7 +60,7 @@ def own_run(seed):
     raise SystemExit(f"seed {seed} has no run of ten seconds")
 
 
-def fitted(run, text):
+def model_of(run, text):
     """A model of one equation, on every fourth sample."""
     passed = ftlm.SensorFilter.low_pass(["theta12"]) if "theta12" in text else None
     structure = ftlm.equation(text, sensor_filter=passed)
@@ -133,7 +133,7 @@ def tip_of(controller, reference, **options):
     return run["theta11"] + run["theta12"]
 
 
-def moved(controller, reference, **options):
+def movement(controller, reference, **options):
     """RMS of the tip about its mean in the second after the reference has arrived [rad]; None where the rig stopped."""
     tip = tip_of(controller, reference, **options)
     if tip is None:
@@ -145,7 +145,7 @@ def moved(controller, reference, **options):
 def designed(run, kind):
     """Hub loop and shapers of a model of a kind."""
     began = time.process_time()
-    link, hub = fitted(run, LINKS[kind]), fitted(run, HUBS[kind])
+    link, hub = model_of(run, LINKS[kind]), model_of(run, HUBS[kind])
     design = control.fractional_pid(hub, input="I1", crossover=CROSSOVER, phase_margin=PHASE, rate=RATE)
     shapers = {name: control.input_shaper(link, name) for name in ("zv", "zvd")}
     return design, shapers, time.process_time() - began
@@ -154,43 +154,43 @@ def designed(run, kind):
 def of_seed(seed):
     """Everything of a seed: the move's noise is another's than the run's."""
     run = own_run(seed)
-    found = {"seed": seed}
+    results = {"seed": seed}
     for kind in LINKS:
         design, shapers, took = designed(run, kind)
         mode = shapers["zv"].modes[0]
         loop = loops(design.pid)
-        told = {
+        angles = {
             "frequency": mode.frequency,
             "damping": mode.damping,
             "pid": design.pid.to_dict(),
             "seconds": took,
             "phase": design.margin_interval("phase"),
         }
-        told["unshaped"] = moved(loop, ramp(), seed=1000 + seed)
+        angles["unshaped"] = movement(loop, ramp(), seed=1000 + seed)
         for name, shaper in shapers.items():
-            told[name] = moved(loop, shaper.filter(ramp(), RATE), seed=1000 + seed)
-        found[kind] = told
-    return found
+            angles[name] = movement(loop, shaper.filter(ramp(), RATE), seed=1000 + seed)
+        results[kind] = angles
+    return results
 
 
-def written(told):
+def save(results):
     """Put what was measured into the page's file."""
-    kept = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
-    OUT.write_text(json.dumps(kept | told) + "\n", encoding="utf-8")
+    content = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
+    OUT.write_text(json.dumps(content | results) + "\n", encoding="utf-8")
 
 
-def table(kept):
+def table(path):
     """Ratios over the seeds."""
-    rows = [json.loads(line) for line in Path(kept).read_text(encoding="utf-8").splitlines()]
+    rows = [json.loads(line) for line in Path(path).read_text(encoding="utf-8").splitlines()]
     rows = list({row["seed"]: row for row in rows}.values())
     print(f"{len(rows)} seeds")
     for kind in LINKS:
         plain = np.array([r[kind]["unshaped"] or np.nan for r in rows])
         for name in ("zv", "zvd"):
-            left = np.array([r[kind][name] or np.nan for r in rows])
-            times = plain / left
+            shaped = np.array([r[kind][name] or np.nan for r in rows])
+            times = plain / shaped
             print(
-                f"{kind} {name}: {1e3 * np.nanmedian(plain):.2f} -> {1e3 * np.nanmedian(left):.3f} mrad, "
+                f"{kind} {name}: {1e3 * np.nanmedian(plain):.2f} -> {1e3 * np.nanmedian(shaped):.3f} mrad, "
                 f"median {np.nanmedian(times):.1f} times less, least {np.nanmin(times):.1f}, "
                 f"at least 10 in {np.sum(times >= 10)} of {np.sum(np.isfinite(times))}"
             )
@@ -208,12 +208,12 @@ if __name__ == "__main__":
     parser.add_argument("what", choices=["seeds", "table"])
     parser.add_argument("seeds", nargs="*", type=int)
     parser.add_argument("--kept", default="control.jsonl")
-    given = parser.parse_args()
-    if given.what == "seeds":
-        for one in given.seeds or range(20):
+    arguments = parser.parse_args()
+    if arguments.what == "seeds":
+        for one in arguments.seeds or range(20):
             line = json.dumps(of_seed(one))
-            with Path(given.kept).open("a", encoding="utf-8") as file:
+            with Path(arguments.kept).open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
             print(line, flush=True)
     else:
-        written({"seeds": table(given.kept)})
+        save({"seeds": table(arguments.kept)})

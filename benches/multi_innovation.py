@@ -24,7 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
     parser.add_argument("--quick", action="store_true", help="search the coarsest grid alone")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     run = plant_a_run()
     equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
     lines: list[str] = []
@@ -36,11 +36,11 @@ def main() -> None:
     def searched(increment: float, coefficients: str, **options: float) -> tuple[int, float]:
         grid = ftlm.order_grid(increment=increment, alpha=(1.05, 2.0))
         start = time.process_time()
-        found = ftlm.search_orders(run, equation, grid, coefficients=coefficients, m=M, threads=1, **options)
-        return found.candidates, time.process_time() - start
+        result = ftlm.search_orders(run, equation, grid, coefficients=coefficients, m=M, threads=1, **options)
+        return result.candidates, time.process_time() - start
 
     say(f"- {heading()}, processor time")
-    for increment in INCREMENTS[: 1 if given.quick else None]:
+    for increment in INCREMENTS[: 1 if arguments.quick else None]:
         count, squares = searched(increment, "least-squares")
         _, weak = searched(increment, "multi-innovation", innovation_length=7)
         say(
@@ -50,7 +50,7 @@ def main() -> None:
     # The paper's prior leaves most candidates open, so that finer grids take hours.
     _, paper = searched(INCREMENTS[0], "multi-innovation", innovation_length=7, prior_covariance=1.0)
     say(f"- P14, increment {INCREMENTS[0]:g}, K0 = 1: {paper:.2f} s (promised 6)")
-    if given.write:
+    if arguments.write:
         save(lines)
 
 

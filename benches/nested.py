@@ -22,10 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 import ftlm
 from arm_measured import FOLDER, arm_run, step_run
 from plants import resonant_plant
-from results import Kept, heading, save
+from results import ResultStore, heading, save
 
 #: The share of the cost beyond which a richer structure counts as worse.
-TOLD = 1e-3
+COST_TOLERANCE = 1e-3
 #: A driven link with one order after another freed; and with a term more.
 LINK = {
     "whole": ("D^2 {y} = d D {y} + a {y} + b D^2 {u}", {}),
@@ -62,17 +62,17 @@ def driven(run: ftlm.Run, output: str, hub: str) -> ftlm.Run:
     )
 
 
-def records(asked: list[str], seeds: range) -> Iterator[tuple[ftlm.Run, list[str]]]:
+def records(names: list[str], seeds: range) -> Iterator[tuple[ftlm.Run, list[str]]]:
     """Each record with its chains."""
     for name in ("psf", "lqr"):
-        if name in asked:
+        if name in names:
             run = arm_run(name)
             for stage in (1, 2):
                 yield driven(run, f"theta{stage}2", f"theta{stage}1"), ["link", "link, terms"]
-    if "steps" in asked:
+    if "steps" in names:
         for name in ("lqg_20", "lqg_minus10", "lqg_30", "lqr_20", "lqr_minus20", "lqr_5"):
             yield driven(step_run(FOLDER / "two_link_steps" / f"{name}.csv"), "theta12", "theta11"), ["link"]
-    if "heating" in asked:
+    if "heating" in names:
         table = np.loadtxt(FOLDER / "heating" / "heating_system.dat")
         yield (
             ftlm.Run.from_arrays(
@@ -80,16 +80,16 @@ def records(asked: list[str], seeds: range) -> Iterator[tuple[ftlm.Run, list[str
             ),
             ["diffusive", "orders"],
         )
-    if "robot_arm" in asked:
+    if "robot_arm" in names:
         table = np.loadtxt(FOLDER / "robot_arm" / "robot_arm.dat")
         yield (
             ftlm.Run.from_arrays(step=1.0, inputs={"u": table[:, 0]}, outputs={"y": table[:, 1]}, name="robot_arm"),
             ["orders"],
         )
     for seed in seeds:
-        if "plants" in asked:
+        if "plants" in names:
             yield resonant_plant(seed, wrong=False), ["orders"]
-        if "wrong" in asked:
+        if "wrong" in names:
             yield resonant_plant(seed, wrong=True), ["orders"]
 
 
@@ -97,22 +97,22 @@ def chain(run: ftlm.Run, name: str) -> Iterator[str]:
     """Fit a chain; a row a structure, the ratio of its cost to the least of those that it contains."""
     least = np.inf
     for kind, (text, orders) in CHAINS[name].items():
-        begun = time.process_time()
-        made = ftlm.equation(text.format(y="y", u="u"), orders=orders)
+        start_time = time.process_time()
+        structure = ftlm.equation(text.format(y="y", u="u"), orders=orders)
         try:
-            found = ftlm.identify(run, made, threads=1, method=ftlm.OutputError(intervals="quadratic"))
+            result = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="quadratic"))
         except ftlm.FtlmError as error:
             yield f"| {run.name} | {name} | {kind} | {error} | | |"
             continue
-        assert found.joint is not None
-        cost = found.joint.noise["y"] ** 2
+        assert result.joint is not None
+        cost = result.joint.noise["y"] ** 2
         ratio = cost / least
-        worse = " **worse**" if ratio > 1.0 + TOLD else ""
-        numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in found.parameters.values())
-        spent = time.process_time() - begun
+        worse = " **worse**" if ratio > 1.0 + COST_TOLERANCE else ""
+        numbers = ", ".join(f"{p.name} {p.value:.4g}" for p in result.parameters.values())
+        seconds = time.process_time() - start_time
         yield (
-            f"| {run.name} | {name} | {kind} | {found.fit['y']:.2f} | {ratio:.4f}{worse} | {numbers}; "
-            f"{found.joint.initial_terms} initial terms | {spent:.1f} s |"
+            f"| {run.name} | {name} | {kind} | {result.fit['y']:.2f} | {ratio:.4f}{worse} | {numbers}; "
+            f"{result.joint.initial_terms} initial terms | {seconds:.1f} s |"
         )
         least = min(least, cost)
 
@@ -130,24 +130,24 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--kept", type=Path, help="file of chains that are done, to go on from")
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
-    given = parser.parse_args()
-    kept = Kept(given.kept)
+    arguments = parser.parse_args()
+    store = ResultStore(arguments.kept)
     lines = [f"{heading()}:", "", "| record | chain | structure | fit | cost | numbers | time |"]
     lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
     print("\n".join(lines))
     pairs = worse = 0
-    for run, chains in records(given.records.split(","), range(given.first, given.first + given.seeds)):
+    for run, chains in records(arguments.records.split(","), range(arguments.first, arguments.first + arguments.seeds)):
         for name in chains:
             # Two outputs of one record have its name.
             of = f"{run.name} {np.std(run['y']):.6g}, {name}"
-            for row, line in enumerate(kept.row(of, functools.partial(rows_of, run, name))["rows"]):
+            for row, line in enumerate(store.row(of, functools.partial(rows_of, run, name))["rows"]):
                 pairs += row > 0
                 worse += "**worse**" in line
                 lines.append(line)
                 print(line, flush=True)
-    lines += ["", f"- {worse} of {pairs} richer structures worse by over {100 * TOLD:g} % of the cost"]
+    lines += ["", f"- {worse} of {pairs} richer structures worse by over {100 * COST_TOLERANCE:g} % of the cost"]
     print(lines[-1])
-    if given.write:
+    if arguments.write:
         save(lines)
 
 

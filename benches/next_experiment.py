@@ -28,7 +28,7 @@ from results import commit, heading, machine, save
 
 LEVEL = 40.0
 ORDERS = ("alpha1", "alpha2", "gamma1", "beta2", "mu2")
-SHOWN = Path(__file__).resolve().parent.parent / "docs" / "next_experiment.json"
+DOCS_FILE = Path(__file__).resolve().parent.parent / "docs" / "next_experiment.json"
 
 
 def one(seed: int, criterion: str) -> dict[str, Any]:
@@ -36,9 +36,9 @@ def one(seed: int, criterion: str) -> dict[str, Any]:
     structure, clean = plants.structure("A"), plants.clean_run("A")
     square = plants.noisy_run("A", LEVEL, seed)
     first = ftlm.identify(square, structure, threads=1)
-    begun = time.process_time()
+    start_time = time.process_time()
     designed = ftlm.design_input(first, criterion=criterion, seed=seed)
-    spent = time.process_time() - begun
+    seconds = time.process_time() - start_time
     truth = demo_plant(1, form="published").simulate(designed.run, tolerance=1e-8)
     rng = np.random.default_rng([2026, seed])
     # The gauge and the encoder are as noisy as in the square.
@@ -50,7 +50,7 @@ def one(seed: int, criterion: str) -> dict[str, Any]:
     return {
         "seed": seed,
         "criterion": criterion,
-        "seconds": spent,
+        "seconds": seconds,
         "gain": designed.gain,
         "shape": designed.shape,
         "efficiency": designed.efficiency,
@@ -71,23 +71,23 @@ def lines_of(rows: list[dict[str, Any]]) -> list[str]:
     """What came of it, in words."""
     truth = plants.truth("A")
     product = [np.prod([r["predicted"]["now"][n] / r["found"][n] for n in ORDERS]) for r in rows]
-    told = [np.prod([r["predicted"]["now"][n] / r["predicted"]["designed"][n] for n in ORDERS]) for r in rows]
+    gains = [np.prod([r["predicted"]["now"][n] / r["predicted"]["designed"][n] for n in ORDERS]) for r in rows]
     each = np.array([[r["found"][n] / r["predicted"]["designed"][n] for n in truth] for r in rows])
     off = np.array([[r["estimates"][n] - truth[n] for n in truth] for r in rows])
     foretold = np.array([[r["predicted"]["designed"][n] for n in truth] for r in rows])
     z, own = off / foretold, [list(truth).index(n) for n in ORDERS]
-    held = np.mean(np.abs(off) <= 1.96 * np.array([[r["found"][n] for n in truth] for r in rows]))
-    moved = [max(r["largest"][o] / r["allowed"][o] for o in r["largest"]) for r in rows]
+    coverage = np.mean(np.abs(off) <= 1.96 * np.array([[r["found"][n] for n in truth] for r in rows]))
+    ratios = [max(r["largest"][o] / r["allowed"][o] for o in r["largest"]) for r in rows]
     return [
         f"{len(rows)} seeds, {rows[0]['criterion']}: product of the orders' intervals smaller than after the square by "
         f"{np.median(product):.1f} times (median; {min(product):.1f} to {max(product):.1f}), predicted "
-        f"{np.median(told):.1f} ({min(told):.1f} to {max(told):.1f})",
+        f"{np.median(gains):.1f} ({min(gains):.1f} to {max(gains):.1f})",
         f"standard errors found over predicted, all ten numbers of all seeds: {np.min(each):.3f} to {np.max(each):.3f}",
         f"spread of the estimates around the truth over predicted: root mean square {np.sqrt(np.mean(z**2)):.3f} "
         f"over all numbers and seeds, {np.sqrt(np.mean(z[:, own] ** 2)):.3f} over orders "
         f"({len(rows)} seeds know one number's to ± {100 / np.sqrt(2 * len(rows)):.0f} %); 95 % intervals hold the "
-        f"truth in {100 * held:.1f} %",
-        f"largest angle of the plant over its limit: {max(moved):.3f}; efficiency "
+        f"truth in {100 * coverage:.1f} %",
+        f"largest angle of the plant over its limit: {max(ratios):.3f}; efficiency "
         f"{np.median([r['efficiency'] for r in rows]):.2f} (median); a design takes "
         f"{np.median([r['seconds'] for r in rows]):.0f} s of processor time",
     ]
@@ -108,8 +108,8 @@ def main() -> None:
     for seed in range(arguments.seeds):
         if seed not in rows:
             rows[seed] = one(seed, arguments.criterion)
-            with arguments.kept.open("a", encoding="utf-8") as kept:
-                kept.write(json.dumps(rows[seed]) + "\n")
+            with arguments.kept.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(rows[seed]) + "\n")
         print(seed, rows[seed]["gain"], rows[seed]["shape"], flush=True)
     every = [rows[k] for k in range(arguments.seeds)]
     lines = [f"{heading()}:", "", *(f"- {line}" for line in lines_of(every))]
@@ -117,8 +117,8 @@ def main() -> None:
     if arguments.write:
         save(lines)
         every = [{k: v for k, v in r.items() if k not in ("correlated", "names")} for r in every]
-        shown = {"commit": commit(), "machine": machine(), "cores": os.cpu_count(), "seeds": every}
-        SHOWN.write_text(json.dumps(shown) + "\n", encoding="utf-8")
+        content = {"commit": commit(), "machine": machine(), "cores": os.cpu_count(), "seeds": every}
+        DOCS_FILE.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -28,9 +28,9 @@ def processor_time(work: Callable[[], object], repeats: int) -> float:
     """Return the median processor time of some work [s]."""
     times = []
     for _ in range(repeats):
-        begun = time.process_time()
+        start_time = time.process_time()
         work()
-        times.append(time.process_time() - begun)
+        times.append(time.process_time() - start_time)
     return statistics.median(times)
 
 
@@ -53,22 +53,22 @@ def speed() -> None:
 def recovery(seeds: int) -> None:
     """Print how often the plants are found, and how many 95 % intervals hold the truth."""
     for name, plant in PLANTS.items():
-        clean, found, hits, count, times = plant.clean(), 0, 0, 0, []
+        clean, hit_count, hits, count, times = plant.clean(), 0, 0, 0, []
         for seed in range(seeds):
-            begun = time.process_time()
+            start_time = time.process_time()
             joint = ftlm.identify(plant.run(clean, seed), plant.structure, threads=1).joint
-            times.append(time.process_time() - begun)
+            times.append(time.process_time() - start_time)
             assert joint is not None
             ratio = joint.noise[plant.output] / (NOISE * float(np.std(clean)))
-            found += abs(ratio - 1) < 0.1
+            hit_count += abs(ratio - 1) < 0.1
             hits += sum(low <= plant.truth[n] <= high for n, (low, high) in joint.intervals.items())
             count += len(joint.intervals)
-        print(f"{name:8s} found {found}/{seeds}, intervals {hits}/{count}, {statistics.median(times):.2f} s")
+        print(f"{name:8s} found {hit_count}/{seeds}, intervals {hits}/{count}, {statistics.median(times):.2f} s")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=["speed", "recovery"])
     parser.add_argument("--seeds", type=int, default=20)
-    given = parser.parse_args()
-    speed() if given.what == "speed" else recovery(given.seeds)
+    arguments = parser.parse_args()
+    speed() if arguments.what == "speed" else recovery(arguments.seeds)

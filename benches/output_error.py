@@ -47,13 +47,13 @@ def kernel(eta: float, m: int, step: float) -> np.ndarray:
 
 def simulated(problem: FreeProblem, x: np.ndarray, rec: object, signals: tuple[str, ...]) -> list[np.ndarray]:
     """Coupled free run of two equations: the 2 x 2 series system by elimination."""
-    told = laws(problem)
+    equations = laws(problem)
     orders, free = x[: len(problem.orders)], x[len(problem.orders) :]
-    outputs = [law[0] for law in told]
+    outputs = [law[0] for law in equations]
     m, step = rec.m, rec.step
     a = [[np.zeros(m), np.zeros(m)], [np.zeros(m), np.zeros(m)]]
     b = [np.zeros(m), np.zeros(m)]
-    for i, (_, (constant, weights), terms) in enumerate(told):
+    for i, (_, (constant, weights), terms) in enumerate(equations):
         a[i][i][0] += 1.0
         alpha = constant + np.dot(weights, orders)
         for signal, (base, slopes), (factor, powers) in terms:

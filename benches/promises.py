@@ -71,25 +71,25 @@ def searches(quick: bool) -> None:
     for hub, deflection in ((1e-3, 1e-4), (1e-4, 1e-4), (1e-3, 1e-3)):
         run = plant_a_run(hub, deflection)
         fft = fft_time()
-        found, wall, cpu = min(
+        result, wall, cpu = min(
             (clocked(lambda run=run: ftlm.search_orders(run, equation, lattice, **options)) for _ in range(3)),
             key=lambda r: r[2],
         )
-        each = cpu / found.candidates
+        each = cpu / result.candidates
         shares = ", ".join(
-            f"{100 * found.exclusion_counts[k] / found.candidates:.2f} % {k}" for k in ("bound", "stopped early")
+            f"{100 * result.exclusion_counts[k] / result.candidates:.2f} % {k}" for k in ("bound", "stopped early")
         )
         judge(
             "P1",
             f"noise {hub:g} and {deflection:g} rad, core time a candidate over one real FFT of 4096",
             each / fft,
             1 / 8,
-            f"{found.candidates} in {wall:.2f} s, {each * 1e6:.3f} us each, NumPy's FFT {fft * 1e6:.1f} us; {shares}; "
+            f"{result.candidates} in {wall:.2f} s, {each * 1e6:.3f} us each, NumPy's FFT {fft * 1e6:.1f} us; {shares}; "
             f"brute force {brute_each * 1e6:.0f} us each, {brute_each / each:.0f} times ours",
         )
     run = plant_a_run()
     step = 0.05 if quick else 0.015
-    found, wall, cpu = min(
+    result, wall, cpu = min(
         (
             clocked(
                 lambda: ftlm.search_orders(
@@ -106,15 +106,15 @@ def searches(quick: bool) -> None:
         key=lambda r: r[2],
     )
     numpy_each = numpy_solve(run, equation)
-    rate = found.candidates / cpu * threads
+    rate = result.candidates / cpu * threads
     for name, promise in (("P2", 60), ("P2'", 120)):
         judge(
             name,
             f"{promise} million a second over candidates a second on all cores",
             promise * 1e6 / rate,
             1,
-            f"{found.candidates} candidates by processor time {rate / 1e6:.1f} million/s on {threads} cores, by wall "
-            f"time {found.candidates / wall / 1e6:.1f}; NumPy's batched solve {1 / numpy_each / 1e6:.2f} million/s on "
+            f"{result.candidates} candidates by processor time {rate / 1e6:.1f} million/s on {threads} cores, by wall "
+            f"time {result.candidates / wall / 1e6:.1f}; NumPy's batched solve {1 / numpy_each / 1e6:.2f} million/s on "
             f"one",
         )
 
@@ -126,7 +126,7 @@ def refined(quick: bool) -> None:
     step = 0.1 if quick else 0.05
     for hub, deflection in ((1e-3, 1e-4), (1e-3, 1e-3)):
         run = plant_a_run(hub, deflection)
-        found, wall, cpu = clocked(
+        result, wall, cpu = clocked(
             lambda run=run: ftlm.search_orders(
                 run,
                 equation,
@@ -135,9 +135,9 @@ def refined(quick: bool) -> None:
                 m=M,
             )
         )
-        each, rival = cpu / found.candidates, numpy_refinement(run, equation)
+        each, rival = cpu / result.candidates, numpy_refinement(run, equation)
         shares = ", ".join(
-            f"{100 * found.exclusion_counts[k] / found.candidates:.1f} % {k}" for k in ("bound", "stopped early")
+            f"{100 * result.exclusion_counts[k] / result.candidates:.1f} % {k}" for k in ("bound", "stopped early")
         )
         judge(
             "P3",
@@ -145,7 +145,7 @@ def refined(quick: bool) -> None:
             f"{threads} cores over 30{', an eighth of the lattice' if quick else ''}",
             cpu / threads / 30,
             1,
-            f"{found.candidates} candidates, exact top 20, in {wall:.1f} s of wall time, {each * 1e6:.0f} us each, up "
+            f"{result.candidates} candidates, exact top 20, in {wall:.1f} s of wall time, {each * 1e6:.0f} us each, up "
             f"to {MAX_IV_ITERATIONS} steps for all but what a bound over all coefficients excludes; {shares}; in NumPy "
             f"{rival * 1e3:.1f} ms each, {rival / each:.0f} times ours",
         )
@@ -192,17 +192,17 @@ def stage(quick: bool) -> None:
     each = 2 * cpu / brute.candidates
     step = 0.1 if quick else 0.05
     low = {"alpha1": (1.5, 2.0, step), "alpha2": (1.5, 2.0, step)}
-    found, wall, cpu = clocked(
+    scan, wall, cpu = clocked(
         lambda: ftlm.search_orders(run, structure, ftlm.order_grid(increment=step, **low), **options)
     )
     judge(
         "stage",
         "joined tables over evaluating every tuple, processor time",
-        cpu / (each * found.candidates),
+        cpu / (each * scan.candidates),
         1,
-        f"{found.candidates} tuples of five orders in {wall:.1f} s, {cpu / found.candidates * 1e9:.0f} ns each; every "
+        f"{scan.candidates} tuples of five orders in {wall:.1f} s, {cpu / scan.candidates * 1e9:.0f} ns each; every "
         f"tuple evaluated {each * 1e6:.0f} us each (from {brute.candidates} runs), "
-        f"{each * found.candidates / cpu:.3g} times ours",
+        f"{each * scan.candidates / cpu:.3g} times ours",
     )
 
 
@@ -214,8 +214,8 @@ def set_up(quick: bool) -> None:
         out = subprocess.run(
             [binary, "setup", str(m), "0.2", str(threads)], capture_output=True, text=True, check=True
         ).stdout
-        found = tuple(float(x) for x in out.split())
-        least[threads] = min(found, least.get(threads, found), key=lambda times: times[2])
+        times_of_run = tuple(float(x) for x in out.split())
+        least[threads] = min(times_of_run, least.get(threads, times_of_run), key=lambda times: times[2])
     (one_wall, one, _, _), (two_wall, two, busiest, peak) = least[1], least[2]
     judge(
         "P12",
@@ -286,36 +286,36 @@ def kernels() -> None:
     from scipy.linalg import solve_triangular, toeplitz  # noqa: PLC0415
     from scipy.signal import fftconvolve  # noqa: PLC0415
 
-    found = operator_times()
+    times = operator_times()
     start = time.perf_counter()
     phi = ftlm.haar_matrix(M)
     dense = phi @ ftlm.block_pulse_matrix(0.85, M, step=10.0 / M) @ phi.T
     numpy_time = time.perf_counter() - start
     assert np.allclose(dense, ftlm.operational_matrix(0.85, M, step=10.0 / M), atol=1e-12)
-    ours, write = found["operational matrix 2048"], found["write 2048"]
+    ours, write = times["operational matrix 2048"], times["write 2048"]
     judge(
         "P4",
         "dense P of 2048 over writing such a matrix once",
         ours / write,
         3,
-        f"{ours * 1e3:.1f} ms, writing {write * 1e3:.1f} ms; F alone {found['block pulse matrix 2048'] * 1e3:.1f} ms, "
-        f"by faer {found['operational matrix by faer 2048'] * 1e3:.0f} ms, by NumPy {numpy_time * 1e3:.0f} ms",
+        f"{ours * 1e3:.1f} ms, writing {write * 1e3:.1f} ms; F alone {times['block pulse matrix 2048'] * 1e3:.1f} ms, "
+        f"by faer {times['operational matrix by faer 2048'] * 1e3:.0f} ms, by NumPy {numpy_time * 1e3:.0f} ms",
     )
     lengths = [2**k for k in range(11, 21)]
-    pairs = {m: found[f"rfft {m}"] + found[f"irfft {m}"] for m in lengths}
-    worst = max(lengths, key=lambda m: found[f"apply {m}"] / pairs[m])
+    pairs = {m: times[f"rfft {m}"] + times[f"irfft {m}"] for m in lengths}
+    worst = max(lengths, key=lambda m: times[f"apply {m}"] / pairs[m])
     signal, kernel = np.random.default_rng(0).standard_normal((2, M))
     rival = best(lambda: fftconvolve(kernel, signal)[:M])
     judge(
         "P5",
         f"I^eta applied over a forward and an inverse FFT, worst of 2^11 to 2^20 (2^{worst.bit_length() - 1})",
-        found[f"apply {worst}"] / pairs[worst],
+        times[f"apply {worst}"] / pairs[worst],
         1.3,
         "by length "
-        + ", ".join(f"{found[f'apply {m}'] / pairs[m]:.2f}" for m in lengths)
-        + f"; at 2048 {found['apply 2048'] * 1e6:.1f} us, SciPy's fftconvolve {rival * 1e6:.1f} us",
+        + ", ".join(f"{times[f'apply {m}'] / pairs[m]:.2f}" for m in lengths)
+        + f"; at 2048 {times['apply 2048'] * 1e6:.1f} us, SciPy's fftconvolve {rival * 1e6:.1f} us",
     )
-    ratios = {m: found[f"simulate {m}"] / found[f"rfft {m}"] for m in lengths}
+    ratios = {m: times[f"simulate {m}"] / times[f"rfft {m}"] for m in lengths}
     worst = max(lengths, key=lambda m: ratios[m])
     kernel = np.abs(kernel) + np.eye(1, M)[0] * M
     matrix = toeplitz(kernel, np.zeros(M))
@@ -328,7 +328,7 @@ def kernels() -> None:
         15,
         "exact division throughout, so no residual to check; by length "
         + ", ".join(f"{ratios[m]:.1f}" for m in lengths)
-        + f"; at 2048 {found['simulate 2048'] * 1e6:.0f} us, SciPy's triangular solve {rival * 1e6:.0f} us",
+        + f"; at 2048 {times['simulate 2048'] * 1e6:.0f} us, SciPy's triangular solve {rival * 1e6:.0f} us",
     )
 
 
@@ -364,16 +364,16 @@ def instructions(write: bool) -> None:
     binary = bench_binary()
 
     def count(kernel: str) -> tuple[int, int]:
-        ran = subprocess.run(
+        process = subprocess.run(
             ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", binary, kernel],
             capture_output=True,
             text=True,
             check=True,
         )
-        units = re.search(r"units (\d+)", ran.stdout)
-        collected = re.search(r"Collected : (\d+)", ran.stderr)
+        units = re.search(r"units (\d+)", process.stdout)
+        collected = re.search(r"Collected : (\d+)", process.stderr)
         if units is None or collected is None:
-            raise SystemExit(f"callgrind did not count {kernel}: {ran.stderr[-300:]}")
+            raise SystemExit(f"callgrind did not count {kernel}: {process.stderr[-300:]}")
         return int(collected[1]), int(units[1])
 
     nothing, _ = count("nothing")
@@ -421,16 +421,16 @@ def memory(quick: bool) -> None:
     """P8: import, demo, peak memory; a search over 10^8 candidates."""
 
     def seconds(code: str) -> float:
-        def spent() -> float:
-            used = resource.getrusage(resource.RUSAGE_CHILDREN)
-            return used.ru_utime + used.ru_stime
+        def processor_time() -> float:
+            usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+            return usage.ru_utime + usage.ru_stime
 
-        found = []
+        times = []
         for _ in range(10):
-            before = spent()
+            before = processor_time()
             subprocess.run([sys.executable, "-c", code], check=True)
-            found.append(spent() - before)
-        return min(found)
+            times.append(processor_time() - before)
+        return min(times)
 
     nothing = seconds("pass")
     ratio = (seconds("import ftlm") - nothing) / (seconds("import numpy") - nothing)
@@ -444,10 +444,10 @@ def memory(quick: bool) -> None:
         f"processor time; with every public name asked for {all_names:.2f}; interpreter {nothing * 1e3:.0f} ms",
     )
     for step in (0.05,) if quick else (0.05, 0.0118):
-        ran = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", STREAM, str(step)], capture_output=True, text=True, check=True, cwd=HERE
         )
-        candidates, wall, peak, pruned = (float(x) for x in ran.stdout.split())
+        candidates, wall, peak, pruned = (float(x) for x in process.stdout.split())
         judge(
             "P8",
             f"memory of a search over {candidates:.3g} candidates beyond the record, MB",
@@ -457,15 +457,15 @@ def memory(quick: bool) -> None:
         )
     if not quick:
         start = time.perf_counter()
-        used = resource.getrusage(resource.RUSAGE_CHILDREN)
-        before = used.ru_utime + used.ru_stime
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        before = usage.ru_utime + usage.ru_stime
         folder = HERE.parent / "target" / "bench-demo"
         subprocess.run(
             [sys.executable, "-m", "ftlm", "demo", "-o", str(folder), "--force"], check=True, capture_output=True
         )
         wall = time.perf_counter() - start
-        used = resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = used.ru_utime + used.ru_stime - before
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu = usage.ru_utime + usage.ru_stime - before
         judge(
             "P8",
             "ftlm demo, seconds",
@@ -493,11 +493,11 @@ def main() -> None:
         "growth": lambda: growth(quick, write),
         "instructions": lambda: instructions(write),
     }
-    chosen = arguments.only.split(",") if arguments.only else list(parts)
-    if unknown := [name for name in chosen if name not in parts]:
+    names = arguments.only.split(",") if arguments.only else list(parts)
+    if unknown := [name for name in names if name not in parts]:
         parser.error(f"no part {unknown[0]!r}; parts are {', '.join(parts)}")
     say(f"{heading()}, load {os.getloadavg()[0]:.1f} at the start")
-    for name in chosen:
+    for name in names:
         start = time.perf_counter()
         parts[name]()
         print(f"  {name} took {time.perf_counter() - start:.0f} s", flush=True)

@@ -35,12 +35,12 @@ BATCH = 10_000
 def shortest(work: Callable[[], object], seconds: float = 0.5) -> float:
     """Shortest processor time of a call [s], after a first one that is not counted."""
     work()
-    best, spent = np.inf, 0.0
-    while spent < seconds:
+    best, total = np.inf, 0.0
+    while total < seconds:
         start = time.process_time()
         work()
         each = time.process_time() - start
-        best, spent = min(best, each), spent + each
+        best, total = min(best, each), total + each
     return best
 
 
@@ -60,7 +60,7 @@ def main() -> None:
     """Time, compare, print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     lines: list[str] = []
 
     def say(text: str) -> None:
@@ -131,7 +131,7 @@ def main() -> None:
         kernels.Recursion(orders, [0, 1, 0, 2], step=STEP, hold=hold, longest=SAMPLES).push(rows)
 
     say(f"Recursion, four terms, p = 7: {shortest(recursion) / SAMPLES * 1e6:.2f} us a sample (promised 1)")
-    if given.write:
+    if arguments.write:
         save([f"- {line}" for line in lines])
 
 

@@ -34,8 +34,8 @@ that of the machine, x86-64 with two cores. Ratios are taken in one run.
 
 def commit() -> str:
     """Short name of the commit that is measured."""
-    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() or "unknown"
+    process = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return process.stdout.strip() or "unknown"
 
 
 def machine() -> str:
@@ -45,8 +45,8 @@ def machine() -> str:
 
 def command() -> str:
     """The command that runs, without ``--write``."""
-    given = [f'"{a}"' if set(a) & {"|", " "} else a for a in sys.argv[1:] if a != "--write"]
-    return " ".join([f"python benches/{Path(sys.argv[0]).name}", *given])
+    words = [f'"{a}"' if set(a) & {"|", " "} else a for a in sys.argv[1:] if a != "--write"]
+    return " ".join([f"python benches/{Path(sys.argv[0]).name}", *words])
 
 
 def heading() -> str:
@@ -56,18 +56,18 @@ def heading() -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that are there."""
-    found = {"python": platform.python_version()}
+    versions_by_name = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            versions_by_name[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return versions_by_name
 
 
 def figures_in(lines: list[str]) -> list[list[str]]:
     """Pairs (name, value) from printed lines: items of lists, and rows of tables with the heads of their columns."""
-    found: list[list[str]] = []
+    figures: list[list[str]] = []
     heads: list[str] = []
     for line in lines:
         cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
@@ -75,13 +75,13 @@ def figures_in(lines: list[str]) -> list[list[str]]:
             heads = []
             if line.startswith("- ") and not line.startswith(("- `", "- commit ")):
                 name, _, value = line[2:].partition(": ")
-                found.append([name, value])
+                figures.append([name, value])
         elif not heads:
             heads = cells
         elif set(line) - set("|- :"):
             rest = (f"{head} {cell}".strip() for head, cell in zip(heads[1:], cells[1:], strict=False) if cell)
-            found.append([cells[0], "; ".join(rest)])
-    return found
+            figures.append([cells[0], "; ".join(rest)])
+    return figures
 
 
 def save(lines: list[str]) -> None:
@@ -101,8 +101,8 @@ def save(lines: list[str]) -> None:
 
 def read() -> list[dict[str, Any]]:
     """All records."""
-    found: list[dict[str, Any]] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else []
-    return found
+    rows: list[dict[str, Any]] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else []
+    return rows
 
 
 def write(records: list[dict[str, Any]]) -> None:
@@ -123,7 +123,7 @@ def page(records: list[dict[str, Any]]) -> str:
     return "\n".join(parts)
 
 
-class Kept:
+class ResultStore:
     """What was measured so far, a line a piece, so that a long measurement goes on where it was stopped."""
 
     def __init__(self, path: Path | None) -> None:

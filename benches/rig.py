@@ -66,7 +66,7 @@ def real_time(rate: float, seconds: float) -> None:
 
 
 def stopped(number: signal.Signals, times: int = 8) -> None:
-    found = []
+    delays = []
     for _ in range(times):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "page"
@@ -80,13 +80,13 @@ def stopped(number: signal.Signals, times: int = 8) -> None:
             os.kill(process.pid, number)
             while not page.has_expired:
                 time.sleep(0.001)
-            found.append(page.get("tripped") - struck)
+            delays.append(page.get("tripped") - struck)
             if page.volts != (0.0, 0.0):
                 raise SystemExit("the watchdog left volts on the motors")
             os.kill(process.pid, signal.SIGKILL)
             process.wait()
             page.close()
-    ms = 1e3 * np.array(found)
+    ms = 1e3 * np.array(delays)
     print(f"{number.name} to 0 V, watchdog of 100 ms, {times} times: {ms.min():.1f} to {ms.max():.1f} ms")
 
 

@@ -95,12 +95,12 @@ def recorded(plant: Plant, rng: np.random.Generator, *, jitter: float = 0.0, dis
     ticks = np.arange(ROWS) * FINE + np.round(rng.uniform(-jitter, jitter, ROWS) * FINE).astype(np.int64)
     ticks[0] = 0
     command = np.where(np.cumsum(rng.random(ROWS) < plant.switching) % 2, -1.0, 1.0)
-    held = command[np.searchsorted(ticks, np.arange(ticks[-1] + 1), side="right") - 1]
+    input_values = command[np.searchsorted(ticks, np.arange(ticks[-1] + 1), side="right") - 1]
     if disturbance:
         # A slow load at the input that nobody measures.
         load = lfilter([np.sqrt(1 - 0.95**2)], [1.0, -0.95], rng.standard_normal(ROWS + 1))
-        held = held + disturbance * np.repeat(load, FINE)[: held.size]
-    y = plant.answer(held, plant.step / FINE)[ticks]
+        input_values = input_values + disturbance * np.repeat(load, FINE)[: input_values.size]
+    y = plant.answer(input_values, plant.step / FINE)[ticks]
     return Recorded(plant, command, ticks, y, float(np.std(y)))
 
 
@@ -156,15 +156,15 @@ def unread(plant: Plant, rng: np.random.Generator) -> ftlm.Run:
     return run_of(record, y, missing="weight")
 
 
-def lost(plant: Plant, rng: np.random.Generator) -> ftlm.Run:
+def with_lost_rows(plant: Plant, rng: np.random.Generator) -> ftlm.Run:
     """1 % noise; 15 % of the rows were lost, the command there with them."""
     record = recorded(plant, rng)
-    kept = rng.random(ROWS) >= 0.15
-    kept[[0, -1]] = True
+    is_present = rng.random(ROWS) >= 0.15
+    is_present[[0, -1]] = True
     return ftlm.Run.from_arrays(
-        inputs={"u": record.command[kept]},
-        outputs={"y": white(record, rng)[kept]},
-        time=np.arange(ROWS)[kept] * plant.step,
+        inputs={"u": record.command[is_present]},
+        outputs={"y": white(record, rng)[is_present]},
+        time=np.arange(ROWS)[is_present] * plant.step,
         missing="hold",
     )
 
@@ -185,7 +185,7 @@ class Case:
     """What befalls a record, how it is identified, and the words that name the cause."""
 
     make: Callable[[Plant, np.random.Generator], ftlm.Run]
-    named: tuple[str, ...] = ()
+    words_of_warning: tuple[str, ...] = ()
     method: str | ftlm.OutputError = "output-error"
 
 
@@ -198,24 +198,24 @@ CASES = {
     "outliers": Case(with_outliers, ("huber",)),
     "outliers, huber": Case(with_outliers, method=ftlm.OutputError(loss="huber")),
     "unread": Case(unread),
-    "lost": Case(lost, ("held",)),
+    "lost": Case(with_lost_rows, ("held",)),
     "jitter": Case(jittered),
 }
 
 
-def fitted(task: tuple[str, str, int]) -> tuple[list[float], list[float], bool, float]:
+def fit(task: tuple[str, str, int]) -> tuple[list[float], list[float], bool, float]:
     """Errors in standard errors, errors over true values, whether the cause was named, seconds."""
     name, plant_name, seed = task
     case, plant = CASES[name], PLANTS[plant_name]
     run = case.make(plant, np.random.default_rng([seed, 13]))
     start = time.process_time()
-    found = ftlm.identify(run, ftlm.equation(plant.words), method=case.method, threads=1)
-    taken = time.process_time() - start
-    values, errors = found.orders | found.coefficients, found.standard_errors
+    result = ftlm.identify(run, ftlm.equation(plant.words), method=case.method, threads=1)
+    seconds = time.process_time() - start
+    values, errors = result.orders | result.coefficients, result.standard_errors
     z = [(values[n] - true) / errors[n] for n, true in plant.truth.items()]
     off = [values[n] - true for n, true in plant.truth.items()]
-    told = any(word in warning for word in case.named for warning in found.warnings)
-    return z, off, told, taken
+    is_reported = any(word in warning for word in case.words_of_warning for warning in result.warnings)
+    return z, off, is_reported, seconds
 
 
 def main() -> None:
@@ -239,17 +239,17 @@ def main() -> None:
         for plant_name in arguments.plants.split(","):
             plant, base = PLANTS[plant_name], None
             for name in arguments.cases:
-                ended = list(pool.map(fitted, [(name, plant_name, s) for s in range(arguments.seeds)]))
+                ended = list(pool.map(fit, [(name, plant_name, s) for s in range(arguments.seeds)]))
                 z = np.array([e[0] for e in ended])
                 spread = np.sqrt(np.mean(np.array([e[1] for e in ended]) ** 2, axis=0))
                 base = spread if base is None else base
                 covered = ", ".join(
                     f"{n} {int(c)}" for n, c in zip(plant.truth, np.sum(np.abs(z) < 1.96, axis=0), strict=True)
                 )
-                told = sum(e[2] for e in ended) if CASES[name].named else "-"
+                reports = sum(e[2] for e in ended) if CASES[name].words_of_warning else "-"
                 lines.append(
                     f"| {name} | {plant_name} | {covered} of {len(z)} | {np.abs(z.mean(axis=0)).max():.2f} "
-                    f"| {np.median(spread / base):.2f} | {told} | {np.mean([e[3] for e in ended]):.1f} |"
+                    f"| {np.median(spread / base):.2f} | {reports} | {np.mean([e[3] for e in ended]):.1f} |"
                 )
                 print(lines[-1], flush=True)
     if arguments.write:

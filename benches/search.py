@@ -77,12 +77,12 @@ def main() -> None:
     per_candidate: dict[str, float] = {}
     for coefficients in ("least-squares", "multi-innovation"):
         start = time.perf_counter()
-        found = ftlm.search_orders(run, equation, ftlm.order_grid(alpha=(1.05, 2.0)), coefficients=coefficients, m=M)
+        scan = ftlm.search_orders(run, equation, ftlm.order_grid(alpha=(1.05, 2.0)), coefficients=coefficients, m=M)
         wall = time.perf_counter() - start
-        cost = per_candidate[coefficients] = wall * threads / found.candidates
-        bounded, stopped = (found.exclusion_counts[k] / found.candidates for k in ("bound", "stopped early"))
+        cost = per_candidate[coefficients] = wall * threads / scan.candidates
+        bounded, stopped = (scan.exclusion_counts[k] / scan.candidates for k in ("bound", "stopped early"))
         say(
-            f"lattice, {coefficients}: {found.candidates} candidates in {wall:.2f} s, {cost * 1e6:.2f} us of core time "
+            f"lattice, {coefficients}: {scan.candidates} candidates in {wall:.2f} s, {cost * 1e6:.2f} us of core time "
             f"each ({cost / fft:.3f} FFTs), {100 * bounded:.2f} % excluded by their bound, "
             f"{100 * stopped:.2f} % stopped early"
         )
@@ -111,17 +111,17 @@ def main() -> None:
     ).table
     rec = record(run, equation, M)
     y, hub, current = (rec.of(n) for n in ("theta12", "theta11", "I1"))
-    worst = spent = 0.0
+    worst = total = 0.0
     picked = [table[i] for i in np.linspace(0, len(table) // 4, LITERAL).astype(int)]
     for row in picked:
         orders = (row.orders["alpha2"], row.orders["beta2"], row.orders["gamma2"], row.orders["mu2"], 0.0)
         start = time.perf_counter()
         theirs = literal.evaluate_candidate(y, [None, hub, None, current], orders, 7, 1.0, m=M, duration=rec.step * M)
-        spent += time.perf_counter() - start
+        total += time.perf_counter() - start
         worst = max(worst, abs(theirs.error - row.score) / row.score)
-        wanted = np.array([row.coefficients[n] for n in ("a2", "b2", "d2", "g2")])
-        worst = max(worst, float(np.max(np.abs(theirs.coefficients - wanted) / np.max(np.abs(wanted)))))
-    cost = spent / LITERAL
+        expected = np.array([row.coefficients[n] for n in ("a2", "b2", "d2", "g2")])
+        worst = max(worst, float(np.max(np.abs(theirs.coefficients - expected) / np.max(np.abs(expected)))))
+    cost = total / LITERAL
     ours = per_candidate["multi-innovation"]
     say(
         f"the paper's algorithm in NumPy: {cost:.2f} s a candidate ({LITERAL} of them): {cost / ours:.3g} times ours; "

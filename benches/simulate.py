@@ -40,12 +40,12 @@ INPUTS = {
 
 def least(work: object, times: int) -> float:
     """Least processor time of one call [s]."""
-    found = np.inf
+    shortest = np.inf
     for _ in range(times):
         start = time.process_time()
         work()
-        found = min(found, time.process_time() - start)
-    return found
+        shortest = min(shortest, time.process_time() - start)
+    return shortest
 
 
 def transform() -> float:
@@ -60,8 +60,8 @@ def runs() -> list[str]:
     lines = [f"- one forward real FFT of 4096 (NumPy): {unit * 1e6:.1f} us of processor time; {ROWS} samples"]
     for words, space in CASES.items():
         model = ftlm.Model(ftlm.equation(words))
-        for name, made in INPUTS.items():
-            u = made(np.random.default_rng(0), ROWS)
+        for name, make_input in INPUTS.items():
+            u = make_input(np.random.default_rng(0), ROWS)
             run = ftlm.Run.from_arrays(step=STEP, inputs={"u": u}, outputs={"y": 0 * u})
             free = simulate_refined(model, run, {}, tolerance=1e-6)
             took = least(lambda model=model, run=run: model.simulate(run), 15)
@@ -118,9 +118,9 @@ def outside(rows: int) -> list[str]:
     total = time.process_time() - start
     rest = total - took["fit_any_start"] - took["with_intervals"]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    told = ", ".join(f"{name} {value:.2f}" for name, value in took.items())
+    times_text = ", ".join(f"{name} {value:.2f}" for name, value in took.items())
     return [
-        f"- {rows} samples, three numbers: {total:.2f} s of processor time ({told})",
+        f"- {rows} samples, three numbers: {total:.2f} s of processor time ({times_text})",
         f"- outside fit and intervals {rest:.2f} s, {rest / unit:.0f} FFTs",
         f"- FFT of 4096 beside it {unit * 1e6:.1f} us; peak of the process {peak:.0f} MB, made its own data",
     ]
@@ -128,8 +128,8 @@ def outside(rows: int) -> list[str]:
 
 def main() -> None:
     """Print what was measured; with ``--write``, keep it."""
-    given = [a for a in sys.argv[1:] if a != "--write"]
-    lines = outside(int(given[1])) if given and given[0] == "outside" else runs()
+    arguments = [a for a in sys.argv[1:] if a != "--write"]
+    lines = outside(int(arguments[1])) if arguments and arguments[0] == "outside" else runs()
     print("\n".join(lines))
     if "--write" in sys.argv:
         results.append([results.heading() + ":", "", *lines])

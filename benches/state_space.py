@@ -32,7 +32,7 @@ ABSENT = "jax-sysid is not here, so nothing was set beside: pip install jax-sysi
 SEEDS = 3
 ADAM, LBFGS = 300, 1000
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 #: Output and inputs as columns.
 Signals = tuple[np.ndarray, np.ndarray]
 
@@ -45,10 +45,10 @@ class Scale:
     u: tuple[Any, Any]
 
     @classmethod
-    def of(cls, seen: Sequence[Signals]) -> Scale:
+    def of(cls, training: Sequence[Signals]) -> Scale:
         """Of all samples fitted."""
-        _, *y = standard_scale(np.concatenate([y for y, _ in seen]))
-        _, *u = standard_scale(np.concatenate([u for _, u in seen]))
+        _, *y = standard_scale(np.concatenate([y for y, _ in training]))
+        _, *u = standard_scale(np.concatenate([u for _, u in training]))
         return cls((y[0], y[1]), (u[0], u[1]))
 
     def scaled(self, signals: Signals) -> Signals:
@@ -57,21 +57,23 @@ class Scale:
         return (y - self.y[0]) * self.y[1], (u - self.u[0]) * self.u[1]
 
 
-def fitted(seen: Sequence[Signals], order: int, seed: int, steps: tuple[int, int] = (ADAM, LBFGS)) -> tuple[Any, float]:
+def train(
+    training: Sequence[Signals], order: int, seed: int, steps: tuple[int, int] = (ADAM, LBFGS)
+) -> tuple[Any, float]:
     """A model of standardised signals from one random start, and what its free runs leave."""
-    model = LinearModel(order, 1, seen[0][1].shape[1], feedthrough=True)
+    model = LinearModel(order, 1, training[0][1].shape[1], feedthrough=True)
     model.loss(rho_x0=1e-4, rho_th=1e-6)
     model.optimization(adam_epochs=steps[0], lbfgs_epochs=steps[1], iprint=-1)
     model.init(seed=seed)
-    model.fit([y for y, _ in seen], [u for _, u in seen])
-    starts = model.x0 if len(seen) > 1 else [model.x0]
-    left = sum(
-        float(np.sum((np.asarray(model.predict(x, u)[0]) - y) ** 2)) for x, (y, u) in zip(starts, seen, strict=True)
+    model.fit([y for y, _ in training], [u for _, u in training])
+    starts = model.x0 if len(training) > 1 else [model.x0]
+    loss = sum(
+        float(np.sum((np.asarray(model.predict(x, u)[0]) - y) ** 2)) for x, (y, u) in zip(starts, training, strict=True)
     )
-    return model, left
+    return model, loss
 
 
-def judged(model: Any, scale: Scale, run: Signals) -> float:
+def fit_percent(model: Any, scale: Scale, run: Signals) -> float:
     """Fit in percent of the free run; the initial state is the judged run's own, as an initial term is."""
     y, u = scale.scaled(run)
     state = model.learn_x0(u, y, rho_x0=1e-8, RTS_epochs=1, verbosity=0)
@@ -85,28 +87,28 @@ def best(ends: Sequence[tuple[Any, float]]) -> Any:
     return min(finite, key=lambda end: end[1])[0] if finite else None
 
 
-def spent(work: Callable[[], Made]) -> tuple[float, Made]:
+def processor_time(work: Callable[[], Result]) -> tuple[float, Result]:
     """Processor time of all threads, and what came of it."""
-    begun = time.process_time()
-    made = work()
-    return time.process_time() - begun, made
+    start_time = time.process_time()
+    result = work()
+    return time.process_time() - start_time, result
 
 
-def measured(runs: dict[str, Signals], used: Sequence[str], order: int, seeds: int) -> dict[str, Any]:
+def measurement(runs: dict[str, Signals], names: Sequence[str], order: int, seeds: int) -> dict[str, Any]:
     """One set of runs fitted, judged on all."""
     before = peak()
-    scale = Scale.of([runs[n] for n in used])
-    seen = [scale.scaled(runs[n]) for n in used]
-    first, *others = (spent(lambda seed=seed: fitted(seen, order, seed)) for seed in range(seeds))
-    setting_up, _ = spent(lambda: fitted(seen, order, 0, (1, 1)))
-    told = {}
+    scale = Scale.of([runs[n] for n in names])
+    training = [scale.scaled(runs[n]) for n in names]
+    first, *others = (processor_time(lambda seed=seed: train(training, order, seed)) for seed in range(seeds))
+    setting_up, _ = processor_time(lambda: train(training, order, 0, (1, 1)))
+    fits = {}
     for name, ends in (("one", [first[1]]), ("best", [end for _, end in (first, *others)])):
         model = best(ends)
-        told[name] = {} if model is None else {n: judged(model, scale, run) for n, run in runs.items()}
-    inputs = seen[0][1].shape[1]
+        fits[name] = {} if model is None else {n: fit_percent(model, scale, run) for n, run in runs.items()}
+    inputs = training[0][1].shape[1]
     return {
-        "used": list(used),
-        "fits": told,
+        "used": list(names),
+        "fits": fits,
         "seconds": [s for s, _ in (first, *others)],
         "setting_up": setting_up,
         "numbers": order * order + order * (inputs + 1) + inputs,
@@ -127,16 +129,18 @@ def main() -> None:
     parser.add_argument("used", help="names of runs fitted together, joined by +")
     parser.add_argument("--order", type=int, default=4)
     parser.add_argument("--seeds", type=int, default=SEEDS)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     if LinearModel is None:
         print(json.dumps({"absent": ABSENT}))
         return
     jax.config.update("jax_enable_x64", True)
-    with np.load(asked.file) as kept:
-        runs = {n.removesuffix(".y"): (kept[n], kept[n.removesuffix("y") + "u"]) for n in kept.files if n[-2:] == ".y"}
-    made = measured(runs, asked.used.split("+"), asked.order, asked.seeds)
+    with np.load(arguments.file) as arrays:
+        runs = {
+            n.removesuffix(".y"): (arrays[n], arrays[n.removesuffix("y") + "u"]) for n in arrays.files if n[-2:] == ".y"
+        }
+    answer = measurement(runs, arguments.used.split("+"), arguments.order, arguments.seeds)
     # What jax-sysid prints comes before.
-    print(json.dumps(made))
+    print(json.dumps(answer))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from results import heading
 LINK = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 FIT = "D^alpha y = a y + b u"
 SOLVED = ftlm.equation("D^1.6 y = -3 D^0.6 y - 8 y + 5 u")
-KNOWN = ftlm.equation("D^1.6 y = c D^0.6 y + a y + b u")
+FIXED_EQUATION = ftlm.equation("D^1.6 y = c D^0.6 y + a y + b u")
 #: Seconds within which a job is to end; one that takes longer is marked.
 PROMISED = 0.5
 
@@ -50,8 +50,8 @@ def searched(run: ftlm.Run, **options: object) -> Callable[[], object]:
 
 def reported(run: ftlm.Run) -> Callable[[], object]:
     """The report on a fit."""
-    found = ftlm.identify(run, ftlm.equation(FIT.replace("alpha", "1.6")))
-    return lambda: found.report(Path(tempfile.mkdtemp()) / "report.html", validation=run)
+    result = ftlm.identify(run, ftlm.equation(FIT.replace("alpha", "1.6")))
+    return lambda: result.report(Path(tempfile.mkdtemp()) / "report.html", validation=run)
 
 
 JOBS: dict[str, Callable[[ftlm.Run], Callable[[], object]]] = {
@@ -60,11 +60,13 @@ JOBS: dict[str, Callable[[ftlm.Run], Callable[[], object]]] = {
     "squares": lambda run: searched(run, norm="l2", coefficients="least-squares"),
     "instruments": lambda run: searched(run, coefficients="instrumental-variables"),
     "certificate": lambda run: lambda: ftlm.certify_orders(run, ftlm.equation(FIT), m=run["y"].size - 1),
-    "recursion": lambda run: lambda: ftlm.multi_innovation_trace(run, KNOWN, m=1 << int(math.log2(run["y"].size - 1))),
+    "recursion": lambda run: (
+        lambda: ftlm.multi_innovation_trace(run, FIXED_EQUATION, m=1 << int(math.log2(run["y"].size - 1)))
+    ),
     "fit": lambda run: lambda: ftlm.identify(run, ftlm.equation(FIT)),
-    "refined": lambda run: lambda: ftlm.identify(run, KNOWN, method="instrumental-variables"),
-    "innovations": lambda run: lambda: ftlm.identify(run, KNOWN, method="multi-innovation"),
-    "select": lambda run: lambda: ftlm.select(run, [ftlm.equation(FIT), KNOWN], validation="blocks"),
+    "refined": lambda run: lambda: ftlm.identify(run, FIXED_EQUATION, method="instrumental-variables"),
+    "innovations": lambda run: lambda: ftlm.identify(run, FIXED_EQUATION, method="multi-innovation"),
+    "select": lambda run: lambda: ftlm.select(run, [ftlm.equation(FIT), FIXED_EQUATION], validation="blocks"),
     "simulate": lambda run: lambda: ftlm.Model(SOLVED).simulate(run, tolerance=1e-9),
     "integral": lambda run: lambda: [ftlm.fractional_integral(run["y"], 0.01 * n, step=0.01) for n in range(1, 200)],
     "report": reported,
@@ -74,27 +76,27 @@ JOBS: dict[str, Callable[[ftlm.Run], Callable[[], object]]] = {
 def child(job: str, samples: int, after: float) -> None:
     """Do a job, told to stop after so many seconds: its own time, or that from the signal to its end."""
     call = JOBS[job](machine(samples))
-    sent = [math.inf]
+    stop_time = [math.inf]
 
     def send() -> None:
-        sent[0] = time.perf_counter()
+        stop_time[0] = time.perf_counter()
         os.kill(os.getpid(), signal.SIGINT)
 
     signal.signal(signal.SIGINT, signal.default_int_handler)
     timer = threading.Timer(after, send)
     timer.daemon = True
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     timer.start()
     try:
         call()
-        took = time.perf_counter() - begun
+        took = time.perf_counter() - start_time
         timer.cancel()
         print("done", took)
     except KeyboardInterrupt:
-        print("stopped", time.perf_counter() - sent[0])
+        print("stopped", time.perf_counter() - stop_time[0])
 
 
-def told(job: str, samples: int, after: float) -> tuple[str, float]:
+def stop_result(job: str, samples: int, after: float) -> tuple[str, float]:
     """What a child said."""
     call = [sys.executable, __file__, "--samples", str(samples), "--child", str(after), job]
     out = subprocess.run(call, stdout=subprocess.PIPE, text=True, check=True).stdout
@@ -118,13 +120,13 @@ def main() -> None:
         return
     print(f"{heading()}, {arguments.samples} samples, load {os.getloadavg()[0]:.1f} at the start")
     for job in arguments.jobs or JOBS:
-        word, seconds = told(job, arguments.samples, arguments.longest)
+        word, seconds = stop_result(job, arguments.samples, arguments.longest)
         late = word == "stopped"
         length = arguments.longest if late else seconds
         waits = [(arguments.longest, seconds)] if late else []
         for k in range(1, arguments.moments):
             after = k * length / arguments.moments
-            word, seconds = told(job, arguments.samples, after)
+            word, seconds = stop_result(job, arguments.samples, after)
             waits += [(after, seconds)] if word == "stopped" else []
         if not waits:
             print(f"{job}: takes {length:.2f} s and was never caught", flush=True)

@@ -80,10 +80,10 @@ def stage(path, progress=None):
     clean = demo_plant(1, form="published").simulate(empty, tolerance=1e-6)
     noise = np.random.default_rng(1)
     noisy = {n: clean[n] + 1e-4 * noise.standard_normal(rows) for n in outputs}
-    given = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy, name="stage")
+    run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy, name="stage")
     lattice = ftlm.order_grid(increment=0.025, alpha=(1.8, 2.0), gamma1=(0.8, 1.1), beta2=(0.0, 0.5), mu2=(0.7, 1.0))
     return ftlm.search_orders(
-        given,
+        run,
         ftlm.flexible_link(form="published"),
         lattice,
         pruning=False,
@@ -94,9 +94,9 @@ def stage(path, progress=None):
     )
 
 
-def table_bytes(found):
+def table_bytes(result):
     """The table and counts as text; a resumed search has no verdict."""
-    return json.dumps(replace(found, verdict=None, model_findings=()).to_dict())
+    return json.dumps(replace(result, verdict=None, model_findings=()).to_dict())
 
 
 def kills(count, seed=0, of=search):
@@ -105,10 +105,10 @@ def kills(count, seed=0, of=search):
     expected = table_bytes(of(None))
     name = "y" if of is search else "stage"
     script = CHILD.replace("{folder!r}", repr(str(Path(__file__).resolve().parent))).replace("{search}", of.__name__)
-    lost, ended, same = [], 0, True
+    losses, ended, same = [], 0, True
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "search.ftlm"
-        while len(lost) < count:
+        while len(losses) < count:
             moment = choose.uniform(0.0, 1.5)
             with subprocess.Popen(
                 [sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True
@@ -120,22 +120,22 @@ def kills(count, seed=0, of=search):
                 if not finished:
                     os.kill(child.pid, signal.SIGKILL)
                 lines = [first, *child.stdout]
-            told = [line.split() for line in lines if line.endswith("\n") and line.strip()]
+            lines_of_progress = [line.split() for line in lines if line.endswith("\n") and line.strip()]
             if not finished:
-                held = ftlm.search_status(path)[name].done_count
+                stored_count = ftlm.search_status(path)[name].done_count
                 # A stage tells what is in the store only: all since then is lost.
                 ages = [
                     killed - float(when)
-                    for when, done in (told if of is search else told[-1:])
-                    if of is stage or int(done) > held
+                    for when, count_text in (lines_of_progress if of is search else lines_of_progress[-1:])
+                    if of is stage or int(count_text) > stored_count
                 ]
-                lost.append(max([0.0, *ages]))
+                losses.append(max([0.0, *ages]))
                 continue
             ended += 1
             same &= table_bytes(of(path)) == expected
             path.unlink()
         same &= table_bytes(ftlm.resume_search(path)[name]) == expected if path.exists() else True
-    return lost, ended, same
+    return losses, ended, same
 
 
 def control_c(arguments, path, frames):
@@ -149,7 +149,7 @@ def control_c(arguments, path, frames):
         start_new_session=True,
     )
     os.close(other)
-    said, typed = b"", None
+    output, typed = b"", None
     while True:
         ready, _, _ = select.select([terminal], [], [], 0.02)
         if ready:
@@ -159,7 +159,7 @@ def control_c(arguments, path, frames):
                 break
             if not data:
                 break
-            said += data
+            output += data
         if typed is None:
             with contextlib.suppress(ftlm.DataError):
                 if path.exists() and rounds_in(path) >= frames:
@@ -168,7 +168,7 @@ def control_c(arguments, path, frames):
     code = child.wait()
     waited = math.nan if typed is None else time.monotonic() - typed
     os.close(terminal)
-    return code, waited, said.decode()
+    return code, waited, output.decode()
 
 
 def rounds_in(path):
@@ -198,10 +198,10 @@ def interruptions(count):
                 "rest",
             ]
             call += ["--coefficients", "instrumental-variables", "--store", str(path)]
-            code, waited, said = control_c(call, path, 1 + number % 3)
+            code, waited, output = control_c(call, path, 1 + number % 3)
             status = ftlm.search_status(path)["y"]
             if code != 130 or status.corruption:
-                sys.exit(f"exit code {code}, {status}\n{said}")
+                sys.exit(f"exit code {code}, {status}\n{output}")
             waits.append(waited)
     return waits
 
@@ -212,6 +212,6 @@ if __name__ == "__main__":
         print(f"{len(waits)} times Ctrl-C: median {sorted(waits)[len(waits) // 2]:.3f} s, worst {max(waits):.3f} s")
         sys.exit()
     numbers = [int(a) for a in sys.argv[1:] if a.isdigit()]
-    lost, ended, same = kills(*(numbers or [50]), of=stage if "stage" in sys.argv else search)
-    print(f"{len(lost)} kills, {ended} searches ended between them; tables identical: {same}")
-    print(f"lost to a kill: median {sorted(lost)[len(lost) // 2]:.3f} s, worst {max(lost):.3f} s")
+    losses, ended, same = kills(*(numbers or [50]), of=stage if "stage" in sys.argv else search)
+    print(f"{len(losses)} kills, {ended} searches ended between them; tables identical: {same}")
+    print(f"lost to a kill: median {sorted(losses)[len(losses) // 2]:.3f} s, worst {max(losses):.3f} s")

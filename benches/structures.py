@@ -35,7 +35,7 @@ from ftlm.structure_selection.cross_validation import (
     validate_fit,
 )
 from oracles import held_response
-from results import Kept, heading, save
+from results import ResultStore, heading, save
 
 DRIVES = [(hub, k) for hub in ("theta11", "theta21", "theta22") for k in (0, 1, 2)]
 
@@ -57,11 +57,11 @@ def everything_inside(offset: str = "auto") -> ftlm.Structure:
 def arm(threads: int) -> Iterator[str]:
     """The choice on psf and lqr."""
     runs = [arm_run(n) for n in ("psf", "lqr")]
-    wall, spent = time.perf_counter(), time.process_time()
-    found = ftlm.select(runs, everything_inside(), threads=threads)
-    wall, spent = time.perf_counter() - wall, time.process_time() - spent
-    yield from ("```", *str(found).splitlines(), "```", "")
-    yield f"- {wall:.0f} s, {spent:.0f} s of processor time on {threads} threads; {found.fitted} candidates fitted"
+    wall, cpu = time.perf_counter(), time.process_time()
+    selection = ftlm.select(runs, everything_inside(), threads=threads)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    yield from ("```", *str(selection).splitlines(), "```", "")
+    yield f"- {wall:.0f} s, {cpu:.0f} s of processor time on {threads} threads; {selection.fitted} candidates fitted"
 
 
 def motor(seed: int, rows: int = 400, late: int = 4, step: float = 0.02) -> ftlm.Run:
@@ -127,34 +127,34 @@ def plant(name: str, seed: int) -> tuple[list[ftlm.Run], ftlm.Structure, Variant
 
 def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
     """Whether the true structure is chosen, and where it is not, how the truth stands beside what was chosen."""
-    begun, wall = time.process_time(), time.perf_counter()
+    start_time, wall = time.process_time(), time.perf_counter()
     runs, rich, true = plant(name, seed)
-    found = ftlm.select(runs, rich, threads=threads)
+    selection = ftlm.select(runs, rich, threads=threads)
     row = {
-        "fitted": found.fitted,
-        "spent": time.process_time() - begun,
+        "fitted": selection.fitted,
+        "spent": time.process_time() - start_time,
         "wall": time.perf_counter() - wall,
-        "chosen": found.winner.name,
+        "chosen": selection.winner.name,
     }
     structure = NestedStructures(rich).build(true)
-    asked = signature(structure)
-    row["found"] = signature(found.winner.structure) == asked
+    key = signature(structure)
+    row["found"] = signature(selection.winner.structure) == key
     if row["found"]:
         return row
-    there = next((t for t in found.trials if signature(t.structure) == asked), None)
+    there = next((t for t in selection.trials if signature(t.structure) == key), None)
     row["why"] = "the choice" if there is not None else "the search: the truth was not judged"
     if there is None:
         folds = Folds.of(runs, "runs" if len(runs) > 1 else "blocks")
         there = validate_fit(describe_structure(structure), structure, folds, fit(folds.runs, structure, []))
-        there = replace(there, bic=schwarz_criterion(there.joint, there.parameters, scatter_of(found)))
-    for word, trial in {"truth": there, "winner": found.winner, "best": found.trials[0]}.items():
+        there = replace(there, bic=schwarz_criterion(there.joint, there.parameters, scatter_of(selection)))
+    for word, trial in {"truth": there, "winner": selection.winner, "best": selection.trials[0]}.items():
         row[word] = {"name": trial.name, "numbers": trial.parameters, "bic": trial.bic, "scores": trial.scores}
     return row
 
 
-def scatter_of(found: ftlm.Selection) -> float:
+def scatter_of(selection: ftlm.Selection) -> float:
     """How many samples told as much as one, when a choice compared criteria."""
-    return min(residual_variance_inflation(t.joint) for t in found.trials if t.joint is not None)
+    return min(residual_variance_inflation(t.joint) for t in selection.trials if t.joint is not None)
 
 
 def failure(seed: int, row: dict[str, Any]) -> Iterator[str]:
@@ -172,7 +172,7 @@ def failure(seed: int, row: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def truth(names: list[str], seeds: range, threads: int, kept: Kept) -> Iterator[str]:
+def truth(names: list[str], seeds: range, threads: int, store: ResultStore) -> Iterator[str]:
     """How often the true structure is found, and what was chosen instead."""
     yield "| plant | seeds | found | processor time a seed, the longest | wall clock a seed | commit |"
     yield "| --- | --- | --- | --- | --- | --- |"
@@ -180,16 +180,16 @@ def truth(names: list[str], seeds: range, threads: int, kept: Kept) -> Iterator[
     for name in names:
         rows: dict[int, dict[str, Any]] = {}
         for seed in seeds:
-            rows[seed] = row = kept.row(f"{name} {seed}", functools.partial(choice, name, seed, threads))
+            rows[seed] = row = store.row(f"{name} {seed}", functools.partial(choice, name, seed, threads))
             print(f"{name} {seed}: {'' if row['found'] else 'NOT THE TRUE ONE: '}{row['chosen']}", file=sys.stderr)
             print(f"  {row['fitted']} fitted, {row['spent']:.1f} s of processor time", file=sys.stderr, flush=True)
             if not row["found"]:
                 failures += [f"- {name}, {line}" if line[0] != " " else line for line in failure(seed, row)]
-        spent, wall = ([r[k] for r in rows.values()] for k in ("spent", "wall"))
+        cpu, wall = ([r[k] for r in rows.values()] for k in ("spent", "wall"))
         yield (
             f"| {name} | {seeds.start} to {seeds.stop - 1} | {sum(r['found'] for r in rows.values())} of {len(rows)} | "
-            f"{np.mean(spent):.1f} s, {max(spent):.1f} s | {np.mean(wall):.1f} s | "
-            f"{kept.commits([f'{name} {s}' for s in seeds])} |"
+            f"{np.mean(cpu):.1f} s, {max(cpu):.1f} s | {np.mean(wall):.1f} s | "
+            f"{store.commits([f'{name} {s}' for s in seeds])} |"
         )
     yield from ("", *failures)
 
@@ -204,18 +204,18 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--kept", type=Path, help="file of seeds that are done, to go on from")
     parser.add_argument("--write", action="store_true", help="write benches/results.json")
-    given = parser.parse_args()
-    seeds = range(given.first, given.first + given.seeds)
+    arguments = parser.parse_args()
+    seeds = range(arguments.first, arguments.first + arguments.seeds)
     rows = (
-        arm(given.threads)
-        if given.what == "arm"
-        else truth(given.plants.split(","), seeds, given.threads, Kept(given.kept))
+        arm(arguments.threads)
+        if arguments.what == "arm"
+        else truth(arguments.plants.split(","), seeds, arguments.threads, ResultStore(arguments.kept))
     )
     lines = [f"{heading()}:", ""]
     for line in rows:
         print(line, flush=True)
         lines.append(line)
-    if given.write:
+    if arguments.write:
         save(lines)
 
 

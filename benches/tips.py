@@ -43,7 +43,7 @@ SAMPLES = 20
 #: Plants on which stability is decided: stiffness of link 1 times, delay of the angles [s].
 FINE_STIFFNESS, FINE_DELAYS = np.linspace(0.3, 1.5, 25), np.linspace(0.0, 0.08, 33)
 OUT = Path(__file__).parent.parent / "docs" / "tips.json"
-KEPT = Path(os.environ.get("KEPT", "tips.jsonl"))
+CHECKPOINT = Path(os.environ.get("KEPT", "tips.jsonl"))
 
 
 def structures():
@@ -79,9 +79,9 @@ def both(first):
 def designed(name, model, samples):
     """A design of a model over so many samples of its numbers, and what runs of it."""
     if name == "lqg":
-        made = control.lqg(model, input="I1", samples=samples, **WEIGHTS)
-        return made, made.with_limit(0.93)
-    made = control.fractional_pid(
+        design = control.lqg(model, input="I1", samples=samples, **WEIGHTS)
+        return design, design.with_limit(0.93)
+    design = control.fractional_pid(
         model,
         output="theta11",
         input="I1",
@@ -90,10 +90,10 @@ def designed(name, model, samples):
         rate=RATE,
         samples=samples,
     )
-    return made, control.DiscretePid(made.pid, RATE, limit=0.93)
+    return design, control.DiscretePid(design.pid, RATE, limit=0.93)
 
 
-def judged(controller, reference, ends, **options):
+def assessment(controller, reference, ends, **options):
     """RMS of the tip in the second after the path has ended, about its mean and about its goal [rad]."""
     tip = moves.tip_of(controller, reference, **options)
     if tip is None:
@@ -107,11 +107,11 @@ def of_seed(seed):
     run = moves.own_run(seed)
     path = control.point_to_point(ANGLE, SECONDS, RATE, dwell_before=BEFORE, dwell_after=AFTER)
     ends = round((BEFORE + SECONDS) * RATE)
-    found = {"seed": seed}
+    results = {"seed": seed}
     for kind, structure in structures().items():
         began = time.process_time()
         model = identified(run, structure)
-        told = {"seconds": time.process_time() - began, "fit": model.estimate.fit}
+        values = {"seconds": time.process_time() - began, "fit": model.estimate.fit}
         for name in ("lqg", "pid"):
             refused = None
             try:
@@ -124,16 +124,16 @@ def of_seed(seed):
                     design, controller = designed(name, model, 0)
                     planned = control.inverse_dynamics(design, path, output=TIP, samples=0)
                 except ftlm.ModelError as worse:
-                    told[name] = {"refused": str(worse), "plain": None, "inverse": None, "none": True}
+                    values[name] = {"refused": str(worse), "plain": None, "inverse": None, "none": True}
                     continue
             loop = both(controller)
-            told[name] = {
+            values[name] = {
                 "refused": refused,
-                "plain": judged(loop, path, ends, seed=1000 + seed),
-                "inverse": judged(loop, planned.reference, ends, seed=1000 + seed),
+                "plain": assessment(loop, path, ends, seed=1000 + seed),
+                "inverse": assessment(loop, planned.reference, ends, seed=1000 + seed),
             }
-        found[kind] = told
-    return found
+        results[kind] = values
+    return results
 
 
 def contenders(seed):
@@ -157,21 +157,21 @@ def stable(seed=0):
     _, loops = contenders(seed)
     w = np.geomspace(0.01, 0.999 * np.pi * RATE, 4000)
     arm = rig.ArmParameters.of("linear")
-    acting = {name: (made.acting(w)[:2], integrals(made)) for name, made in loops.items()}
+    acting = {name: (design.acting(w)[:2], integrals(design)) for name, design in loops.items()}
     acting["LQR of the maker's model"] = (("theta11", "theta12"), maker(w)), 0.0
-    found = {name: [] for name in acting}
+    results = {name: [] for name in acting}
     for times in FINE_STIFFNESS:
         law = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * float(times))).model()
         plants = {o: stability_margins.Plant(law, o, "I1", RATE, "simulated") for o in ("theta11", "theta12")}
-        seen = {o: plant.response(w) for o, plant in plants.items()}
+        responses = {o: plant.response(w) for o, plant in plants.items()}
         grows = plants["theta11"].count_unstable_poles()
         for delay in FINE_DELAYS:
             late = np.exp(-1j * w * float(delay))
             for name, ((read, answers), integral) in acting.items():
-                loop = sum(a * seen[o] for o, a in zip(read, answers, strict=True)) * late
+                loop = sum(a * responses[o] for o, a in zip(read, answers, strict=True)) * late
                 margins = stability_margins.margins_of(loop, w, plants["theta11"].integral_order() + integral, grows)
-                found[name].append([float(times), float(delay), margins.stable])
-    return {"stable": found}
+                results[name].append([float(times), float(delay), margins.stable])
+    return {"stable": results}
 
 
 def integrals(design):
@@ -218,20 +218,20 @@ def still(seed=0):
         ),
     }
     arm = rig.ArmParameters.of("effective")
-    found = {n: [] for n in runs}
+    results = {n: [] for n in runs}
     for times in moves.STIFFNESS:
         other = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * times))
         for delay in moves.DELAYS:
-            for name, (made, reference, until) in runs.items():
+            for name, (make_loop, reference, until) in runs.items():
                 after = np.concatenate([reference, np.full(round(0.4 * RATE), reference[-1])])
-                left = judged(moves.Late(made(), delay), after, until, parameters=other, seed=5000)
-                found[name].append([times, delay, None if left is None else left[0]])
+                residual = assessment(moves.Late(make_loop(), delay), after, until, parameters=other, seed=5000)
+                results[name].append([times, delay, None if residual is None else residual[0]])
         print(times, file=sys.stderr, flush=True)
     traces = {}
     for name in ("fractional PID", "fractional PID, ZVD", "LQG, inverse"):
-        made, reference, _ = runs[name]
-        traces[name] = traced(made(), reference)
-    return {"still": found, "traces": traces, "step": 4 / RATE, "path": path[::4].round(6).tolist()}
+        make_loop, reference, _ = runs[name]
+        traces[name] = traced(make_loop(), reference)
+    return {"still": results, "traces": traces, "step": 4 / RATE, "path": path[::4].round(6).tolist()}
 
 
 def traced(controller, reference):
@@ -245,29 +245,29 @@ def traced(controller, reference):
 
 def table():
     """Ratios over the seeds."""
-    rows = {r["seed"]: r for r in map(json.loads, KEPT.read_text(encoding="utf-8").splitlines())}
+    rows = {r["seed"]: r for r in map(json.loads, CHECKPOINT.read_text(encoding="utf-8").splitlines())}
     rows = [rows[s] for s in sorted(rows)]
     print(f"{len(rows)} seeds")
 
-    def left(kind, name, what, about=0):
+    def column_values(kind, name, what, about=0):
         values = [r[kind][name].get(what) for r in rows]
         return np.array([np.nan if v is None else 1e3 * v[about] for v in values])
 
-    def shown(values):
+    def quantiles(values):
         there = values[np.isfinite(values)]
         return f"{np.median(there):.3g} ({there.min():.3g} to {there.max():.3g})" if there.size else "none"
 
     for name in ("lqg", "pid"):
-        own = left("fractional", name, "inverse")
+        own = column_values("fractional", name, "inverse")
         for kind in structures():
-            plain, inverse, goal = (left(kind, name, *w) for w in (("plain",), ("inverse",), ("inverse", 1)))
+            plain, inverse, goal = (column_values(kind, name, *w) for w in (("plain",), ("inverse",), ("inverse", 1)))
             none = sum("none" in r[kind][name] for r in rows)
             refused = sum(r[kind][name]["refused"] is not None for r in rows) - none
             print(
-                f"{name}, {kind}: no design {none}, refused by its intervals {refused}; mrad plain {shown(plain)}, "
-                f"stopped {np.isnan(plain).sum() - none}; inverse {shown(inverse)}, stopped "
-                f"{np.isnan(inverse).sum() - none}, about the goal {shown(goal)}; plain over inverse "
-                f"{shown(plain / inverse)}; inverse over the fractional one {shown(inverse / own)}"
+                f"{name}, {kind}: no design {none}, refused by its intervals {refused}; mrad plain {quantiles(plain)}, "
+                f"stopped {np.isnan(plain).sum() - none}; inverse {quantiles(inverse)}, stopped "
+                f"{np.isnan(inverse).sum() - none}, about the goal {quantiles(goal)}; plain over inverse "
+                f"{quantiles(plain / inverse)}; inverse over the fractional one {quantiles(inverse / own)}"
             )
     return [
         {"seed": r["seed"]}
@@ -280,14 +280,16 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["seeds", "stable", "still", "table"])
     parser.add_argument("seeds", nargs="*", type=int)
-    given = parser.parse_args()
-    if given.what == "seeds":
-        for one in given.seeds or range(20):
+    arguments = parser.parse_args()
+    if arguments.what == "seeds":
+        for one in arguments.seeds or range(20):
             line = json.dumps(of_seed(one))
-            with KEPT.open("a", encoding="utf-8") as file:
+            with CHECKPOINT.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
             print(f"seed {one}", file=sys.stderr, flush=True)
     else:
-        told = {"seeds": table()} if given.what == "table" else {"stable": stable, "still": still}[given.what]()
+        tables = (
+            {"seeds": table()} if arguments.what == "table" else {"stable": stable, "still": still}[arguments.what]()
+        )
         before = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
-        OUT.write_text(json.dumps(before | told) + "\n", encoding="utf-8")
+        OUT.write_text(json.dumps(before | tables) + "\n", encoding="utf-8")

@@ -30,7 +30,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, minimize_cost, sample_run
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.reproduction.simulated_arm import demo_plant
-from results import Kept, heading, save
+from results import ResultStore, heading, save
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -62,12 +62,12 @@ class Scores:
         return 100.0 * np.mean(np.abs(self.z) < NORMAL_95, axis=0)
 
     def __str__(self) -> str:
-        mean, held = self.mean, 100 * np.mean(np.abs(self.z) < NORMAL_95)
+        mean, share = self.mean, 100 * np.mean(np.abs(self.z) < NORMAL_95)
         at = int(np.argmax(np.abs(mean)))
         worst = f"{abs(mean[at]):.2f} ({self.names[at]})"
         return (
             f"{self.plant} {self.level:g} dB, {len(self.z)} seeds: largest |mean z| {worst}; "
-            f"95 % intervals cover {held:.1f} % pooled, {self.coverage.min():.0f} to {self.coverage.max():.0f} % by "
+            f"95 % intervals cover {share:.1f} % pooled, {self.coverage.min():.0f} to {self.coverage.max():.0f} % by "
             f"parameter; largest |z| {np.max(np.abs(self.z)):.1f}; {self.seconds:.1f} s a fit on one core"
         )
 
@@ -77,14 +77,14 @@ def workers() -> int:
     return os.cpu_count() or 1
 
 
-def fitted(task: tuple[str, float, int]) -> tuple[np.ndarray, tuple[str, ...], float]:
+def fit(task: tuple[str, float, int]) -> tuple[np.ndarray, tuple[str, ...], float]:
     """z-scores of one seed from the automatic start."""
     name, level, seed = task
     start = time.process_time()
-    found = fit_output_error([plants.noisy_run(name, level, seed)], plants.structure(name))
+    result = fit_output_error([plants.noisy_run(name, level, seed)], plants.structure(name))
     truth = plants.truth(name)
-    z = (found.values - np.array([truth[n] for n in found.names])) / np.sqrt(np.diag(found.covariance))
-    return z, tuple(found.names), time.process_time() - start
+    z = (result.values - np.array([truth[n] for n in result.names])) / np.sqrt(np.diag(result.covariance))
+    return z, tuple(result.names), time.process_time() - start
 
 
 def intervals(names: Iterable[str], levels: Iterable[float], seeds: int) -> Iterator[Scores]:
@@ -92,7 +92,7 @@ def intervals(names: Iterable[str], levels: Iterable[float], seeds: int) -> Iter
     with ProcessPoolExecutor(workers()) as pool:
         for name in names:
             for level in levels:
-                ended = list(pool.map(fitted, [(name, level, s) for s in range(seeds)]))
+                ended = list(pool.map(fit, [(name, level, s) for s in range(seeds)]))
                 z = np.array([e[0] for e in ended])
                 yield Scores(name, level, ended[0][1], z, float(np.mean([e[2] for e in ended])))
 
@@ -129,9 +129,9 @@ def three_terms(task: tuple[float, int]) -> float:
     """Fit to the noise-free output of one seed."""
     level, seed = task
     run, clean = plants.noisy_run("3T", level, seed), plants.clean_run("3T")
-    found = ftlm.identify(run, plants.structure("3T"), threads=1)
+    result = ftlm.identify(run, plants.structure("3T"), threads=1)
     y = clean["y"]
-    simulated = found.model.simulate(clean, tolerance=1e-6)["y"]
+    simulated = result.model.simulate(clean, tolerance=1e-6)["y"]
     return float(100 * (1 - np.linalg.norm(simulated - y) / np.linalg.norm(y - y.mean())))
 
 
@@ -154,21 +154,21 @@ def random_plant(seed: int) -> tuple[int, float, float, str]:
     words = ", ".join(f"{n} {v:.3g}" for n, v in truth.items())
     start = time.process_time()
     try:
-        found = fit_output_error([run], structure)
-        taken = time.process_time() - start
+        result = fit_output_error([run], structure)
+        seconds = time.process_time() - start
         reference = fit_output_error([run], structure, start=truth)
     except ftlm.FtlmError as error:
         return seed, np.inf, time.process_time() - start, f"{words}: {error}"
-    return seed, (found.noise["y"] / reference.noise["y"]) ** 2 - 1.0, taken, words
+    return seed, (result.noise["y"] / reference.noise["y"]) ** 2 - 1.0, seconds, words
 
 
-def random_plants(seeds: int, kept: Kept) -> Iterator[str]:
+def random_plants(seeds: int, store: ResultStore) -> Iterator[str]:
     """Share of random plants whose automatic start ends in the global optimum; the others one by one."""
-    asked = [s for s in range(seeds) if f"random plant {s}" not in kept.known]
+    seeds_missing = [s for s in range(seeds) if f"random plant {s}" not in store.known]
     with ProcessPoolExecutor(workers()) as pool:
-        for end in pool.map(random_plant, asked):
-            kept.row(f"random plant {end[0]}", functools.partial(dict, end=end))
-    ended = [kept.known[f"random plant {s}"]["end"] for s in range(seeds)]
+        for end in pool.map(random_plant, seeds_missing):
+            store.row(f"random plant {end[0]}", functools.partial(dict, end=end))
+    ended = [store.known[f"random plant {s}"]["end"] for s in range(seeds)]
     missed = [e for e in ended if e[1] > SAME_OPTIMUM]
     yield (
         f"random plants, seeds 0 to {seeds - 1}, 40 dB: {seeds - len(missed)} of {seeds} end in the global optimum; "
@@ -178,10 +178,10 @@ def random_plants(seeds: int, kept: Kept) -> Iterator[str]:
         yield f"  missed: seed {seed} ({words}), noise variance {100 * excess:.3g} % above"
 
 
-def shortfall(found: ftlm.Model, best: ftlm.Model, clean: ftlm.Run) -> float:
+def shortfall(model: ftlm.Model, best: ftlm.Model, clean: ftlm.Run) -> float:
     """Points of fit to the noise-free outputs that one model has less than another; of the worst output."""
-    reached, wanted = clean_fits(found, clean), clean_fits(best, clean)
-    return max(wanted[n] - reached[n] for n in clean.outputs)
+    reached, best_fits = clean_fits(model, clean), clean_fits(best, clean)
+    return max(best_fits[n] - reached[n] for n in clean.outputs)
 
 
 def instruments(seeds: int) -> Iterator[str]:
@@ -190,19 +190,19 @@ def instruments(seeds: int) -> Iterator[str]:
     true = structure.with_orders({n: v for n, v in plants.truth("A").items() if n in structure.order_names})
     exact = demo_plant(1, form="published").coefficients
     for level in (60, 40, 20):
-        found = [
+        results = [
             ftlm.identify(plants.noisy_run("A", level, s), true, method="instrumental-variables") for s in range(seeds)
         ]
         for name, value in exact.items():
-            values = np.array([f.coefficients[name] for f in found])
-            errors = np.array([f.standard_errors[name] for f in found])
+            values = np.array([f.coefficients[name] for f in results])
+            errors = np.array([f.standard_errors[name] for f in results])
             z = (values - value) / errors
             yield (
                 f"A {level} dB, {seeds} seeds: {name} {values.mean():.5g} ± {values.std():.2g} (truth {value:.5g}), "
                 f"standard error {np.median(errors):.2g}, mean z {z.mean():.2f}, |z| < 1.96 in "
                 f"{100 * np.mean(np.abs(z) < NORMAL_95):.0f} %"
             )
-        fits = np.array([list(clean_fits(f.model, clean).values()) for f in found])
+        fits = np.array([list(clean_fits(f.model, clean).values()) for f in results])
         words = ", ".join(
             f"{o} {m:.3f} % (least {w:.3f})"
             for o, m, w in zip(clean.outputs, np.median(fits, axis=0), fits.min(axis=0), strict=True)
@@ -233,10 +233,10 @@ def orders_by_lattice(task: tuple[str, int]) -> tuple[dict[str, float], float]:
     true = structure.with_orders({n: v for n, v in plants.truth(name).items() if n in structure.order_names})
     best = ftlm.identify(run, true, method="instrumental-variables", threads=1)
     try:
-        found = ftlm.identify(
+        result = ftlm.identify(
             run, structure, method=ftlm.InstrumentalVariables(order_grid=ftlm.order_grid(**LATTICES[name])), threads=1
         )
-        return found.orders, shortfall(found.model, best.model, clean)
+        return result.orders, shortfall(result.model, best.model, clean)
     except ftlm.ConvergenceError:
         return dict.fromkeys(structure.order_names, np.inf), np.inf
 
@@ -281,16 +281,16 @@ def heating() -> Iterator[str]:
     )
     for name, (words, initial) in HEATING.items():
         structure = replace(ftlm.equation(words), initial=initial)
-        found = ftlm.identify(run, structure)
+        result = ftlm.identify(run, structure)
         part = ftlm.identify(run.window(0, 1000), structure)
-        numbers = ", ".join(f"{n} {v:.3f} ± {found.standard_errors[n]:.2g}" for n, v in found.orders.items())
-        finer = found.joint.noise["T"] if found.joint is not None else np.nan
+        numbers = ", ".join(f"{n} {v:.3f} ± {result.standard_errors[n]:.2g}" for n, v in result.orders.items())
+        finer = result.joint.noise["T"] if result.joint is not None else np.nan
         yield (
-            f"{name}: fit {found.fit['T']:.2f} %, residuals {finer:.2f} degC, BIC {found.information.bic:.0f}"
+            f"{name}: fit {result.fit['T']:.2f} %, residuals {finer:.2f} degC, BIC {result.information.bic:.0f}"
             f"{'; ' + numbers if numbers else ''}; identified from the first 1000 of 1600 s: "
             f"{part.model.compare(run).fit['T']:.2f} % of all"
         )
-        yield from (f"  {name}: {w}" for w in found.warnings)
+        yield from (f"  {name}: {w}" for w in result.warnings)
 
 
 def main() -> None:
@@ -313,8 +313,8 @@ def main() -> None:
         "instruments": lambda: instruments(arguments.seeds),
         "orders": lambda: orders([n for n in names if n in LATTICES], arguments.seeds),
         "three-terms": lambda: three_terms_table(arguments.seeds),
-        "random-plants": lambda: random_plants(arguments.seeds, Kept(arguments.kept)),
-        "arm": lambda: itertools.chain(arm_measured.measured(), arm_measured.orders(), arm_measured.steps()),
+        "random-plants": lambda: random_plants(arguments.seeds, ResultStore(arguments.kept)),
+        "arm": lambda: itertools.chain(arm_measured.measurements(), arm_measured.orders(), arm_measured.steps()),
         "heating": heating,
     }[arguments.what]()
     lines = [f"{heading()}:", ""]

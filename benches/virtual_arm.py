@@ -77,21 +77,21 @@ def cut(run: ftlm.Run, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndar
 
 def for_links(run: ftlm.Run) -> ftlm.Run:
     """All angles behind the filter, and the angles of what stands on link 1 and of link 2 on its hub."""
-    seen = {n: behind_filter(run[n], run.step) for n in HUBS} | {n: run[n] for n in DEFLECTIONS}
-    sums = {"tip": seen["theta11"] + seen["theta12"], "second": seen["theta21"] + seen["theta22"]}
-    return cut(run, {n: seen[n] for n in HUBS} | sums, {n: seen[n] for n in DEFLECTIONS})
+    signals = {n: behind_filter(run[n], run.step) for n in HUBS} | {n: run[n] for n in DEFLECTIONS}
+    sums = {"tip": signals["theta11"] + signals["theta12"], "second": signals["theta21"] + signals["theta22"]}
+    return cut(run, {n: signals[n] for n in HUBS} | sums, {n: signals[n] for n in DEFLECTIONS})
 
 
-def fitted(words: str, runs: list[ftlm.Run], judged: list[ftlm.Run]) -> ftlm.Identification:
+def fit_and_print(words: str, runs: list[ftlm.Run], validation: list[ftlm.Run]) -> ftlm.Identification:
     """Fit, and say numbers with standard errors and the fit on every run."""
-    begun = time.process_time()
-    found = ftlm.identify(runs, ftlm.equation(words), threads=1, method=ftlm.OutputError(intervals="quadratic"))
-    output = found.model.outputs[0]
-    fits = ", ".join(f"{r.name} {found.model.compare(r).fit[output]:.1f}" for r in judged)
-    numbers = ", ".join(f"{n} {v:.5g} ± {found.standard_errors[n]:.2g}" for n, v in found.coefficients.items())
-    used = "+".join(r.name for r in runs)
-    print(f"| {output} | {used} | {numbers} | {fits} | {time.process_time() - begun:.0f} s", flush=True)
-    return found
+    start_time = time.process_time()
+    result = ftlm.identify(runs, ftlm.equation(words), threads=1, method=ftlm.OutputError(intervals="quadratic"))
+    output = result.model.outputs[0]
+    fits = ", ".join(f"{r.name} {result.model.compare(r).fit[output]:.1f}" for r in validation)
+    numbers = ", ".join(f"{n} {v:.5g} ± {result.standard_errors[n]:.2g}" for n, v in result.coefficients.items())
+    names = "+".join(r.name for r in runs)
+    print(f"| {output} | {names} | {numbers} | {fits} | {time.process_time() - start_time:.0f} s", flush=True)
+    return result
 
 
 def bends(run: ftlm.Run, links: dict[int, dict[str, float]]) -> dict[str, np.ndarray]:
@@ -124,8 +124,8 @@ def fit() -> None:
     both = list(runs.values())
     links = {}
     for stage, words in LINKS.items():
-        for used in ([runs["psf"]], [runs["lqr"]], both):
-            links[stage] = fitted(words, used, both).coefficients
+        for runs_of_fit in ([runs["psf"]], [runs["lqr"]], both):
+            links[stage] = fit_and_print(words, runs_of_fit, both).coefficients
     bent = {n: bends(r, links) for n, r in whole.items()}
     for stage in (1, 2):
         hub, bend, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
@@ -133,11 +133,11 @@ def fit() -> None:
         # The link is as stiff for its hub as for itself: K_s/J_j1 is K_s/J_j2 over J_j1/J_j2 of the maker's file.
         words = HUB.format(hub=hub, bend=bend, current=current, k=-links[stage]["a"] / (RATIOS[stage] - 1.0))
         for run in own:
-            found = fitted(words, [run], [run])
-            if found.standard_errors["g"] > 0.1 * found.coefficients["g"]:
+            result = fit_and_print(words, [run], [run])
+            if result.standard_errors["g"] > 0.1 * result.coefficients["g"]:
                 # A hub that friction holds so well tells torque and friction apart only where one is known.
                 torque = PARAMETER_SETS["effective"][stage].coefficients(stage)[f"g{2 * stage - 1}"]
-                fitted(words.replace("g I", f"{torque:.6g} I"), [run], [run])
+                fit_and_print(words.replace("g I", f"{torque:.6g} I"), [run], [run])
 
 
 def beside() -> None:
@@ -152,9 +152,9 @@ def beside() -> None:
             words = ", ".join(f"{v:+.2f}" for v in real_arm.correlations(run))
             ratios = ", ".join(f"{n} {run[n][600:].std() / real[n][600:].std():.2f}" for n in ANGLES)
             worst = {n: real_arm.factor(run, real, (n,), bands) for n in ANGLES}
-            told = ", ".join(f"{n} {v:.1f}" for n, v in worst.items())
+            bands_text = ", ".join(f"{n} {v:.1f}" for n, v in worst.items())
             print(
-                f"| {unit} | {name} | {words} | deviation over the real one: {ratios} | worst band: {told} |",
+                f"| {unit} | {name} | {words} | deviation over the real one: {ratios} | worst band: {bands_text} |",
                 flush=True,
             )
 

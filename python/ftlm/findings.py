@@ -280,11 +280,11 @@ def texts(findings: Iterable[Finding]) -> tuple[str, ...]:
 
 def unique(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings without repetitions."""
-    kept: list[Finding] = []
+    selection: list[Finding] = []
     for item in findings:
-        if item not in kept:
-            kept.append(item)
-    return tuple(kept)
+        if item not in selection:
+            selection.append(item)
+    return tuple(selection)
 
 
 @dataclass(frozen=True)
@@ -331,7 +331,7 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
     return tuple(FindingGroup(tuple(sorted(by[key], key=lambda item: not item.kind.remedy))) for key in sorted(by))
 
 
-def hidden_findings_text(found: Sequence[FindingGroup]) -> str:
+def hidden_findings_text(groups: Sequence[FindingGroup]) -> str:
     """Return the number of findings that a summary omits, as text; empty if it omits none."""
-    count = sum(len(g.findings) for g in found) - len(found[:MAX_SUMMARY_FINDINGS])
+    count = sum(len(g.findings) for g in groups) - len(groups[:MAX_SUMMARY_FINDINGS])
     return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

@@ -105,14 +105,14 @@ def fractional_derivative(
     -----
     O(n log n) for n samples.
     """
-    given = as_floats("initial", [] if initial is None else initial)
+    values = as_floats("initial", [] if initial is None else initial)
     alpha, width = real_number("order", order), real_number("step", step)
 
     def work(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        if given.ndim <= 1:
-            starts = np.broadcast_to(given.reshape(1, -1), (rows.shape[0], given.size))
+        if values.ndim <= 1:
+            starts = np.broadcast_to(values.reshape(1, -1), (rows.shape[0], values.size))
         else:
-            starts = given.reshape(-1, given.shape[-1])
+            starts = values.reshape(-1, values.shape[-1])
         starts = np.ascontiguousarray(starts)
         return _core.fractional_derivative(rows, alpha, width, definition, starts)
 

@@ -270,7 +270,7 @@ def multi_innovation(
     if prior.ndim > 1 or (prior.ndim and prior.size != width):
         raise DataError(f"prior_covariance has shape {prior.shape}; give a number, or one for each of {width} columns")
     lead = _broadcast({"Q": regressors.shape[:-2], "m": outputs.shape[:-1]})
-    found = _core.multi_innovation_rows(
+    rows = _core.multi_innovation_rows(
         np.broadcast_to(regressors, (*lead, count, width)).reshape(-1, width),
         np.broadcast_to(outputs, (*lead, count)).ravel(),
         count,
@@ -278,7 +278,7 @@ def multi_innovation(
         np.broadcast_to(prior, width).tolist(),
         trace,
     )
-    return found.reshape(*lead, count, width) if trace else found.reshape(*lead, width)
+    return rows.reshape(*lead, count, width) if trace else rows.reshape(*lead, width)
 
 
 @check_arguments
@@ -307,10 +307,10 @@ def errors(measured: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
         raise DataError(f"measured has shape {y.shape}, predicted {prediction.shape}; give arrays of one length")
     lead = _broadcast({"measured": y.shape[:-1], "predicted": prediction.shape[:-1]})
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        left = np.abs(np.broadcast_to(y - prediction, (*lead, m)))
-        rmse = np.sqrt(np.mean(left**2, axis=-1))
+        residuals = np.abs(np.broadcast_to(y - prediction, (*lead, m)))
+        rmse = np.sqrt(np.mean(residuals**2, axis=-1))
         ratio = rmse / np.std(y, axis=-1)
-        return np.stack([np.sum(left, axis=-1), rmse, ratio, 100.0 * (1.0 - ratio)], axis=-1)
+        return np.stack([np.sum(residuals, axis=-1), rmse, ratio, 100.0 * (1.0 - ratio)], axis=-1)
 
 
 #: Smallest eigenvalue of the correlation matrix of a candidate's columns; below it they are dependent within rounding.
@@ -415,11 +415,11 @@ class Candidates:
         with np.errstate(divide="ignore", invalid="ignore"):
             unit = normal / (sizes[:, :, None] * sizes[:, None, :])
             target = gram[places, 0] / sizes
-        found = np.full(places.shape, np.nan)
+        coefficients = np.full(places.shape, np.nan)
         usable = np.flatnonzero(np.all(sizes > 0, axis=1))
         usable = usable[np.linalg.eigvalsh(unit[usable])[:, 0] > MIN_CORRELATION_EIGENVALUE]
-        found[usable] = np.linalg.solve(unit[usable], target[usable, :, None])[..., 0] / sizes[usable]
-        return found
+        coefficients[usable] = np.linalg.solve(unit[usable], target[usable, :, None])[..., 0] / sizes[usable]
+        return coefficients
 
     @check_arguments
     def score(
@@ -471,13 +471,15 @@ class Candidates:
         if math.isnan(highest):
             raise ModelError(f"{parameter('limit', limit)} is not a number; give one, or inf for none")
         if coefficients is None:
-            found = self.coefficients(table, p=p, prior_covariance=prior_covariance, rows=rows)
+            coefficients_table = self.coefficients(table, p=p, prior_covariance=prior_covariance, rows=rows)
         else:
-            found = self._check_shape(as_floats("coefficients", coefficients, gaps=True), len(table))
+            coefficients_table = self._check_shape(as_floats("coefficients", coefficients, gaps=True), len(table))
         scores = np.full(len(table), np.inf)
-        known = np.all(np.isfinite(found), axis=1)
-        scores[known] = self._points[norm].scores(np.hstack([table, found])[known], highest, check_threads(threads))
-        return scores, found
+        is_finite = np.all(np.isfinite(coefficients_table), axis=1)
+        scores[is_finite] = self._points[norm].scores(
+            np.hstack([table, coefficients_table])[is_finite], highest, check_threads(threads)
+        )
+        return scores, coefficients_table
 
     @check_arguments
     def free_run(self, orders: ArrayLike, coefficients: ArrayLike) -> NDArray[np.float64]:
@@ -557,9 +559,13 @@ class Candidates:
         new = [key for key in keys if key not in self._columns]
         if new or not self._bank:
             rows, etas = [row for row, _ in new], [gap for _, gap in new]
-            before = self._bank.get("time", self._signals[[self._output]])
-            whole = np.vstack([before, integrate(self._signals[rows], etas, step=self._step)]) if new else before
-            self._columns |= {key: len(before) + k for k, key in enumerate(new)}
+            signals_before = self._bank.get("time", self._signals[[self._output]])
+            whole = (
+                np.vstack([signals_before, integrate(self._signals[rows], etas, step=self._step)])
+                if new
+                else signals_before
+            )
+            self._columns |= {key: len(signals_before) + k for k, key in enumerate(new)}
             self._bank = {"time": whole}
         at = np.array([self._columns[key] for key in keys], dtype=np.intp)
         return at[inverse.ravel()].reshape(gaps.shape)

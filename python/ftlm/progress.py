@@ -60,37 +60,37 @@ class ShareTracker:
 
     Parameters
     ----------
-    told
+    listener
         Called with (parts done, ``TOTAL_PARTS``); None for no reports.
     """
 
-    def __init__(self, told: Callable[[int, int], None] | None) -> None:
-        self._told = told
+    def __init__(self, listener: Callable[[int, int], None] | None) -> None:
+        self._listener = listener
         self.reached = 0.0
-        self._said = -1
+        self._reported_parts = -1
 
     def advance_to(self, share: float) -> None:
         """Report that this share of the whole is done."""
         self.reached = max(self.reached, min(share, 1.0))
         parts = round(TOTAL_PARTS * self.reached)
-        if self._told is not None and parts > self._said:
-            self._said = parts
-            self._told(parts, TOTAL_PARTS)
+        if self._listener is not None and parts > self._reported_parts:
+            self._reported_parts = parts
+            self._listener(parts, TOTAL_PARTS)
 
     def subtask(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
         """Return a callback (done, total) for a part of the work that ends at this share of the whole.
 
         If the part restarts its count, each pass takes the same share of the remainder.
         """
-        begun, last = self.reached, 0.0
+        first, last = self.reached, 0.0
 
-        def report_subtask(done: int, total: int) -> None:
-            nonlocal begun, last
-            fraction = done / max(total, 1)
+        def report_subtask(count: int, total: int) -> None:
+            nonlocal first, last
+            fraction = count / max(total, 1)
             if fraction < last:
-                begun = self.reached
+                first = self.reached
             last = fraction
-            self.advance_to(begun + sweep * (share - begun) * fraction)
+            self.advance_to(first + sweep * (share - first) * fraction)
 
         return report_subtask
 
@@ -140,29 +140,29 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
-        """Show ``done`` of ``total`` candidates, ``pruned`` of them excluded early."""
+    def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
+        """Show ``count`` of ``total`` candidates, ``pruned`` of them excluded early."""
         if self._quiet or time.monotonic() - self._start < BAR_DELAY_S or total == 0:
             return
         passed = max(time.monotonic() - self._start, 1e-9)
-        counted = f"{100 * done // total:.0f} %"
+        text = f"{100 * count // total:.0f} %"
         # Of work without a count of its own a person wants to know the share alone.
         if not isinstance(total, ShareTotal):
-            counted += f" of {total:,.0f}" if self._current_bar().console.width >= WIDE_TERMINAL_COLUMNS else ""
-            counted += f" {done / passed:,.0f}/s"
-        share = "" if pruned is None else f"{100 * pruned / max(done, 1):.1f} % pruned"
-        left = format_time_left(passed * (total - done) / done) if 0 < done < total else ""
-        self._show(counted, share, left, completed=done, total=total)
-        if done >= total:
+            text += f" of {total:,.0f}" if self._current_bar().console.width >= WIDE_TERMINAL_COLUMNS else ""
+            text += f" {count / passed:,.0f}/s"
+        share = "" if pruned is None else f"{100 * pruned / max(count, 1):.1f} % pruned"
+        time_left = format_time_left(passed * (total - count) / count) if 0 < count < total else ""
+        self._show(text, share, time_left, completed=count, total=total)
+        if count >= total:
             # The next search of the same job starts a bar of its own.
             self._stop()
 
-    def so_far(self, done: int, known: int) -> None:
+    def so_far(self, count: int, total: int) -> None:
         """Show progress of work whose total is not known."""
         passed = time.monotonic() - self._start
         if self._quiet or passed < BAR_DELAY_S:
             return
-        self._show(f"{done} of {known} so far", left=f"after {passed:.0f} s")
+        self._show(f"{count} of {total} so far", time_left=f"after {passed:.0f} s")
 
     @property
     def quiet(self) -> bool:
@@ -191,13 +191,13 @@ class Progress:
             self._bar = self._bar or _start_bar()
             return self._bar
 
-    def _show(self, counted: str, pruned: str = "", left: str = "", **state: Any) -> None:
+    def _show(self, text: str, pruned: str = "", time_left: str = "", **state: Any) -> None:
         """Show figures; the label is truncated to the width of the line."""
-        bar, taken = self._current_bar(), len(counted) + len(pruned) + len(left) + 3
-        room = max(bar.console.width - taken - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS)
+        bar, columns = self._current_bar(), len(text) + len(pruned) + len(time_left) + 3
+        room = max(bar.console.width - columns - MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS)
         label = escape_controls(self._label)
         label = label if len(label) <= room else f"{label[: room - 1].rstrip(' ,')}…"
-        bar.update(bar.task_ids[0], description=label, counted=counted, pruned=pruned, left=left, **state)
+        bar.update(bar.task_ids[0], description=label, counted=text, pruned=pruned, left=time_left, **state)
 
     def _stop(self) -> None:
         with self._lock:
@@ -215,22 +215,22 @@ class Stoppable(Progress):
 
     Parameters
     ----------
-    told
+    listener
         Receiver of the reports.
     stop
         Event that ends the work with KeyboardInterrupt at its next report; signals reach the main thread only.
     """
 
-    def __init__(self, told: Callable[[int, int], None] | None, stop: threading.Event) -> None:
+    def __init__(self, listener: Callable[[int, int], None] | None, stop: threading.Event) -> None:
         super().__init__("", quiet=True)
-        self._told = told
+        self._listener = listener
         self._ended = stop
 
-    def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
+    def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
         """Forward a report, or raise KeyboardInterrupt."""
         if self._ended.is_set():
             raise KeyboardInterrupt
-        if isinstance(self._told, Progress):
-            self._told(done, total, pruned)
-        elif self._told is not None:
-            self._told(done, total)
+        if isinstance(self._listener, Progress):
+            self._listener(count, total, pruned)
+        elif self._listener is not None:
+            self._listener(count, total)

@@ -109,19 +109,19 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, ensure_min_samples=8
         )
         table = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
-        wanted = self._structure(X.shape[1], table.shape[1])
-        inputs = tuple(s for s in wanted.signals if s not in wanted.outputs)
-        for what, names, count in (("X", inputs, X.shape[1]), ("y", wanted.outputs, table.shape[1])):
+        structure = self._structure(X.shape[1], table.shape[1])
+        inputs = tuple(s for s in structure.signals if s not in structure.outputs)
+        for what, names, count in (("X", inputs, X.shape[1]), ("y", structure.outputs, table.shape[1])):
             if len(names) != count:
                 raise ValueError(f"{what} has {count} columns, and the structure has {len(names)}: {', '.join(names)}")
         by_name = not isinstance(self.structure, str) or self.structure != "auto"
         self._inputs = _in_order("X", inputs, getattr(self, "feature_names_in_", None) if by_name else None)
-        self._outputs = _in_order("y", wanted.outputs, columns if by_name else None)
+        self._outputs = _in_order("y", structure.outputs, columns if by_name else None)
         self._index = _check_index(index)
         run = self._run(X, table, "fit")
-        self.identification_ = identify(run, wanted, method=self.method, threads=self.threads, offset=self.offset)
+        self.identification_ = identify(run, structure, method=self.method, threads=self.threads, offset=self.offset)
         self.model_ = self.identification_.model
-        self._fitted, self._flat = X.copy(), np.ndim(y) == 1
+        self._fit_inputs, self._flat = X.copy(), np.ndim(y) == 1
         return self
 
     @check_arguments
@@ -131,18 +131,18 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         as_array("X", X)
         index = _check_index(_index(X))
         X = _validation.validate_data(self, X, reset=False, dtype=np.float64)
-        before = 0
-        if self.continues and not np.array_equal(X, self._fitted):
+        rows_before = 0
+        if self.continues and not np.array_equal(X, self._fit_inputs):
             if index is not None and self._index is not None:
-                _check_index(np.concatenate([self._index, index]), len(self._fitted))
-            before = len(self._fitted)
-            X = np.concatenate([self._fitted, X])
+                _check_index(np.concatenate([self._index, index]), len(self._fit_inputs))
+            rows_before = len(self._fit_inputs)
+            X = np.concatenate([self._fit_inputs, X])
         rows = len(X)
         # A simulation needs a few instants; what is held beyond the last row changes nothing before it.
         X = np.concatenate([X, np.repeat(X[-1:], max(3 - rows, 0), axis=0)])
         run = self._run(X, np.zeros((len(X), len(self._outputs))), "predict")
         free = self.model_.simulate(run, initial={o: {} for o in self._outputs})
-        out: Floats = np.stack([free[o] for o in self._outputs], axis=1)[before:rows]
+        out: Floats = np.stack([free[o] for o in self._outputs], axis=1)[rows_before:rows]
         return out[:, 0] if self._flat else out
 
     def _structure(self, inputs: int, outputs: int) -> Structure:
@@ -194,14 +194,14 @@ def _index(table: Any) -> Floats | None:
     return np.asarray(index, dtype=np.float64) if kind and kind in "iufM" else None
 
 
-def _check_index(index: Floats | None, fitted: int = 0) -> Floats | None:
+def _check_index(index: Floats | None, fit_rows: int = 0) -> Floats | None:
     """Return the index of rows; raise if it does not increase by one step."""
     steps = np.diff(index) if index is not None else np.zeros(0)
     usual = float(np.median(steps)) if steps.size else 1.0
     bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_SHARE * usual)))
     if not bad.size:
         return index
-    where = "between the fitted rows and those of X" if fitted == bad[0] + 1 else f"after row {bad[0]} of X"
+    where = "between the fitted rows and those of X" if fit_rows == bad[0] + 1 else f"after row {bad[0]} of X"
     raise DataError(
         f"X: its index does not go on by one step {where}, {bad.size} such places in all, and rows are instants of "
         "one record; leave out no row in between (gap=0, no shuffling), or reset the index if none is missing"

@@ -139,7 +139,7 @@ PLANTS = {
 def drawn_plants(count: int, seed: int) -> dict[str, Plant]:
     """Return random plants: two of three of integer orders 1 to 4, half of these with a dead time, one fractional."""
     g = np.random.default_rng(seed)
-    found = {}
+    plants = {}
     for number in range(count):
         step, samples = 0.02, int(g.integers(600, 2000))
         if number % 3 == 2:
@@ -160,8 +160,8 @@ def drawn_plants(count: int, seed: int) -> dict[str, Plant]:
             delay = step * g.uniform(0.5, 20) if g.uniform() < 0.5 else 0.0
             response = integer_response(np.atleast_1d(numerator).tolist(), denominator.tolist(), delay)
             words = f"order {order}, {zeros.size} zeros" + (f", {delay:.2f} s late" if delay else "")
-        found[f"{number + 1}: {words}"] = Plant(step, samples, int(g.integers(20, 60)), response, ())
-    return found
+        plants[f"{number + 1}: {words}"] = Plant(step, samples, int(g.integers(20, 60)), response, ())
+    return plants
 
 
 def _two_terms(order: float, damped: float, loss: float, stiff: float) -> Callable[[np.ndarray], np.ndarray]:

@@ -8,7 +8,7 @@ import re
 
 def circles(graph):
     """Sets of nodes that reach each other (Tarjan's strongly connected components), each in order."""
-    number, low, stack, found = {}, {}, [], []
+    number, low, stack, components = {}, {}, [], []
 
     def visit(node):
         number[node] = low[node] = len(number)
@@ -23,12 +23,12 @@ def circles(graph):
             members = stack[stack.index(node) :]
             del stack[stack.index(node) :]
             if len(members) > 1 or node in graph.get(node, ()):
-                found.append(sorted(members))
+                components.append(sorted(members))
 
     for node in graph:
         if node not in number:
             visit(node)
-    return sorted(found)
+    return sorted(components)
 
 
 TOKEN = re.compile(
@@ -82,21 +82,21 @@ def use_tree(text):
     """Paths of a use declaration with the name each is known by: ``a::{self, b::C as D}`` and so on."""
     brace = text.find("{")
     if brace < 0:
-        path, _, known = re.sub(r"\s+as\s+", " as ", text.strip()).partition(" as ")
+        path, _, alias = re.sub(r"\s+as\s+", " as ", text.strip()).partition(" as ")
         names = tuple(part.strip() for part in path.split("::") if part.strip())
-        return [(names, known or names[-1])]
+        return [(names, alias or names[-1])]
     prefix = tuple(part.strip() for part in text[:brace].split("::") if part.strip())
-    inside, depth, start, found = text[brace + 1 : text.rindex("}")] + ",", 0, 0, []
+    inside, depth, start, uses = text[brace + 1 : text.rindex("}")] + ",", 0, 0, []
     for at, letter in enumerate(inside):
         depth += (letter == "{") - (letter == "}")
         if letter != "," or depth:
             continue
-        for path, known in use_tree(inside[start:at]) if inside[start:at].strip() else ():
+        for path, alias in use_tree(inside[start:at]) if inside[start:at].strip() else ():
             # In braces `self` is what stands before them.
             whole = prefix + path[: -1 if path[-1] == "self" else None]
-            found.append((whole, whole[-1] if known == "self" else known))
+            uses.append((whole, whole[-1] if alias == "self" else alias))
         start = at + 1
-    return found
+    return uses
 
 
 class Crate:
@@ -161,21 +161,21 @@ class Crate:
         item = rf"\b(?:fn|struct|enum|union|const|static|trait|type|macro_rules!)\s+(?:mut\s+)?{re.escape(name)}\b"
         return re.search(item, self.code[module]) is not None
 
-    def homes(self, path, seen=frozenset()):
+    def homes(self, path, visited=frozenset()):
         """Files that a path from the root leads to, through whatever passes a name on."""
-        if path in seen:
+        if path in visited:
             return set()
         module = next(path[:n] for n in range(len(path), -1, -1) if path[:n] in self.paths)
-        rest, seen = path[len(module) :], seen | {path}
+        rest, visited = path[len(module) :], visited | {path}
         if not rest:
             return {module}
         if rest[0] == "*":
-            return set().union(*(self.homes(p, seen) for ps in self.scope[module].values() for p in ps), {module})
+            return set().union(*(self.homes(p, visited) for ps in self.scope[module].values() for p in ps), {module})
         if not self.defines(module, rest[0]):
-            for known in self.scope[module].get(rest[0], ()):
-                return self.homes((*known, *rest[1:]), seen)
+            for target in self.scope[module].get(rest[0], ()):
+                return self.homes((*target, *rest[1:]), visited)
             for passed in self.scope[module].get("*", ()):
-                for home in self.homes(passed[:-1], seen):
+                for home in self.homes(passed[:-1], visited):
                     if self.defines(home, rest[0]):
                         return {home}
         return {module}
@@ -189,8 +189,8 @@ class Crate:
                 absolute = self._absolute(path, here)
                 if absolute is not None:
                     targets |= self.homes(absolute)
-                for known in self.scope[module].get(path[0], ()) if absolute is None else ():
-                    targets |= self.homes((*known, *path[1:]))
+                for target in self.scope[module].get(path[0], ()) if absolute is None else ():
+                    targets |= self.homes((*target, *path[1:]))
             if not self.is_face(module):
                 graph[module] = {t for t in targets if t != module and not self.is_face(t)}
         return graph
@@ -218,18 +218,18 @@ def functions_of(code, start, end):
 
 def entries(root):
     """Bodies of what a Python program can call in the bindings below a folder: {file::Class.name: body}."""
-    found, helpers = {}, {}
+    entry_bodies, helpers = {}, {}
     for path in sorted(root.rglob("*.rs")):
         code = without_tests(bare(path.read_text(encoding="utf-8")))
         bodies = helpers[path] = {}
         for mark in re.finditer(r"#\[pyfunction", code):
             name, body = next(functions_of(code, mark.end(), len(code)))
-            found[f"{path.stem}::{name}"] = body
+            entry_bodies[f"{path.stem}::{name}"] = body
         for mark in re.finditer(r"#\[pymethods\]\s*impl(?:<[^>]*>)?\s+(\w+)[^{]*\{", code):
             for name, body in functions_of(code, mark.end(), closing(code, mark.end() - 1)):
-                found[f"{path.stem}::{mark[1]}.{name}"] = body
+                entry_bodies[f"{path.stem}::{mark[1]}.{name}"] = body
         bodies.update(functions_of(code, 0, len(code)))
-    return found, {name: body for bodies in helpers.values() for name, body in bodies.items()}
+    return entry_bodies, {name: body for bodies in helpers.values() for name, body in bodies.items()}
 
 
 def unwrapped(root, wrappers):

@@ -45,21 +45,21 @@ def naive_run(
     damping = [(c, nu, weights(nu - 1.0, count) * step ** (1.0 - nu)) for c, nu in own]
     for k in range(1, count):
         # Everything but this instant's velocity and friction; Caputo's derivative of the velocity does not see `rate`.
-        known = force[k] - inertia[1 : k + 1] @ (v[k - 1 :: -1][:k] - rate) + inertia[0] * rate
+        momentum = force[k] - inertia[1 : k + 1] @ (v[k - 1 :: -1][:k] - rate) + inertia[0] * rate
         gain = inertia[0]
         for c, nu, w in damping:
             if nu == 0:
-                known += c * y[k - 1]
+                momentum += c * y[k - 1]
                 gain -= c * step
             elif nu < 1:
-                known += c * (w[1:k] @ v[k - 1 : 0 : -1])
+                momentum += c * (w[1:k] @ v[k - 1 : 0 : -1])
                 gain -= c * w[0]
             else:
                 shift = rate if nu > 1 else 0.0
-                known += c * (w[1 : k + 1] @ (v[k - 1 :: -1][:k] - shift) - w[0] * shift)
+                momentum += c * (w[1 : k + 1] @ (v[k - 1 :: -1][:k] - shift) - w[0] * shift)
                 gain -= c * w[0]
         holds = friction + more * np.exp(-((v[k - 1] / speed) ** 2))
-        v[k] = np.sign(known) * max(abs(known) - holds, 0.0) / gain
+        v[k] = np.sign(momentum) * max(abs(momentum) - holds, 0.0) / gain
         y[k] = y[k - 1] + step * v[k]
     return y, v
 
@@ -94,8 +94,8 @@ def between_events(
                     middle = 0.5 * (low + high)
                     low, high = (low, middle) if abs(force(middle) - spring * state[0]) > most else (middle, high)
                 until = high
-            held = (times >= now) & (times <= until)
-            y[held], v[held] = state[0], 0.0
+            is_inside = (times >= now) & (times <= until)
+            y[is_inside], v[is_inside] = state[0], 0.0
             now, side = until, np.sign(force(until) - spring * state[0]) if until < end else 0.0
             if until >= end:
                 break
@@ -107,20 +107,20 @@ def between_events(
                 force(t) - spring * x[0] - viscous * x[1] - s * (friction + more * np.exp(-((x[1] / speed) ** 2))),
             ]
 
-        def rest(t: float, x: np.ndarray, s: float = s, begun: float = now) -> float:
-            return x[1] if t > begun + 1e-9 else s
+        def rest(t: float, x: np.ndarray, s: float = s, start_time: float = now) -> float:
+            return x[1] if t > start_time + 1e-9 else s
 
         rest.terminal, rest.direction = True, -s
         inside = times[(times > now) & (times <= end)]
-        found = solve_ivp(
+        solution = solve_ivp(
             motion, (now, end), state, events=rest, rtol=1e-10, atol=1e-12, dense_output=True, max_step=(end / 500)
         )
-        reached = inside[inside <= found.t[-1]]
+        reached = inside[inside <= solution.t[-1]]
         if reached.size:
             at = [np.searchsorted(times, t) for t in reached]
-            y[at], v[at] = found.sol(reached)
-        now, state = float(found.t[-1]), found.y[:, -1].copy()
-        if found.status == 1:
+            y[at], v[at] = solution.sol(reached)
+        now, state = float(solution.t[-1]), solution.y[:, -1].copy()
+        if solution.status == 1:
             state[1] = 0.0
             pull = force(now) - spring * state[0]
             side = 0.0 if abs(pull) <= most else float(np.sign(pull))
@@ -131,7 +131,7 @@ def regularised(
     force: Callable[[float], float], times: np.ndarray, viscous: float, friction: float, width: float, rate: float = 0.0
 ) -> np.ndarray:
     """Position of the same mass where sgn is tanh(v / width)."""
-    found = solve_ivp(
+    solution = solve_ivp(
         lambda t, x: [x[1], force(t) - viscous * x[1] - friction * np.tanh(x[1] / width)],
         (0.0, float(times[-1])),
         [0.0, rate],
@@ -141,7 +141,7 @@ def regularised(
         atol=1e-11,
         max_step=float(times[-1]) / 2000,
     )
-    return np.asarray(found.y[0])
+    return np.asarray(solution.y[0])
 
 
 def exact_cart(
@@ -155,21 +155,21 @@ def exact_cart(
     y[0], v[0] = level, rate
     x, w = level, rate
     for k in range(force.size - 1):
-        left = step
-        while left > 0:
+        remaining = step
+        while remaining > 0:
             side = np.sign(w)
             if side == 0:
                 if abs(force[k]) <= friction:
                     break
                 side = np.sign(force[k])
             final = (force[k] - side * friction) / viscous
-            gone = left
+            duration = remaining
             if w != 0 and final * side < 0:
-                gone = min(left, np.log((w - final) / -final) / viscous)
-            decay = np.exp(-viscous * gone)
-            x += final * gone + (w - final) * (1.0 - decay) / viscous
-            w = 0.0 if gone < left else final + (w - final) * decay
-            left -= gone
+                duration = min(remaining, np.log((w - final) / -final) / viscous)
+            decay = np.exp(-viscous * duration)
+            x += final * duration + (w - final) * (1.0 - decay) / viscous
+            w = 0.0 if duration < remaining else final + (w - final) * decay
+            remaining -= duration
         y[k + 1], v[k + 1] = x, w
     return y, v
 
@@ -198,9 +198,9 @@ def hub_and_link(
     (a, d, b), (k, c) = hub, link
     most, now, end = friction + more, 0.0, float(times[-1])
     state = np.array([*start, *held] if low_pass else start, dtype=float)
-    shown = [0, 2, 4, 6] if low_pass else [0, 2]
-    angles, rate = np.zeros((len(shown), times.size)), np.zeros(times.size)
-    angles[:, 0], rate[0] = state[shown], state[1]
+    columns = [0, 2, 4, 6] if low_pass else [0, 2]
+    angles, rate = np.zeros((len(columns), times.size)), np.zeros(times.size)
+    angles[:, 0], rate[0] = state[columns], state[1]
 
     def behind(x: np.ndarray) -> list[float]:
         if low_pass is None:
@@ -224,13 +224,13 @@ def hub_and_link(
                 away = pull(t, x) + b * x[1] - s * (friction + more * np.exp(-((x[1] / speed) ** 2)))
             return [x[1] if s else 0.0, away, x[3], -away - k * x[2] - c * x[3], *behind(x)]
 
-        def event(t: float, x: np.ndarray, s: float = side, begun: float = now) -> float:
+        def event(t: float, x: np.ndarray, s: float = side, start_time: float = now) -> float:
             if s:
-                return s * x[1] if t > begun + 1e-9 else 1.0
-            return abs(pull(t, x)) - most if t > begun + 1e-9 else -1.0
+                return s * x[1] if t > start_time + 1e-9 else 1.0
+            return abs(pull(t, x)) - most if t > start_time + 1e-9 else -1.0
 
         event.terminal, event.direction = True, -1.0 if side else 1.0
-        found = solve_ivp(
+        solution = solve_ivp(
             motion,
             (now, end),
             state,
@@ -241,12 +241,12 @@ def hub_and_link(
             dense_output=True,
             max_step=end / 1000,
         )
-        inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
+        inside = np.flatnonzero((times > now) & (times <= solution.t[-1]))
         if inside.size:
-            there = found.sol(times[inside])
-            angles[:, inside], rate[inside] = there[shown], there[1] if side else 0.0
-        now, state = float(found.t[-1]), found.y[:, -1].copy()
-        if found.status == 1:
+            there = solution.sol(times[inside])
+            angles[:, inside], rate[inside] = there[columns], there[1] if side else 0.0
+        now, state = float(solution.t[-1]), solution.y[:, -1].copy()
+        if solution.status == 1:
             if side:
                 state[1] = 0.0
                 side = side_at_rest(now, state)
@@ -307,20 +307,22 @@ def bodies(
                 pulled[i] -= rubs(i, x[2 * i + 1]) * np.tanh(x[2 * i + 1] / width)
             return np.stack([x[1::2], np.linalg.solve(mass, pulled)]).T.ravel()
 
-        found = solve_ivp(
+        solution = solve_ivp(
             smooth, (0.0, end), state, method="LSODA", t_eval=times, rtol=1e-9, atol=1e-11, max_step=end / 2000
         )
-        return found.y[::2], found.y[1::2]
+        return solution.y[::2], solution.y[1::2]
 
-    def on_from(t: float, x: np.ndarray, known: dict[int, float]) -> list[float]:
+    def on_from(t: float, x: np.ndarray, sides_known: dict[int, float]) -> list[float]:
         """The one way to go on: what moves goes on to its side, what rests stays or starts as forces say."""
-        known = {i: float(np.sign(x[2 * i + 1])) for i in range(n) if i not in rough or x[2 * i + 1]} | known
-        asked = [i for i in range(n) if i not in known]
+        sides_known = {
+            i: float(np.sign(x[2 * i + 1])) for i in range(n) if i not in rough or x[2 * i + 1]
+        } | sides_known
+        undecided = [i for i in range(n) if i not in sides_known]
         agree = []
-        for ways in product((-1.0, 0.0, 1.0), repeat=len(asked)):
-            sides = known | dict(zip(asked, ways, strict=True))
-            a, held = moving(t, x, [sides[i] for i in range(n)])
-            if all(a[i] * sides[i] > 0.0 if sides[i] else abs(held[i]) <= most(i) for i in asked):
+        for ways in product((-1.0, 0.0, 1.0), repeat=len(undecided)):
+            sides = sides_known | dict(zip(undecided, ways, strict=True))
+            a, forces = moving(t, x, [sides[i] for i in range(n)])
+            if all(a[i] * sides[i] > 0.0 if sides[i] else abs(forces[i]) <= most(i) for i in undecided):
                 agree.append([sides[i] for i in range(n)])
         assert len(agree) == 1, agree
         return agree[0]
@@ -337,16 +339,16 @@ def bodies(
             still = rested(x)
             return np.stack([still[1::2], moving(t, still, sides)[0]]).T.ravel()
 
-        def event_of(i: int, begun: float = now, sides: Sequence[float] = tuple(sides)):
+        def event_of(i: int, start_time: float = now, sides: Sequence[float] = tuple(sides)):
             def event(t: float, x: np.ndarray) -> float:
                 if sides[i]:
-                    return sides[i] * x[2 * i + 1] if t > begun + 1e-9 else 1.0
-                return abs(float(moving(t, rested(x), sides)[1][i])) - most(i) if t > begun + 1e-9 else -1.0
+                    return sides[i] * x[2 * i + 1] if t > start_time + 1e-9 else 1.0
+                return abs(float(moving(t, rested(x), sides)[1][i])) - most(i) if t > start_time + 1e-9 else -1.0
 
             event.terminal, event.direction = True, -1.0 if sides[i] else 1.0
             return event
 
-        found = solve_ivp(
+        solution = solve_ivp(
             motion,
             (now, end),
             state,
@@ -357,17 +359,17 @@ def bodies(
             dense_output=True,
             max_step=end / 500,
         )
-        inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
+        inside = np.flatnonzero((times > now) & (times <= solution.t[-1]))
         if inside.size:
-            there = np.array([rested(column) for column in found.sol(times[inside]).T]).T
+            there = np.array([rested(column) for column in solution.sol(times[inside]).T]).T
             places[:, inside], rates[:, inside] = there[::2], there[1::2]
-        now, state = float(found.t[-1]), rested(found.y[:, -1])
-        if found.status == 1:
-            met = [i for i, when in zip(rough, found.t_events, strict=True) if when.size]
-            held = moving(now, state, sides)[1]
-            state[[2 * i + 1 for i in met if sides[i]]] = 0.0
+        now, state = float(solution.t[-1]), rested(solution.y[:, -1])
+        if solution.status == 1:
+            contacts = [i for i, when in zip(rough, solution.t_events, strict=True) if when.size]
+            forces = moving(now, state, sides)[1]
+            state[[2 * i + 1 for i in contacts if sides[i]]] = 0.0
             # At its limit a body lets go to the side to which it is pushed.
-            sides = on_from(now, state, {i: float(np.sign(held[i])) for i in met if not sides[i]})
+            sides = on_from(now, state, {i: float(np.sign(forces[i])) for i in contacts if not sides[i]})
     return places, rates
 
 
@@ -398,7 +400,7 @@ def slope_errors(at: Callable[[np.ndarray], dict], point: np.ndarray, numbers: i
 
     Behind the numbers, `point` holds initial terms, along which nothing is compared: the fit projects them out.
     """
-    found = np.asarray(at(point)["jacobian"])
+    result = np.asarray(at(point)["jacobian"])
     columns = []
     for i in range(point.size):
         step = np.zeros(point.size)
@@ -410,5 +412,5 @@ def slope_errors(at: Callable[[np.ndarray], dict], point: np.ndarray, numbers: i
     for k in range(numbers):
         expected = columns[k] - states @ (states.T @ columns[k])
         assert np.linalg.norm(expected) > 1e-6 * np.linalg.norm(columns[k]) > 0
-        errors.append(float(np.linalg.norm(found[k] - expected) / np.linalg.norm(columns[k])))
+        errors.append(float(np.linalg.norm(result[k] - expected) / np.linalg.norm(columns[k])))
     return errors

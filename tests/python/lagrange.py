@@ -38,12 +38,12 @@ def structure(stage: int) -> ftlm.Structure:
 
 def model(stage: int) -> ftlm.Model:
     """The arm with everything known; the deflection's coefficients by the law, written out."""
-    known, h, d = truth(stage), 2 * stage - 1, 2 * stage
-    made = structure(stage)
-    orders = {n: known[n] for n in made.order_names}
-    ratio = known[f"j{stage}"]
-    link = {f"{c}{d}": -known[f"{c}{h}"] * ratio for c in "ad"}
-    return ftlm.Model(made.with_orders(orders).with_coefficients({f"{c}{h}": known[f"{c}{h}"] for c in "abdg"} | link))
+    values, h, d = truth(stage), 2 * stage - 1, 2 * stage
+    form = structure(stage)
+    orders = {n: values[n] for n in form.order_names}
+    ratio = values[f"j{stage}"]
+    link = {f"{c}{d}": -values[f"{c}{h}"] * ratio for c in "ad"}
+    return ftlm.Model(form.with_orders(orders).with_coefficients({f"{c}{h}": values[f"{c}{h}"] for c in "abdg"} | link))
 
 
 def current(shape: str, rows: int = ROWS) -> np.ndarray:

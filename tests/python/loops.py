@@ -44,8 +44,8 @@ def relaxation(t: np.ndarray, alpha: float, rate: float, *, integral: bool = Fal
         out[i : i + 512] = (-np.expm1(-decay) / r) @ weight if integral else np.exp(-decay) @ weight
     if alpha > 1.0:
         pole = complex(math.cos(math.pi / alpha), math.sin(math.pi / alpha))
-        grown = np.exp(pole * scaled)
-        out += 2.0 / alpha * np.real((grown - 1.0) / pole if integral else grown)
+        exponential = np.exp(pole * scaled)
+        out += 2.0 / alpha * np.real((exponential - 1.0) / pole if integral else exponential)
     return out / rate ** (1.0 / alpha) if integral else out
 
 

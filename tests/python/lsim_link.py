@@ -57,29 +57,29 @@ def projected(
     *,
     filtered: Sequence[str],
     offset: bool = False,
-    known: np.ndarray | None = None,
+    fixed: np.ndarray | None = None,
     first: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients of the terms, unless known (all, or the first), and what is left over."""
     table = columns(signals, step, *point, terms, filtered, offset)
     y, count = signals[output], len(terms)
-    if known is not None:
-        y = y - table[:, :count] @ known
+    if fixed is not None:
+        y = y - table[:, :count] @ fixed
         table = table[:, count:]
     elif first is not None:
         y = y - first * table[:, 0]
         table = table[:, 1:]
     scale = np.linalg.norm(table, axis=0)
-    found = np.linalg.lstsq(table / scale, y, rcond=1e-12)[0] / scale
-    left = y - table @ found
-    if known is not None:
-        return known, left
-    return (found[:count] if first is None else np.r_[first, found[: count - 1]]), left
+    solution = np.linalg.lstsq(table / scale, y, rcond=1e-12)[0] / scale
+    residual = y - table @ solution
+    if fixed is not None:
+        return fixed, residual
+    return (solution[:count] if first is None else np.r_[first, solution[: count - 1]]), residual
 
 
-def fit(y: np.ndarray, left: np.ndarray) -> float:
+def fit(y: np.ndarray, residual: np.ndarray) -> float:
     """Fit of a free run that leaves this."""
-    return 100.0 * (1.0 - float(np.linalg.norm(left) / np.linalg.norm(y - y.mean())))
+    return 100.0 * (1.0 - float(np.linalg.norm(residual) / np.linalg.norm(y - y.mean())))
 
 
 def fitted(
@@ -95,16 +95,16 @@ def fitted(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and damping of the best of several descents, and the coefficients of the terms there."""
     best, size = None, np.linalg.norm(signals[output])
-    asked: dict[str, Any] = {"filtered": filtered, "offset": offset, "first": first}
+    options: dict[str, Any] = {"filtered": filtered, "offset": offset, "first": first}
     for start in starts:
         scale = np.abs(np.array(start))
 
         def missed(z: np.ndarray, scale: np.ndarray = scale) -> np.ndarray:
-            return projected(signals, step, output, z * scale, terms, **asked)[1] / size
+            return projected(signals, step, output, z * scale, terms, **options)[1] / size
 
         end = least_squares(missed, np.sign(start))
         if best is None or end.cost < best[0]:
             best = (end.cost, end.x * scale)
     assert best is not None
-    coefficients, _ = projected(signals, step, output, best[1], terms, **asked)
+    coefficients, _ = projected(signals, step, output, best[1], terms, **options)
     return best[1], coefficients

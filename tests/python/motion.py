@@ -38,7 +38,7 @@ class Plant:
 
     def poles(self) -> list[complex]:
         """Zeros of the divisor in the upper half of the principal sheet, by Newton's method from a net of starts."""
-        found: list[complex] = []
+        poles_so_far: list[complex] = []
         for radius in np.geomspace(0.05, 50.0, 25):
             for angle in np.linspace(0.05, np.pi - 0.05, 25):
                 s = radius * np.exp(1j * angle)
@@ -48,9 +48,9 @@ class Plant:
                     if not np.isfinite(s) or abs(s) < 1e-9:
                         break
                 inside = np.isfinite(s) and s.imag > 1e-9 and abs(self.divisor(s)) < 1e-9 * (1 + abs(s) ** self.alpha)
-                if inside and all(abs(s - p) > 1e-6 * abs(p) for p in found):
-                    found.append(complex(s))
-        return found
+                if inside and all(abs(s - p) > 1e-6 * abs(p) for p in poles_so_far):
+                    poles_so_far.append(complex(s))
+        return poles_so_far
 
     def step_response(self, t: np.ndarray) -> np.ndarray:
         """Response to a unit step at these times; exact to about 1e-10."""
@@ -120,7 +120,7 @@ def pieces(
     return first, second
 
 
-def scores(found: ftlm.Identification, plant: Plant) -> dict[str, float]:
+def scores(result: ftlm.Identification, plant: Plant) -> dict[str, float]:
     """How many standard errors each number is from the truth."""
-    values = {**found.orders, **found.coefficients}
-    return {n: (values[n] - truth) / found.standard_errors[n] for n, truth in plant.truth.items()}
+    values = {**result.orders, **result.coefficients}
+    return {n: (values[n] - truth) / result.standard_errors[n] for n, truth in plant.truth.items()}

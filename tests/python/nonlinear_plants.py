@@ -13,9 +13,9 @@ NOISE = 0.01
 
 def switching(step, every, size, seed=1):
     """Input that switches to a uniform random value every so many seconds."""
-    held = round(every / step)
-    values = np.random.default_rng(seed).uniform(-size, size, ROWS // held + 1)
-    return np.repeat(values, held)[:ROWS]
+    rows = round(every / step)
+    values = np.random.default_rng(seed).uniform(-size, size, ROWS // rows + 1)
+    return np.repeat(values, rows)[:ROWS]
 
 
 @dataclass(frozen=True)

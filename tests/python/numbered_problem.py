@@ -38,8 +38,8 @@ class NumberedProblem:
             products[name] = (name, 1.0, factors)
             return factor, name
 
-        def order(given: Order) -> tuple[float, list[tuple[str, float]]]:
-            return given[0], [(f"o{k}", weight) for k, weight in enumerate(given[1]) if weight]
+        def order(order_values: Order) -> tuple[float, list[tuple[str, float]]]:
+            return order_values[0], [(f"o{k}", weight) for k, weight in enumerate(order_values[1]) if weight]
 
         friction = dict(frictions)
         equations = []
@@ -78,6 +78,6 @@ class NumberedProblem:
     ) -> dict[str, Any]:
         """Return the fit of so many evaluations, with the derivatives in the order of the numbers."""
         start = [float(v) for v in np.asarray(values)[self.places]], [list(map(float, s)) for s in states]
-        found = dict(self.core.minimize(runs, start, True, [], evaluations, 1e-9, False, stop))
-        found["jacobian"] = np.asarray(found["jacobian"])[np.argsort(self.places)]
-        return found
+        result = dict(self.core.minimize(runs, start, True, [], evaluations, 1e-9, False, stop))
+        result["jacobian"] = np.asarray(result["jacobian"])[np.argsort(self.places)]
+        return result

@@ -95,10 +95,10 @@ def pulse_means(samples: Sequence[float], m: int, how: str) -> np.ndarray:
     last = len(samples) - 1
     means = np.zeros(m)
     for k in range(m):
-        left, right = Fraction(last * k, m), Fraction(last * (k + 1), m)
+        start, right = Fraction(last * k, m), Fraction(last * (k + 1), m)
         area = 0.0
-        for j in range(int(left), last):
-            a, b = max(left, Fraction(j)), min(right, Fraction(j + 1))
+        for j in range(int(start), last):
+            a, b = max(start, Fraction(j)), min(right, Fraction(j + 1))
             if b <= a:
                 break
             if how == "zoh":
@@ -107,7 +107,7 @@ def pulse_means(samples: Sequence[float], m: int, how: str) -> np.ndarray:
                 middle = float((a + b) / 2 - j)
                 height = (1 - middle) * float(samples[j]) + middle * float(samples[j + 1])
             area += float(b - a) * height
-        means[k] = area / float(right - left)
+        means[k] = area / float(right - start)
     return means
 
 
@@ -129,13 +129,13 @@ def free_run(
     `own` holds (coefficient, order) and `exogenous` (coefficient, order, signal) of the right-hand side; `initial` is
     a ready contribution of the initial terms, added as it is.
     """
-    left = np.eye(m)
+    lhs = np.eye(m)
     right = np.zeros(m) if initial is None else np.array(initial, float)
     for coefficient, order in own:
-        left -= coefficient * block_pulse_matrix(alpha - order, m, duration).T
+        lhs -= coefficient * block_pulse_matrix(alpha - order, m, duration).T
     for coefficient, order, signal in exogenous:
         right += coefficient * integrate(signal, alpha - order, duration)
-    return solve_triangular(left, right, lower=True)
+    return solve_triangular(lhs, right, lower=True)
 
 
 def coupled_free_run(
@@ -147,17 +147,17 @@ def coupled_free_run(
     of some equation is solved for, any other is looked up in `inputs`.
     """
     place = {equation["output"]: slice(i * m, (i + 1) * m) for i, equation in enumerate(equations)}
-    left = np.eye(m * len(equations))
+    lhs = np.eye(m * len(equations))
     right = np.zeros(m * len(equations))
     for equation in equations:
         row = place[equation["output"]]
         for term in equation["terms"]:
             operator = block_pulse_matrix(equation["alpha"] - term["order"], m, duration).T
             if term["signal"] in place:
-                left[row, place[term["signal"]]] -= term["coefficient"] * operator
+                lhs[row, place[term["signal"]]] -= term["coefficient"] * operator
             else:
                 right[row] += term["coefficient"] * (operator @ inputs[term["signal"]])
-    solution = np.linalg.solve(left, right)
+    solution = np.linalg.solve(lhs, right)
     return {name: solution[where] for name, where in place.items()}
 
 

@@ -120,8 +120,8 @@ def simulate_samples(
     rec = TransientRecord.of_run(run, model.structure, (run.length - 1) * every)
     at = None if times is None else SampleTimes.of(run, rec, model.structure, times)
     if initial is not None:
-        kept = {o: dict(initial.get(o, {})) for o in model.outputs}
-        return _samples_from_pulses(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
+        terms = {o: dict(initial.get(o, {})) for o in model.outputs}
+        return _samples_from_pulses(model, run, rec, every, _responses(model, rec, terms), terms, at), terms
     names = initial_names(model, rec.initial)
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     if not names and model.structure.offset != "level":
@@ -250,7 +250,7 @@ def _samples_from_pulses(
     drive, now, start = None if drive is None else through @ drive, through @ now, through @ start
     with np.errstate(invalid="ignore", over="ignore"):
         rest = means if drive is None else means - drive
-        gain, held = np.ones(len(names)), np.zeros(len(names))
+        gain, offsets = np.ones(len(names)), np.zeros(len(names))
         series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
         if series is not None and structure.sensor_filter is not None:
             rest = means.copy() if drive is None else rest
@@ -259,7 +259,7 @@ def _samples_from_pulses(
                     gain[i] = high_frequency_gain(structure.sensor_filter)
                     # What the filter of this output still held, of impulses as powers below.
                     if degree := structure.sensor_filter.relative_degree:
-                        held[i] = terms[name].get(-float(degree), 0.0) * leading_gain(structure.sensor_filter)
+                        offsets[i] = terms[name].get(-float(degree), 0.0) * leading_gain(structure.sensor_filter)
                     rest[i] = _core.series_multiply(series, means[i], rec.m)
                     if drive is not None:
                         rest[i] -= gain[i] * drive[i]
@@ -267,8 +267,8 @@ def _samples_from_pulses(
             kinks = through @ _kink_correction(model, run, at, terms)
             kinks[gain != 1.0] = 0.0
             # At the very start nothing has been integrated yet.
-            begun = np.where(at.times > 0.0, _interpolate_smooth(rest, at) + kinks, (gain * start + held)[:, None])
-            return np.asarray(begun + gain[:, None] * now)
+            early = np.where(at.times > 0.0, _interpolate_smooth(rest, at) + kinks, (gain * start + offsets)[:, None])
+            return np.asarray(early + gain[:, None] * now)
         # On one pulse an interval what is asked for lies far behind its start, see long.py.
         earlier = rest[:, every - 2 :: every] if every > 1 else np.concatenate([rest[:, :1], rest[:, :-1]], axis=1)
         later = 1.5 * rest[:, every - 1 :: every] - 0.5 * earlier
@@ -279,7 +279,7 @@ def _samples_from_pulses(
             if run is not None:
                 later[:, :-1] -= np.where(gain == 1.0, 1.0, 0.0)[:, None] * _early_response(model, run, rec, every)
             later[:, -1] = rest[:, -1] + 0.5 * rest[:, -2] - 0.5 * rest[:, -3]
-        return np.concatenate([(gain * start + held)[:, None], later], axis=1) + gain[:, None] * now
+        return np.concatenate([(gain * start + offsets)[:, None], later], axis=1) + gain[:, None] * now
 
 
 def _early_response(model: Model, run: Run, rec: TransientRecord, every: int) -> Floats:
@@ -311,10 +311,10 @@ def _early_response(model: Model, run: Run, rec: TransientRecord, every: int) ->
                     driven.setdefault(name, np.zeros(count))[i] += factor * leading
             if not own and name not in halves:
                 means = rec.of(name)
-                told = 0.5 * (means[every - 1 : -1 : every] + means[every::every])
+                middles = 0.5 * (means[every - 1 : -1 : every] + means[every::every])
                 values = _values_at_samples(run, rec, structure, name, every, None)[1:-1]
-                held = name in run.inputs and run.intersample[name] == "zoh"
-                halves[name] = values - told if held else told - values
+                is_hold = name in run.inputs and run.intersample[name] == "zoh"
+                halves[name] = values - middles if is_hold else middles - values
     out = np.zeros((count, rec.m // every - 1))
     for name, half in halves.items():
         gains = [np.linalg.solve(between, driven[name]) for between, driven in (answered, direct)]
@@ -353,9 +353,9 @@ def _kink_correction(model: Model, run: Run | None, at: SampleTimes, terms: Term
                 order = sum(item.order.constant - t.order.constant for t in path)
                 if order <= ORDER_TOLERANCE or (len(path) > 1 and order >= SMOOTH_INTEGRATION_ORDER):
                     continue
-                known = at.jump_correction(term.signal, order)
-                if known is not None:
-                    out[i] += math.prod(float(t.fixed or 0.0) for t in path) * known
+                correction = at.jump_correction(term.signal, order)
+                if correction is not None:
+                    out[i] += math.prod(float(t.fixed or 0.0) for t in path) * correction
     return out
 
 
@@ -410,8 +410,8 @@ RATIO_TEST_GRIDS = 4
 
 
 def _relative_change(new: Floats, old: Floats) -> Floats:
-    moved, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
-    return np.asarray(np.where(moved == 0.0, 0.0, moved / size))
+    change, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
+    return np.asarray(np.where(change == 0.0, 0.0, change / size))
 
 
 @dataclass(frozen=True)
@@ -462,14 +462,14 @@ class RichardsonTable:
         row = extrapolate_row(samples, before if both else [])
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             # Nobody asks for the samples themselves: what was taken away moves less.
-            moved = [unknown_change(samples.shape[0])] * min(len(row), len(before))
-            moved[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
+            changes = [unknown_change(samples.shape[0])] * min(len(row), len(before))
+            changes[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
         numbers = np.zeros(0) if beside is None else beside
         self.initial_terms = [*self.initial_terms, extrapolate_row(numbers, self.initial_terms[-1] if both else [])][
             -RATIO_TEST_GRIDS:
         ]
         self.rows = [*self.rows, row][-RATIO_TEST_GRIDS:]
-        self.changes = [*self.changes, moved][-2:]
+        self.changes = [*self.changes, changes][-2:]
 
     def estimate(self, owners: Sequence[int] = (), *, enough: float = 0.0) -> LimitEstimate:
         """Return the estimate that another halving changes least; ``owners`` are the outputs of the initial terms.
@@ -477,11 +477,11 @@ class RichardsonTable:
         If the change of a column is at most ``enough``, no other estimate is tried.
         """
         column, change = self.best_column
-        found = LimitEstimate(self.rows[-1][column], change, self.initial_terms[-1][column])
+        best = LimitEstimate(self.rows[-1][column], change, self.initial_terms[-1][column])
         if len(self.rows) < RATIO_TEST_GRIDS or np.all(change <= enough):
-            return found
-        known = min(map(len, self.rows))
-        every = [found, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(known))]
+            return best
+        count = min(map(len, self.rows))
+        every = [best, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(count))]
         return min(
             (one for one in every if one is not None), key=lambda one: float(np.max(_nan_to_infinity(one.change)))
         )
@@ -509,17 +509,17 @@ class RichardsonTable:
         Infinite before there are three grids.
         """
         row, last = self.rows[-1], self.changes[-1]
-        found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown_change(row[0].shape[0]))
+        best: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown_change(row[0].shape[0]))
         for column in range(1, len(last)):
-            told = [(column, last[column])]
+            choices = [(column, last[column])]
             before = self.changes[0][column] if len(self.changes) > 1 and column < len(self.changes[0]) else None
             if before is not None and column + 1 < len(row):
                 factor = 2.0 ** ERROR_POWERS[column]
                 # What is left of a column whose power shows is what the next column takes away.
                 if np.all(last[column] * (MIN_POWER_RATIO * factor) <= before):
-                    told.append((column + 1, last[column] / (factor - 1.0)))
-            found = min([found, *told], key=lambda pair: float(np.max(_nan_to_infinity(pair[1]))))
-        return found
+                    choices.append((column + 1, last[column] / (factor - 1.0)))
+            best = min([best, *choices], key=lambda pair: float(np.max(_nan_to_infinity(pair[1]))))
+        return best
 
 
 def extrapolate_row(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
@@ -708,8 +708,8 @@ def simulate_long(
     The initial conditions of the model are resolved. The refinement is that of the whole record.
     """
     own = run.length - 1
-    given = None if initial is None else [(o, p) for o in model.outputs for p in initial.get(o, {})]
-    names = initial_names(model, resolve_initial_conditions(run, model.structure)) if given is None else given
+    pairs = None if initial is None else [(o, p) for o in model.outputs for p in initial.get(o, {})]
+    names = initial_names(model, resolve_initial_conditions(run, model.structure)) if pairs is None else pairs
     answers = SampleResponses.of(model, run, names)
     if answers is None:
         return None
@@ -723,8 +723,8 @@ def simulate_long(
             return fit_initial_terms(
                 model, measured_samples(model, run, FULL_GRID_REFINEMENTS[-1]), driven, names, units
             )
-        kept = {o: dict((initial or {}).get(o, {})) for o in model.outputs}
-        return driven + sum((kept[o][p] * u for (o, p), u in zip(names, units, strict=True)), np.zeros(1)), kept
+        values = {o: dict((initial or {}).get(o, {})) for o in model.outputs}
+        return driven + sum((values[o][p] * u for (o, p), u in zip(names, units, strict=True)), np.zeros(1)), values
 
     rough, terms = superpose_with_terms(grids[FULL_GRID_REFINEMENTS[-1]])
     size = np.max(np.abs(rough), axis=1)
@@ -757,14 +757,14 @@ def _refine_pieces(pieces: Sequence[ResponsePiece], answers: SampleResponses, to
     """Halve the step on pieces that have not converged; return the remaining change."""
     while True:
         changes = [p.limit.estimate().change for p in pieces]
-        left = np.asarray(sum(c[: answers.count] for c in changes))
+        remaining_change = np.asarray(sum(c[: answers.count] for c in changes))
         restless = [
             p
             for p, c in zip(pieces, changes, strict=True)
             if np.any(c > tolerance / len(pieces)) and 2 * p.refinement * p.end <= max_m
         ]
-        if np.all(left <= tolerance) or not restless:
-            return left
+        if np.all(remaining_change <= tolerance) or not restless:
+            return remaining_change
         widest = restless[-1]
         every = 2 * widest.refinement
         finer = answers.compute(every, widest.end - 1)
@@ -798,32 +798,32 @@ def simulate_refined(
     if initial is None:
         model = with_initial_conditions(model, run)
     if run.length > long_intervals:
-        found = simulate_long(model, run, initial, tolerance=tolerance, max_m=max_m)
-        if found is not None:
-            return found
+        result = simulate_long(model, run, initial, tolerance=tolerance, max_m=max_m)
+        if result is not None:
+            return result
     own = run.length - 1
     every = FIRST_REFINEMENT
     times = nonuniform_sample_times(model, run)
-    limit, lost = RichardsonTable(), 0
+    limit, failures = RichardsonTable(), 0
     while True:
         last = 2 * every * own > max_m
-        samples, terms = _simulate_grid(model, run, every, initial, times, last=lost == 1)
+        samples, terms = _simulate_grid(model, run, every, initial, times, last=failures == 1)
         finite = bool(np.all(np.isfinite(samples)))
         owners = [i for i, o in enumerate(model.outputs) for _ in terms[o]]
         limit.add(samples, np.array([v for o in model.outputs for v in terms[o].values()]))
-        told = limit.estimate(owners, enough=tolerance)
+        estimate = limit.estimate(owners, enough=tolerance)
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
-        lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
-        if last or lost == 2 or np.all(told.change <= tolerance):
+        failures = 0 if finite or every == FIRST_REFINEMENT else failures + 1
+        if last or failures == 2 or np.all(estimate.change <= tolerance):
             break
         every *= 2
-    return OutputSamples(told.samples, _with_values(terms, told.initial_terms), every, told.change)
+    return OutputSamples(estimate.samples, _with_values(terms, estimate.initial_terms), every, estimate.change)
 
 
 def _with_values(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
     """Return initial terms with the same outputs and exponents and other values."""
-    left = iter(values.tolist())
-    return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
+    remaining = iter(values.tolist())
+    return {o: {e: next(remaining) for e in powers} for o, powers in terms.items()}
 
 
 def _simulate_grid(

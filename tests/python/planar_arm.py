@@ -52,8 +52,8 @@ class Planar:
     def acceleration(self, state, current, mode):
         """Of all angles, and what holds the hubs that stick; mode 0 sticks, else the sign of the hub's velocity."""
         force = self.forces(state, current)
-        held = [2 * k for k in (0, 1) if mode[k] == 0]
-        moves = [i for i in range(4) if i not in held]
+        locked = [2 * k for k in (0, 1) if mode[k] == 0]
+        moves = [i for i in range(4) if i not in locked]
         for k in (0, 1):
             force[2 * k] -= mode[k] * self.friction[k]
         out = np.zeros(4)
@@ -67,9 +67,9 @@ class Planar:
         for choice in itertools.product((0, 1, -1), repeat=len(rest)):
             for k, value in zip(rest, choice, strict=True):
                 mode[k] = value
-            out, held = self.acceleration(state, current, mode)
+            out, forces = self.acceleration(state, current, mode)
             if all(
-                abs(held[2 * k]) <= self.friction[k] * (1 + 1e-12) if mode[k] == 0 else out[2 * k] * mode[k] > 0.0
+                abs(forces[2 * k]) <= self.friction[k] * (1 + 1e-12) if mode[k] == 0 else out[2 * k] * mode[k] > 0.0
                 for k in rest
             ):
                 return mode
@@ -88,39 +88,39 @@ class Planar:
             samples = np.arange(first + 1, last + 1) * step
             mode = self.settled(state, current, mode)
             while len(samples):
-                kept = tuple(mode)
+                current_mode = tuple(mode)
 
-                def flow(_, x, kept=kept, current=current):
-                    return np.concatenate([x[4:], self.acceleration(x, current, kept)[0]])
+                def flow(_, x, mode_now=current_mode, current=current):
+                    return np.concatenate([x[4:], self.acceleration(x, current, mode_now)[0]])
 
-                def event(k, kept=kept, current=current):
+                def event(k, mode_now=current_mode, current=current):
                     def at(_, x):
-                        if kept[k] == 0:
-                            return self.friction[k] - abs(self.acceleration(x, current, kept)[1][2 * k])
-                        return x[4 + 2 * k] * kept[k]
+                        if mode_now[k] == 0:
+                            return self.friction[k] - abs(self.acceleration(x, current, mode_now)[1][2 * k])
+                        return x[4 + 2 * k] * mode_now[k]
 
                     at.terminal, at.direction = True, -1.0
                     return at
 
-                found = solve_ivp(
+                solution = solve_ivp(
                     flow, (now, end), state, events=[event(0), event(1)], rtol=1e-10, atol=1e-13, dense_output=True
                 )
-                inside = samples <= found.t[-1] + 1e-12
+                inside = samples <= solution.t[-1] + 1e-12
                 if inside.any():
-                    rows += list(found.sol(samples[inside]).T[:, :4])
+                    rows += list(solution.sol(samples[inside]).T[:, :4])
                 samples = samples[~inside]
-                state, now = found.y[:, -1].copy(), found.t[-1]
+                state, now = solution.y[:, -1].copy(), solution.t[-1]
                 for k in (0, 1):
-                    if len(found.t_events[k]) and mode[k] != 0:
+                    if len(solution.t_events[k]) and mode[k] != 0:
                         state[4 + 2 * k] = 0.0
-                    if len(found.t_events[k]):
+                    if len(solution.t_events[k]):
                         changes[k] += 1
-                if found.status == 1:
-                    left = [k for k in (0, 1) if len(found.t_events[k])]
-                    for k in left:
-                        if kept[k] == 0:
+                if solution.status == 1:
+                    events = [k for k in (0, 1) if len(solution.t_events[k])]
+                    for k in events:
+                        if current_mode[k] == 0:
                             # It leaves in the direction in which it was pushed.
-                            mode[k] = int(np.sign(self.acceleration(state, current, kept)[1][2 * k]))
+                            mode[k] = int(np.sign(self.acceleration(state, current, current_mode)[1][2 * k]))
                             state[4 + 2 * k] = 1e-14 * mode[k]
                         else:
                             mode[k] = 0
@@ -155,24 +155,24 @@ class Planar:
             for (i, j, c, _), w in zip(entries, weights, strict=True):
                 right[i] -= c * (w[m:0:-1] @ past[:m, j])
             for choice in sorted(itertools.product((0, 1, -1), repeat=2), key=lambda c: np.abs(c).sum()):
-                held = [2 * k for k in (0, 1) if choice[k] == 0]
+                locked = [2 * k for k in (0, 1) if choice[k] == 0]
                 force = right.copy()
                 for k in (0, 1):
                     force[2 * k] -= choice[k] * self.friction[k]
                 # Angles of held hubs stay; what holds them takes their place among the unknowns.
-                system, known = matrix.copy(), force.copy()
-                for h in held:
-                    known -= system[:, h] * past[m - 1, h]
+                system, rhs = matrix.copy(), force.copy()
+                for h in locked:
+                    rhs -= system[:, h] * past[m - 1, h]
                     system[:, h] = 0.0
                     system[h, h] = 1.0
-                found = np.linalg.solve(system, known) if held else inverse @ force
-                angles = found.copy()
-                angles[held] = past[m - 1, held]
-                moved = angles - past[m - 1]
+                solution = np.linalg.solve(system, rhs) if locked else inverse @ force
+                angles = solution.copy()
+                angles[locked] = past[m - 1, locked]
+                change = angles - past[m - 1]
                 if all(
-                    abs(found[2 * k]) <= self.friction[k] * (1 + 1e-9)
+                    abs(solution[2 * k]) <= self.friction[k] * (1 + 1e-9)
                     if choice[k] == 0
-                    else moved[2 * k] * choice[k] > 0.0
+                    else change[2 * k] * choice[k] > 0.0
                     for k in (0, 1)
                 ):
                     past[m] = angles

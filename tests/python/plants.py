@@ -90,8 +90,8 @@ def truth(name: str) -> dict[str, float]:
     model = demo_plant(stage, form="published")
     h, d = 2 * stage - 1, 2 * stage
     free = {n: model.coefficients[f"{n}{h}"] for n in "abdg"}
-    named = {f"{n}{h}": v for n, v in free.items()}
-    return model.orders | named | {f"r{stage}": -model.coefficients[f"a{d}"] / free["a"]}
+    values = {f"{n}{h}": v for n, v in free.items()}
+    return model.orders | values | {f"r{stage}": -model.coefficients[f"a{d}"] / free["a"]}
 
 
 # ------------------------------------------------------------------------------------------------ random plants
@@ -192,10 +192,10 @@ def resonant_plant(seed: int, *, wrong: bool = False) -> ftlm.Run:
     else:
         models = [ftlm.equation(words)]
     total = np.zeros(rows)
-    for made in models:
-        name = made.outputs[0]
+    for structure in models:
+        name = structure.outputs[0]
         blank = ftlm.Run.from_arrays(step=step, inputs={"u": command}, outputs={name: np.zeros(rows)})
-        total = total + ftlm.Model(made).simulate(blank)[name]
+        total = total + ftlm.Model(structure).simulate(blank)[name]
     noisy = total + 0.01 * np.std(total) * rng.standard_normal(rows)
     return ftlm.Run.from_arrays(
         step=step, inputs={"u": command}, outputs={"y": noisy}, name=f"{'wrong' if wrong else 'plant'} {seed}"

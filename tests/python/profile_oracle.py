@@ -114,12 +114,15 @@ class ProfileLikelihood:
             # Half as fine a grid moved the optimum by less than its errors, and how steep it is by less still.
             with contextlib.suppress(FtlmError):
                 coarse = replace(grid, every=joint.refinement // 2)
-                found = cls.at(coarse, joint.finest_grid_values, np.zeros(len(problem.names)))
+                likelihood = cls.at(coarse, joint.finest_grid_values, np.zeros(len(problem.names)))
                 near = np.maximum(
-                    MAX_OPTIMUM_SHIFT_ERRORS * found.errors, MAX_OPTIMUM_SHIFT_RATIO * np.abs(joint.finest_grid_values)
+                    MAX_OPTIMUM_SHIFT_ERRORS * likelihood.errors,
+                    MAX_OPTIMUM_SHIFT_RATIO * np.abs(joint.finest_grid_values),
                 )
-                if found.best.has_converged and np.all(np.abs(found.best.values - joint.finest_grid_values) <= near):
-                    return replace(found, shift=joint.values - found.best.values)
+                if likelihood.best.has_converged and np.all(
+                    np.abs(likelihood.best.values - joint.finest_grid_values) <= near
+                ):
+                    return replace(likelihood, shift=joint.values - likelihood.best.values)
         return cls.at(grid, joint.finest_grid_values, joint.values - joint.finest_grid_values)
 
     @classmethod
@@ -163,9 +166,9 @@ class ProfileLikelihood:
                 there = self._evaluate(i, self._point_along(i, self.best.values, self.bread[:, i], float(ends[i])))
             except FtlmError:
                 return math.inf
-            left = _projected_residuals(there, i)
+            residuals = _projected_residuals(there, i)
             with np.errstate(over="ignore"):
-                worst = max(worst, abs(self.rise(i, dot(left, left)) / width - 1.0))
+                worst = max(worst, abs(self.rise(i, dot(residuals, residuals)) / width - 1.0))
         return worst
 
     def search_bound(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> BoundSearch:
@@ -250,8 +253,8 @@ class ProfileLikelihood:
                 )
                 way = min(max(following, inside + margin), outside - margin)
         # An end between two points of which the outer one has a cost; else the cost never rose that far.
-        risen = math.isfinite(outside) and any(r >= width**2 for _, r in points)
-        return IntervalBound(start + side * outside if risen else side * math.inf, points, evaluations)
+        is_bounded = math.isfinite(outside) and any(r >= width**2 for _, r in points)
+        return IntervalBound(start + side * outside if is_bounded else side * math.inf, points, evaluations)
 
     def refit(self, i: int, value: float, near: Iterate, lap: int = MAX_REFIT_EVALUATIONS) -> Iterate | None:
         """Refit all other parameters at a value of one, from a nearby point; None if none is feasible.
@@ -390,32 +393,34 @@ def profile_intervals(
     KeyboardInterrupt
         Ctrl-C, within one refit.
     """
-    start, spent = valley, 0
+    start, evaluations = valley, 0
     for _ in range(MAX_LOWER_OPTIMA):
-        ends, took = _search_bounds(valley, names, level, threads, progress, None if most is None else most - spent)
-        spent += took
+        ends, took = _search_bounds(
+            valley, names, level, threads, progress, None if most is None else most - evaluations
+        )
+        evaluations += took
         below = [e.attempt for e in ends.values() if isinstance(e, _LowerOptimumError)]
         if not below:
             break
         # What was the limit for step 0 of another optimum is none of this one.
         valley = ProfileLikelihood.at(valley.grid, below[0].values, np.zeros_like(valley.shift))
     fall = 2.0 * (float(start.best.outcome["cost"]) - float(valley.best.outcome["cost"]))
-    known = valley.units[np.isfinite(valley.units)]
-    lower = valley.best.values if known.size and fall > MIN_COST_REDUCTION * float(np.median(known)) else None
-    found: dict[str, ProfileInterval] = {}
-    left = tuple(n for n in names if any(ends.get((n, side), 0) is None for side in (-1.0, 1.0)))
-    for name in (n for n in names if n not in left):
+    finite = valley.units[np.isfinite(valley.units)]
+    lower = valley.best.values if finite.size and fall > MIN_COST_REDUCTION * float(np.median(finite)) else None
+    intervals: dict[str, ProfileInterval] = {}
+    remaining = tuple(n for n in names if any(ends.get((n, side), 0) is None for side in (-1.0, 1.0)))
+    for name in (n for n in names if n not in remaining):
         both = [e for e in (ends.get((name, side)) for side in (-1.0, 1.0)) if isinstance(e, IntervalBound)]
         if len(both) < 2:
-            found[name] = ProfileInterval(-math.inf, math.inf, level)
+            intervals[name] = ProfileInterval(-math.inf, math.inf, level)
             continue
         i = valley.names.index(name)
         first, last = valley.grid.problem.all_bounds[i]
         low, high = (e.value + float(valley.shift[i]) for e in both)
         low, high = (min(max(v, first), last) if math.isfinite(v) else v for v in (low, high))
         points = tuple(sorted([*both[0].points, *both[1].points]))
-        found[name] = ProfileInterval(low, high, level, points, sum(e.evaluations for e in both))
-    return ProfileResult(found, lower, left, spent)
+        intervals[name] = ProfileInterval(low, high, level, points, sum(e.evaluations for e in both))
+    return ProfileResult(intervals, lower, remaining, evaluations)
 
 
 def _search_bounds(
@@ -431,8 +436,8 @@ def _search_bounds(
     The search stops at the first lower optimum, because the other bounds would belong to the wrong optimum.
     """
     width, stop = half_width(level), threading.Event()
-    asked = [(n, side) for n in names if valley.is_identifiable(valley.names.index(n)) for side in (-1.0, 1.0)]
-    searches = {one: valley.search_bound(valley.names.index(one[0]), one[1], width, stop) for one in asked}
+    tasks = [(n, side) for n in names if valley.is_identifiable(valley.names.index(n)) for side in (-1.0, 1.0)]
+    searches = {one: valley.search_bound(valley.names.index(one[0]), one[1], width, stop) for one in tasks}
     for search in searches.values():
         next(search)
 
@@ -445,37 +450,38 @@ def _search_bounds(
         except _LowerOptimumError as lower:
             return lower
 
-    out: dict[tuple[str, float], IntervalBound | _LowerOptimumError | None] = dict.fromkeys(asked)
-    took = dict.fromkeys(asked, 0)
-    left = asked
+    out: dict[tuple[str, float], IntervalBound | _LowerOptimumError | None] = dict.fromkeys(tasks)
+    took = dict.fromkeys(tasks, 0)
+    remaining = tasks
     with interruptible_pool(max(threads, 1)) as workers:
         try:
-            while left:
+            while remaining:
                 share = (
                     MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND * 2
                     if most is None
-                    else (most - sum(took.values())) // len(left)
+                    else (most - sum(took.values())) // len(remaining)
                 )
                 if share < MIN_BUDGET_PER_BOUND:
                     break
                 # In whole rounds, so that what an end may take does not depend on the number of threads.
-                allowed = [took[o] + share for o in left]
+                allowed = [took[o] + share for o in remaining]
                 asked_now = [
-                    workers.submit(continue_search, one, most_now) for one, most_now in zip(left, allowed, strict=True)
+                    workers.submit(continue_search, one, most_now)
+                    for one, most_now in zip(remaining, allowed, strict=True)
                 ]
-                for one, future in zip(left, asked_now, strict=True):
-                    found = future.result()
-                    if isinstance(found, int):
-                        took[one] = found
+                for one, future in zip(remaining, asked_now, strict=True):
+                    result = future.result()
+                    if isinstance(result, int):
+                        took[one] = result
                         continue
-                    out[one], took[one] = found, found.evaluations
-                    if isinstance(found, _LowerOptimumError):
+                    out[one], took[one] = result, result.evaluations
+                    if isinstance(result, _LowerOptimumError):
                         stop.set()
                         workers.shutdown(cancel_futures=True)
                         return out, sum(took.values())
                     if progress is not None:
-                        progress(sum(e is not None for e in out.values()), len(asked))
-                left = [o for o in left if out[o] is None]
+                        progress(sum(e is not None for e in out.values()), len(tasks))
+                remaining = [o for o in remaining if out[o] is None]
         except BaseException:
             stop.set()
             raise
@@ -522,8 +528,8 @@ def _other_sensitivities(attempt: Iterate, i: int) -> tuple[Any, Floats]:
     length = np.where(length > 0, length, 1.0)
     length = length * np.maximum(np.linalg.norm(others / length[:, None], axis=1), 1.0)
     tall, sizes, square = thin_svd((others / length[:, None]).T)
-    kept = sizes > SINGULAR_VALUE_TOLERANCE * sizes.max(initial=0.0)
-    return (square.T[:, kept], sizes[kept], tall.T[kept]), length
+    is_significant = sizes > SINGULAR_VALUE_TOLERANCE * sizes.max(initial=0.0)
+    return (square.T[:, is_significant], sizes[is_significant], tall.T[is_significant]), length
 
 
 def _projected_residuals(attempt: Iterate, i: int) -> Floats:
@@ -535,10 +541,10 @@ def _projected_residuals(attempt: Iterate, i: int) -> Floats:
 
 def _tangent(attempt: Iterate, i: int) -> Floats:
     """Return the direction of all parameters along the profile when one moves by 1."""
-    (left, sizes, right), length = _other_sensitivities(attempt, i)
+    (u, sizes, right), length = _other_sensitivities(attempt, i)
     along = np.asarray(attempt.outcome["jacobian"])[i]
     with np.errstate(over="ignore"):
-        others = -(left @ (projections(right.T, along) / sizes)) / length
+        others = -(u @ (projections(right.T, along) / sizes)) / length
     return np.insert(others, i, 1.0)
 
 

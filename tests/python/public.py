@@ -16,16 +16,16 @@ def modules():
 
 def functions():
     """Functions by name, and methods of classes by that of their class, such as ``ftlm.Run.select``."""
-    found = {}
+    names = {}
     for owner, module in modules().items():
         own = [n for n, v in vars(module).items() if n[0] != "_" and getattr(v, "__module__", "") == module.__name__]
         for name in getattr(module, "__all__", own):
             value = getattr(module, name)
             if inspect.isfunction(value):
-                found.setdefault(value, f"{owner}.{name}")
+                names.setdefault(value, f"{owner}.{name}")
             elif inspect.isclass(value):
                 for key, attribute in vars(value).items():
                     method = getattr(attribute, "__func__", attribute)
                     if inspect.isfunction(method) and (key[0] != "_" or key in SPECIAL_METHODS):
-                        found.setdefault(method, f"{owner}.{name}.{key}")
-    return {name: function for function, name in found.items()}
+                        names.setdefault(method, f"{owner}.{name}.{key}")
+    return {name: function for function, name in names.items()}

@@ -301,8 +301,8 @@ class HIL:
         if board.page is not None:
             time.sleep(max(0.0, board.start + board.sample / board.rate - time.monotonic()))
         noise = board.random.standard_normal(4).tolist()
-        found = board.arm.read(noise)
-        analog[:], counts[:], digital[:] = found
+        values = board.arm.read(noise)
+        analog[:], counts[:], digital[:] = values
         if "reading" in board.hooks:
             return board.hooks["reading"](board, analog, counts, digital)
         return 1

@@ -28,8 +28,8 @@ def hold_means(times, values, m, step):
     cuts = np.unique(np.concatenate([edges, snapped[snapped < edges[-1]]]))
     row, first = np.searchsorted(snapped, cuts[:-1], side="right") - 1, np.searchsorted(cuts, edges[:-1])
     begin = values[row[first]]
-    risen = (values[row] - np.repeat(begin, np.diff(np.append(first, row.size)))) * (np.diff(cuts) / step)
-    return begin + np.add.reduceat(risen, first)
+    ramps = (values[row] - np.repeat(begin, np.diff(np.append(first, row.size)))) * (np.diff(cuts) / step)
+    return begin + np.add.reduceat(ramps, first)
 
 
 def linear_means(times, values, m, step):
@@ -105,9 +105,9 @@ def matrix_exponential(matrix):
     return total
 
 
-def free_responses(system, begun, count, state):
+def free_responses(system, initial, count, state):
     """One state at unit time steps for several initial states, shape (count, initial states)."""
-    power, states = matrix_exponential(system), begun[None]
+    power, states = matrix_exponential(system), initial[None]
     while states.shape[0] < count:
         states = np.concatenate([states, power @ states])
         power = power @ power
@@ -118,19 +118,19 @@ def filter_transient(samples, step, sensor, states):
     """Transient of the filter at the samples of a signal; the first sample is all transient."""
     system, gain = filter_states(sensor)
     size, fastest = system.shape[0], fastest_pole(sensor)
-    shown = round(1.0 / (fastest * step)) if fastest > 0 else 0
-    count = min(max(shown, 2 * (states + 2)), samples.size)
+    rows = round(1.0 / (fastest * step)) if fastest > 0 else 0
+    count = min(max(rows, 2 * (states + 2)), samples.size)
     whole = np.zeros((size + 2, size + 2))
     whole[:size, :size], whole[size - 1, size], whole[size, size + 1] = system, gain, 1.0
-    begun = np.zeros((size + 2, states + 2))
-    begun[:size, :states] = impulse_states(system, gain, states)
-    begun[size, states], begun[size + 1, states + 1] = 1.0, 1.0
-    columns = free_responses(whole * step, begun, count, 0)
+    initial = np.zeros((size + 2, states + 2))
+    initial[:size, :states] = impulse_states(system, gain, states)
+    initial[size, states], initial[size + 1, states + 1] = 1.0, 1.0
+    columns = free_responses(whole * step, initial, count, 0)
     rest, level = np.delete(columns, states - 1, axis=1), samples[0] / columns[0, states - 1]
     sizes = np.linalg.norm(rest, axis=0)
     sizes[sizes == 0] = 1.0
-    found = np.linalg.lstsq(rest / sizes, samples[:count] - level * columns[:, states - 1], rcond=None)[0] / sizes
-    first = begun[:size, :states] @ np.append(found[: states - 1], level)
+    solution = np.linalg.lstsq(rest / sizes, samples[:count] - level * columns[:, states - 1], rcond=None)[0] / sizes
+    first = initial[:size, :states] @ np.append(solution[: states - 1], level)
     return free_responses(system * step, first[:, None], samples.size, 0)[:, 0]
 
 
@@ -142,9 +142,9 @@ def impulse_responses(sensor, states, m, step):
     size = system.shape[0]
     whole = np.zeros((size + 1, size + 1))
     whole[:size, :size], whole[size, 0] = system, 1.0
-    begun = np.zeros((size + 1, states))
-    begun[:size] = impulse_states(system, gain, states)
-    return np.diff(free_responses(whole * step, begun, m + 1, size), axis=0).T / step
+    initial = np.zeros((size + 1, states))
+    initial[:size] = impulse_states(system, gain, states)
+    return np.diff(free_responses(whole * step, initial, m + 1, size), axis=0).T / step
 
 
 def enters_as_input(run, structure, name):
@@ -178,9 +178,13 @@ def acting(run, structure):
 
 
 def gapless(values):
-    gone = np.isnan(values)
+    is_missing = np.isnan(values)
     rows = np.arange(values.size)
-    return np.where(gone, np.interp(rows, rows[~gone], values[~gone]), values) if gone.any() else values
+    return (
+        np.where(is_missing, np.interp(rows, rows[~is_missing], values[~is_missing]), values)
+        if is_missing.any()
+        else values
+    )
 
 
 def means_of(run, structure, name, m, at_rest):
@@ -189,15 +193,15 @@ def means_of(run, structure, name, m, at_rest):
         rate = np.sign(np.diff(run[name.removeprefix("coulomb_")]))
         return kernels.pulse_means(np.append(rate, rate[-1]), m, hold=True)
     samples, delay, step = gapless(run[name]), structure.delay.get(name, 0.0), run.duration / m
-    held, before = run.intersample.get(name) == "zoh", 0.0 if at_rest else float(run[name][0])
+    is_hold, before = run.intersample.get(name) == "zoh", 0.0 if at_rest else float(run[name][0])
     if run.sample_times is not None and name not in run.missing_samples:
         return Line.of(run, structure, name, before).means(m, step)
     if delay:
         intervals = run.length - 1
-        every = m // intervals if held and m % intervals == 0 else 1
+        every = m // intervals if is_hold and m % intervals == 0 else 1
         samples = np.repeat(samples, every)[: intervals * every + 1]
         samples = _core.delay_samples(samples, delay / run.step * every, before)
-    return kernels.pulse_means(samples, m, hold=held)
+    return kernels.pulse_means(samples, m, hold=is_hold)
 
 
 def pulses(run, structure, m, filtered):
@@ -225,24 +229,24 @@ def experiment(run, structure, *, every=1, decimation=1):
     if rows != run.length:
         run = run.window(None, rows * run.step - run.step / 2)
     m, own, weights = (rows - 1) // decimation * every, is_nonuniform(run, structure), [1.0] * len(structure.outputs)
-    step, means, sensor, begun = pulses(run, structure, m, structure.all_filtered)
+    step, means, sensor, initial = pulses(run, structure, m, structure.all_filtered)
     series = None if sensor is not None else sensor_series(structure, m, step)
     of = dict(zip(structure.signals, means, strict=True))
     if own:
         times = compared_times(run, structure)
-        kept = np.flatnonzero(times > 0.0)[::decimation]
-        samples = np.stack([compared_values(run, structure, o)[kept] for o in structure.outputs])
+        sample_rows = np.flatnonzero(times > 0.0)[::decimation]
+        samples = np.stack([compared_values(run, structure, o)[sample_rows] for o in structure.outputs])
         signals, jumps, limited = [], [], apply_input_nonlinearity(run, structure)
         at_rest = resolve_initial_conditions(run, structure) == "rest"
         for name in structure.signals:
             line = None
             if name in run:
                 line = Line.of(limited, structure, name, 0.0 if at_rest else float(limited.sample_times.data[name][0]))
-            values = None if line is None else line.at(times[kept])
+            values = None if line is None else line.at(times[sample_rows])
             signals.append((None if values is None or np.isnan(values).any() else values, False))
-            known = None if line is None or not line.held else line.jumps()
-            jumps.append(None if known is None else (known[0] / step, known[1]))
-        places = np.minimum(times[kept] / step, float(m)), jumps
+            jump_pair = None if line is None or not line.held else line.jumps()
+            jumps.append(None if jump_pair is None else (jump_pair[0] / step, jump_pair[1]))
+        places = np.minimum(times[sample_rows] / step, float(m)), jumps
     else:
         plain = [sensor is None or structure.is_filtered(o) for o in structure.outputs]
         samples = np.stack(
@@ -255,9 +259,9 @@ def experiment(run, structure, *, every=1, decimation=1):
         places = None
     unread = np.isnan(samples)
     inner = unread if own else unread[:, 1:-1]
-    told = (step, means, sensor, begun) if any(begun[0]) or any(begun[1]) else (step, means, sensor)
+    record = (step, means, sensor, initial) if any(initial[0]) or any(initial[1]) else (step, means, sensor)
     return {
-        "record": told,
+        "record": record,
         "pulses_per_sample": 1 if own else every,
         "samples": np.ascontiguousarray(np.where(unread, 0.0, samples)),
         "filter": None if series is None else (series, [structure.is_filtered(o) for o in structure.outputs]),
@@ -272,19 +276,19 @@ def instant(run, structure, name, means, sensor, every, decimation):
     """Values of a signal at the samples, after any jump there, and whether it is held between samples."""
     if name not in run or name in run.missing_samples or (sensor is not None and not structure.is_filtered(name)):
         return None, False
-    held, delay = name in run.inputs and run.intersample[name] == "zoh", structure.delay.get(name, 0.0)
+    is_hold, delay = name in run.inputs and run.intersample[name] == "zoh", structure.delay.get(name, 0.0)
     values = acting(run, structure)[name]
-    if delay and held:
+    if delay and is_hold:
         later = means[name][::every]
-        return np.append(later, later[-1]), held
+        return np.append(later, later[-1]), is_hold
     if delay:
         before = 0.0 if resolve_initial_conditions(run, structure) == "rest" else float(values[0])
         values = _core.delay_samples(values, delay / run.step, before)
-    return np.ascontiguousarray(values[::decimation]), held
+    return np.ascontiguousarray(values[::decimation]), is_hold
 
 
 def records(run, structure, m, inputs):
     """Step, means and series of the measured signals, with given free numbers of inputs, all behind the filter."""
     names = [item.name for item in structure.free_inputs]
-    known = replace(structure.with_inputs(dict(zip(names, inputs, strict=True))), coupling="measured")
-    return pulses(run, known, m, filtered=True)[:3]
+    fixed = replace(structure.with_inputs(dict(zip(names, inputs, strict=True))), coupling="measured")
+    return pulses(run, fixed, m, filtered=True)[:3]

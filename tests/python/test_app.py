@@ -854,7 +854,7 @@ def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_the
     asked = []
 
     async def noted(self, seconds=None):
-        asked.append(self._asked["store"])
+        asked.append(self._request["store"])
         await asleep(self)
 
     monkeypatch.setattr(Task, "answer", noted)

@@ -135,7 +135,7 @@ def test_scipy_alone_says_the_same(runs, output, terms, first, words, offset: bo
     step = runs["lqr"].step
     point, known = lsim_link.fitted(tables["lqr"], step, output, terms, [(-115, -2), (-260, -1)], first=first, **asked)
     scipy = {
-        n: lsim_link.fit(t[output], lsim_link.projected(t, step, output, point, terms, known=known, **asked)[1])
+        n: lsim_link.fit(t[output], lsim_link.projected(t, step, output, point, terms, fixed=known, **asked)[1])
         for n, t in tables.items()
     }
     assert scipy == pytest.approx({"lqr": own, "psf": unseen}, abs=0.3)

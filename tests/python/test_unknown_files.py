@@ -21,7 +21,7 @@ def command(*words):
 def files(tmp_path_factory):
     """Each stranger's file in a folder."""
     folder = tmp_path_factory.mktemp("strangers")
-    made = {name: unknown_files.made(name, folder) for name in unknown_files.MAKERS}
+    made = {name: unknown_files.write_file(name, folder) for name in unknown_files.MAKERS}
     for stranger in made.values():
         (folder / stranger.name).write_bytes(stranger.content)
     return folder, made

@@ -16,18 +16,18 @@ def overlap(work: Callable[[int], object], monkeypatch: pytest.MonkeyPatch, owne
     """Whether two threads are ever within a function at once, which `work` calls in each of them."""
     call, inside, most = getattr(owner, name), [0], [0]
 
-    def watched(*arguments: object, **named: object) -> object:
+    def watched(*arguments: object, **keywords: object) -> object:
         inside[0] += 1
         most[0] = max(most[0], inside[0])
         try:
-            return call(*arguments, **named)
+            return call(*arguments, **keywords)
         finally:
             inside[0] -= 1
 
     monkeypatch.setattr(owner, name, watched)
     for _ in range(MAX_PAIRS):
-        begun = threading.Barrier(2)
-        run_in_two_threads(lambda key, begun=begun: (begun.wait(), work(key)))
+        barrier = threading.Barrier(2)
+        run_in_two_threads(lambda key, barrier=barrier: (barrier.wait(), work(key)))
         if most == [2]:
             return True
     return False

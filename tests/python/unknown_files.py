@@ -154,8 +154,8 @@ def opendocument(folder):
         return f'<table:table-cell office:value-type="string"><text:p>{text}</text:p></table:table-cell>'
 
     def number(value):
-        shown = f"<text:p>{value:.2f}</text:p>"
-        return f'<table:table-cell office:value-type="float" office:value="{value!r}">{shown}</table:table-cell>'
+        text = f"<text:p>{value:.2f}</text:p>"
+        return f'<table:table-cell office:value-type="float" office:value="{value!r}">{text}</table:table-cell>'
 
     rows = [row(map(word, ("time (s)", "input", "output")))]
     rows += [row(map(number, cells)) for cells in zip(*(v.tolist() for v in record()), strict=True)]
@@ -251,7 +251,7 @@ MAKERS = {
 }
 
 
-def made(name, folder):
+def write_file(name, folder):
     """One of them."""
     maker = MAKERS[name]
     return maker(folder) if maker.__code__.co_argcount else maker()

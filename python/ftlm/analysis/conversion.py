@@ -101,16 +101,16 @@ def matlab_text(model: Model) -> str:
         "% G_y_u = (b(1)*s^nb(1) + ...)/(a(1)*s^na(1) + ...)*exp(-s*delay); SI units.",
         "% FOMCON (https://fomcon.net) makes fotf objects of them; without it the vectors remain.",
     ]
-    used: set[str] = set()
+    names: set[str] = set()
     for output in transfer.outputs:
         for signal in transfer.inputs:
             top = transfer.numerators[output, signal]
             if not top:
                 continue
             name = f"G_{identifier(output)}_{identifier(signal)}"
-            while name in used:
+            while name in names:
                 name += "_"
-            used.add(name)
+            names.add(name)
             bottom = transfer.denominator[output]
             lines += [
                 "",
@@ -376,10 +376,10 @@ def _sample_system(
 
 def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
     """Coefficients of a polynomial in descending powers from (coefficient, power) pairs; raise for other powers."""
-    broken = next((p for _, p in pairs if abs(p - round(p)) > POWER_TOLERANCE or p < -POWER_TOLERANCE), None)
-    if broken is not None:
+    bad_power = next((p for _, p in pairs if abs(p - round(p)) > POWER_TOLERANCE or p < -POWER_TOLERANCE), None)
+    if bad_power is not None:
         raise ModelError(
-            f"order {broken:g} is not a whole number of at least 0, so no system of python-control is exact; "
+            f"order {bad_power:g} is not a whole number of at least 0, so no system of python-control is exact; "
             f"to_control with {parameter('band')} approximates one"
         )
     values = np.zeros(1 + max((round(p) for _, p in pairs), default=0))
@@ -433,21 +433,21 @@ def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Seq
 
 def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
     """Return a common monic denominator of each output, and the numerators over it."""
-    found = []
+    fractions = []
     for top, bottom in zip(tops, bottoms, strict=True):
         own = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in bottom]
         distinct: list[Floats] = []
         for d in (d / d[0] for d in own):
-            if not any(d.size == known.size and np.array_equal(d, known) for known in distinct):
+            if not any(d.size == denominator.size and np.array_equal(d, denominator) for denominator in distinct):
                 distinct.append(d)
         common = _product(distinct)
         over = []
         for n, d in zip(top, own, strict=True):
-            rest = [known for known in distinct if not np.array_equal(known, d / d[0])]
+            rest = [denominator for denominator in distinct if not np.array_equal(denominator, d / d[0])]
             values = np.trim_zeros(np.atleast_1d(np.asarray(n, dtype=float)), "f") / d[0]
             over.append(_product([values, *rest]) if values.size else np.zeros(1))
-        found.append((common, over))
-    return found
+        fractions.append((common, over))
+    return fractions
 
 
 def _product(factors: Sequence[Floats]) -> Floats:
@@ -462,11 +462,11 @@ def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[
     count = a.shape[0]
     bottom, powers = [1.0], [np.eye(count)]
     for k in range(1, count + 1):
-        moved = a @ powers[-1]
-        bottom.append(-float(np.trace(moved)) / k)
-        powers.append(moved + bottom[-1] * np.eye(count))
+        product = a @ powers[-1]
+        bottom.append(-float(np.trace(product)) / k)
+        powers.append(product + bottom[-1] * np.eye(count))
     scale = max(float(np.linalg.norm(a, 2)) if count else 0.0, 1e-300)
-    found = []
+    fractions = []
     for i, row in enumerate(c):
         tops = []
         for j in range(b.shape[1]):
@@ -475,17 +475,17 @@ def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[
             if d[i, j] == 0.0:
                 size = float(np.linalg.norm(row) * np.linalg.norm(b[:, j]))
                 answers = [abs(float(row @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
-                seen = [k for k, v in enumerate(answers) if v > MARKOV_TOLERANCE * size * scale**k]
-                top[: 1 + (seen[0] if seen else count)] = 0.0
+                rows = [k for k, v in enumerate(answers) if v > MARKOV_TOLERANCE * size * scale**k]
+                top[: 1 + (rows[0] if rows else count)] = 0.0
             tops.append(top)
-        found.append((np.array(bottom), tops))
-    return found
+        fractions.append((np.array(bottom), tops))
+    return fractions
 
 
-def _names(what: str, given: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
+def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
     """Return signal names: given ones, or the labels of the system with u[0] as u0, or as u if it is the only one."""
-    if given is not None:
-        names = [given] if isinstance(given, str) else list(given)
+    if names_argument is not None:
+        names = [names_argument] if isinstance(names_argument, str) else list(names_argument)
         if len(names) != count:
             raise ModelError(f"{what}: {len(names)} given, the system has {count}")
         return names

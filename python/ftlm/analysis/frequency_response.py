@@ -69,16 +69,16 @@ def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:
 def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
     """Return polynomials of D^alpha y minus own and coupled terms, by output, and those of every other signal."""
     check_linear([item], "a frequency response")
-    left: list[Polynomial] = [{} for _ in names]
+    polynomials: list[Polynomial] = [{} for _ in names]
     right: dict[str, Polynomial] = {}
-    left[names.index(item.output)][item.order.constant] = 1.0
+    polynomials[names.index(item.output)][item.order.constant] = 1.0
     for term in item.terms:
         value = {term.order.constant: float(term.fixed or 0.0)}
         if term.signal in names:
-            add_polynomial(left[names.index(term.signal)], value, -1.0)
+            add_polynomial(polynomials[names.index(term.signal)], value, -1.0)
         else:
             add_polynomial(right.setdefault(term.signal, {}), value)
-    return left, right
+    return polynomials, right
 
 
 def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
@@ -154,7 +154,7 @@ def transfer_functions(model: Model, *, coupling: str = "simulated") -> Transfer
     for names in coupled_outputs(model, coupled=coupled):
         items = [e for e in model.equations if e.output in names]
         rows = [equation_polynomials(e, names) for e in items]
-        matrix = [left for left, _ in rows]
+        matrix = [lhs for lhs, _ in rows]
         bottom = determinant(matrix)
         if not bottom:
             raise ModelError(f"the equations of {', '.join(names)} cannot be solved for them: their determinant is 0")
@@ -227,10 +227,10 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
         a = np.zeros((omega.size, len(names), len(names)), dtype=np.complex128)
         b = np.zeros((omega.size, len(names), len(inputs)), dtype=np.complex128)
         for i, item in enumerate(items):
-            left, right = equation_polynomials(item, names)
+            lhs, right = equation_polynomials(item, names)
             # Divided by s^alpha at high and left as it is at low frequencies, numbers keep their range.
             scale = np.maximum(omega, 1.0) ** -item.order.constant
-            for j, polynomial in enumerate(left):
+            for j, polynomial in enumerate(lhs):
                 a[:, i, j] = scale * value_at(polynomial, s)
             for signal, polynomial in right.items():
                 b[:, i, inputs.index(signal)] = scale * value_at(polynomial, s)

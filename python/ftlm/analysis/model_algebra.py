@@ -104,9 +104,9 @@ def transfer_function(
     return Ratio(_polynomial("num", num), _polynomial("den", den), delay).model(output, input)
 
 
-def _polynomial(name: str, given: Sequence[float] | Sequence[Pair]) -> Polynomial:
+def _polynomial(name: str, values_argument: Sequence[float] | Sequence[Pair]) -> Polynomial:
     """Return a polynomial from coefficients of descending powers or from pairs (coefficient, power)."""
-    values = list(given)
+    values = list(values_argument)
     pairs = [v if isinstance(v, (tuple, list)) else (v, len(values) - 1.0 - k) for k, v in enumerate(values)]
     out: Polynomial = {}
     for k, pair in enumerate(pairs):
@@ -194,15 +194,15 @@ def _distinct_name(output: str, signal: str) -> str:
 
 def linearize(model: Model, at: Mapping[str, float]) -> Model:
     """Return the linear model of small deviations from an operating point; see :meth:`ftlm.Model.linearized`."""
-    found = [(c, t) for e in model.equations for t in e.nonlinear_terms for c in (t.nonlinear or channel("")).channels]
-    channels = list(dict.fromkeys(c for c, _ in found))
+    pairs = [(c, t) for e in model.equations for t in e.nonlinear_terms for c in (t.nonlinear or channel("")).channels]
+    channels = list(dict.fromkeys(c for c, _ in pairs))
     names = {str(channel(*c)): c for c in channels}
     point = {_channel_of(name): real_number(f"operating point of {name}", value) for name, value in at.items()}
     check_known("operating point", [str(channel(*c)) for c in point], list(names))
     for c in channels:
         if c not in point and c[1] == 0:
             raise ModelError(
-                f"the operating point of {c[0]} is not given, and {next(t for k, t in found if k == c)} depends on it; "
+                f"the operating point of {c[0]} is not given, and {next(t for k, t in pairs if k == c)} depends on it; "
                 f"add {c[0]!r} to at"
             )
     values = {c: point.get(c, 0.0) for c in channels}

@@ -195,17 +195,17 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
         A name that is not known, several signals and none named, or zeros that overflow.
     """
     transfer = transfer_functions(model)
-    chosen = []
-    for what, given, known in (("output", output, transfer.outputs), ("input", input, transfer.inputs)):
-        if given is None and len(known) != 1:
-            raise ModelError(f"the model has the {what}s {', '.join(known)}; name one with {parameter(what)}")
-        name = known[0] if given is None else given
-        if name not in known:
-            raise ModelError(f"{what} {name!r} is not in the model; known: {', '.join(known)}")
-        chosen.append(name)
-    numerator = {power: value for value, power in transfer.numerators[chosen[0], chosen[1]]}
-    found = _principal_roots(numerator, "zeros") if numerator else []
-    return np.array(sorted(found, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
+    pair = []
+    for what, argument, choices in (("output", output, transfer.outputs), ("input", input, transfer.inputs)):
+        if argument is None and len(choices) != 1:
+            raise ModelError(f"the model has the {what}s {', '.join(choices)}; name one with {parameter(what)}")
+        name = choices[0] if argument is None else argument
+        if name not in choices:
+            raise ModelError(f"{what} {name!r} is not in the model; known: {', '.join(choices)}")
+        pair.append(name)
+    numerator = {power: value for value, power in transfer.numerators[pair[0], pair[1]]}
+    roots = _principal_roots(numerator, "zeros") if numerator else []
+    return np.array(sorted(roots, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
 def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
@@ -222,15 +222,15 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
             f"the {what} overflow, outside of 1e-{decades} to 1e{decades} rad/s: change the unit of time"
             " or the coefficients"
         )
-    found = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
+    poles = [s for w in upper for s in ({_pole(w), _pole(w.conjugate())} if w.imag else {_pole(w)})]
     if roots_in_base(polynomial) is None:
         expected, on_cut = right_zeros(polynomial, math.pi)
-        if not on_cut and len(found) != expected:
+        if not on_cut and len(poles) != expected:
             raise ModelError(
-                f"{len(found)} of {expected:.0f} {what} were found (counted by the argument principle); round the"
+                f"{len(poles)} of {expected:.0f} {what} were found (counted by the argument principle); round the"
                 " orders to multiples of 0.01"
             )
-    return found
+    return poles
 
 
 def _whole_orders(polynomial: Polynomial) -> bool:
@@ -449,13 +449,13 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     """
     check_model(model)
     coupled = is_coupled(coupling)
-    found: list[Mode] = []
+    result: list[Mode] = []
     for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
         # A pole that underflows is one at the origin; one that overflows has no visible effect.
         sheet = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
         spreads = _standard_deviations(model, at, np.array(sheet), coupled=coupled)
-        found += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
-    return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
+        result += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
+    return tuple(sorted(result, key=lambda mode: (mode.frequency, mode.pole.imag)))
 
 
 def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
@@ -500,12 +500,12 @@ def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RA
         roots = roots[np.abs(roots) > 0]
         w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
         # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
-        kept = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= reach)]
+        inside = w[(np.angle(roots) >= -DISTINCT_ZERO_TOLERANCE) & (w.imag <= reach)]
         if abs(base - 1) < POWER_TOLERANCE:
-            kept = kept[kept.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]
-        return sorted(kept.tolist(), key=lambda z: (z.real, z.imag))
+            inside = inside[inside.imag <= math.pi + DISTINCT_ZERO_TOLERANCE]
+        return sorted(inside.tolist(), key=lambda z: (z.real, z.imag))
     values = np.array(list(polynomial.values()))
-    found: list[complex] = []
+    roots_so_far: list[complex] = []
     seeds = [_two_term_zeros(powers, values, reach)]
     for base in SEED_ORDER_BASES:
         if (highest - lowest) / base > MAX_SEED_DEGREE:
@@ -513,10 +513,10 @@ def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RA
         seeds.append(_seeds(polynomial, base, reach))
     for z in _newton_zeros(np.concatenate(seeds), powers, values):
         if -DISTINCT_ZERO_TOLERANCE <= z.imag <= reach and all(
-            abs(z - other) > DISTINCT_ZERO_TOLERANCE for other in found
+            abs(z - other) > DISTINCT_ZERO_TOLERANCE for other in roots_so_far
         ):
-            found.append(complex(z.real, max(z.imag, 0.0)))
-    return sorted(found, key=lambda z: (z.real, z.imag))
+            roots_so_far.append(complex(z.real, max(z.imag, 0.0)))
+    return sorted(roots_so_far, key=lambda z: (z.real, z.imag))
 
 
 def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
@@ -525,10 +525,10 @@ def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
     for power, value in polynomial.items():
         near = round(round(power / base) * base, 9)
         rounded[near] = rounded.get(near, 0.0) + value
-    found = roots_in_base({p: v for p, v in rounded.items() if v != 0.0}) if len(rounded) > 1 else None
-    if found is None or not found[1].size:
+    base_roots = roots_in_base({p: v for p, v in rounded.items() if v != 0.0}) if len(rounded) > 1 else None
+    if base_roots is None or not base_roots[1].size:
         return np.empty(0, dtype=np.complex128)
-    step, roots = found
+    step, roots = base_roots
     roots = roots[np.abs(roots) > 0]
     w = np.log(np.abs(roots)) / step + 1j * np.abs(np.angle(roots)) / step
     return np.asarray(w[w.imag <= 1.2 * reach], dtype=np.complex128)
@@ -538,10 +538,10 @@ def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
     """Zeros of the sum of each pair of terms, as ln s, for distant zeros with close orders."""
     out = []
     for i, j in itertools.combinations(range(powers.size), 2):
-        apart = powers[j] - powers[i]
+        difference = powers[j] - powers[i]
         turn = np.angle(-values[i] / values[j] + 0j)
-        angles = (turn + 2 * math.pi * np.arange(-1, math.ceil(reach * abs(apart) / math.pi) + 1)) / apart
-        size = math.log(abs(values[i] / values[j])) / apart
+        angles = (turn + 2 * math.pi * np.arange(-1, math.ceil(reach * abs(difference) / math.pi) + 1)) / difference
+        size = math.log(abs(values[i] / values[j])) / difference
         out += [complex(size, a) for a in angles.tolist() if -DISTINCT_ZERO_TOLERANCE <= a <= reach]
     return np.array(out, dtype=np.complex128)
 
@@ -725,10 +725,10 @@ def settling_time(model: Model) -> float:
 
     At most fifty periods of the fastest oscillation, so that a chart resolves it.
     """
-    found = modes(model)
-    if not found:
+    model_modes = modes(model)
+    if not model_modes:
         return 10.0
-    slowest = max(min(m.time_constant, 20.0 * 2 * math.pi / m.frequency) for m in found)
-    swings = [2 * math.pi / m.frequency for m in found if m.oscillatory]
+    slowest = max(min(m.time_constant, 20.0 * 2 * math.pi / m.frequency) for m in model_modes)
+    swings = [2 * math.pi / m.frequency for m in model_modes if m.oscillatory]
     settled = min(6.0 * slowest, 50.0 * min(swings)) if swings else 6.0 * slowest
     return settled + max(model.structure.delay.values(), default=0.0)

@@ -98,10 +98,10 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
     if matrix.shape != (numbers.size, numbers.size) or not np.all(np.isfinite(matrix)):
         return None
     size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    used = np.flatnonzero(size > 0)
-    if not used.size:
+    rows = np.flatnonzero(size > 0)
+    if not rows.size:
         return None
-    scaled = matrix[np.ix_(used, used)] / np.outer(size[used], size[used])
+    scaled = matrix[np.ix_(rows, rows)] / np.outer(size[rows], size[rows])
     weights, directions = np.linalg.eigh(scaled)
     total: Floats = np.zeros(1)
     # Of the model alone, lest every step is refined with the covariance of another one.
@@ -110,7 +110,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
         if weight <= MIN_VARIANCE_RATIO * float(weights[-1]):
             continue
         shift = np.zeros(numbers.size)
-        shift[used] = DEVIATION_STEP_RATIO * np.sqrt(weight) * direction * size[used]
+        shift[rows] = DEVIATION_STEP_RATIO * np.sqrt(weight) * direction * size[rows]
         try:
             above, below = (
                 step_response(with_parameter_vector(bare, numbers + side), time) for side in (shift, -shift)

@@ -47,8 +47,8 @@ class ProgressListener(Protocol):
     def phase(self, words: str) -> None:
         """Announce the next phase."""
 
-    def __call__(self, done: int, total: int) -> None:
-        """Report ``done`` of ``total`` parts."""
+    def __call__(self, count: int, total: int) -> None:
+        """Report ``count`` of ``total`` parts."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,10 @@ class FitRequest:
     loss: str = ""
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> FitRequest:
+    def of(cls, fields: Mapping[str, Any]) -> FitRequest:
         """Build a request from the dictionary of :meth:`to_dict`."""
-        other = told["validation"]
-        parts = {**told, "structure": tuple(told["structure"]), "estimation": RunSource(**told["estimation"])}
+        other = fields["validation"]
+        parts = {**fields, "structure": tuple(fields["structure"]), "estimation": RunSource(**fields["estimation"])}
         return cls(**{**parts, "validation": None if other is None else RunSource(**other)})
 
     def to_dict(self) -> dict[str, Any]:
@@ -134,8 +134,8 @@ class FitRequest:
 
     def settings(self) -> dict[str, str]:
         """Options of the fit that the user gave, other than runs and structure."""
-        given = {"method": self.method, "offset": self.offset, "loss": self.loss}
-        return {name: value for name, value in given.items() if value}
+        options = {"method": self.method, "offset": self.offset, "loss": self.loss}
+        return {name: value for name, value in options.items() if value}
 
     def estimation_method(self) -> EstimationMethod:
         """Method of the fit with its options."""
@@ -164,12 +164,12 @@ class FitRequest:
         """Whether a structure is selected, which takes long enough to need a checkpoint."""
         return self.way != "fit"
 
-    def fit_model(self, told: ProgressListener, store: str | None = None) -> FittedModel:
+    def fit_model(self, listener: ProgressListener, store: str | None = None) -> FittedModel:
         """Fit the model.
 
         Parameters
         ----------
-        told
+        listener
             Receiver of progress reports.
         store
             Checkpoint file of a structure selection; a stopped selection continues from it.
@@ -179,21 +179,21 @@ class FitRequest:
         DataError, ModelError, ConvergenceError
             As :func:`ftlm.load`, :func:`ftlm.identify`, :func:`ftlm.select`.
         """
-        wanted = self.structures()
-        told.phase("reading")
+        structures = self.structures()
+        listener.phase("reading")
         own, other, cut = self._runs()
-        told.phase(SELECTION_PHASE if self.is_choice else f"fitting{self._time_estimate(own, wanted[0])}")
+        listener.phase(SELECTION_PHASE if self.is_choice else f"fitting{self._time_estimate(own, structures[0])}")
         choice = None
         if not self.is_choice:
             method, offset = self.estimation_method(), cast("Offset", self.offset) if self.offset else None
-            result = identify(own, wanted[0], method=method, offset=offset, progress=told)
+            result = identify(own, structures[0], method=method, offset=offset, progress=listener)
         else:
-            candidates = "auto" if self.way == "auto" else wanted[0] if self.way == "inside" else wanted
-            choice = select(own, candidates, progress=told, store=store)
+            candidates = "auto" if self.way == "auto" else structures[0] if self.way == "inside" else structures
+            choice = select(own, candidates, progress=listener, store=store)
             # The selection started from rest, as its run does. Another run may not.
-            told.phase("fitting what was chosen")
-            result = identify(own, choice.winner.structure, progress=told)
-        told.phase("validating")
+            listener.phase("fitting what was chosen")
+            result = identify(own, choice.winner.structure, progress=listener)
+        listener.phase("validating")
         return FittedModel(
             result, own, other, None if other is None else result.validate(other), choice, self._script(cut)
         )
@@ -247,10 +247,12 @@ class FitRequest:
                 )
             lines += ["choice = ftlm.select(run, candidates)", "print(choice.reason)"]
             lines.append("result = ftlm.identify(run, choice.winner.structure)")
-        tried = cut is not None or self.validation is not None
-        lines.append("print(result.summary(result.validate(other)))" if tried else "print(result.summary())")
+        has_validation = cut is not None or self.validation is not None
+        lines.append("print(result.summary(result.validate(other)))" if has_validation else "print(result.summary())")
         lines.append(f"result.model.save({format_string(stem + '-model.json')})")
-        lines.append(f"result.report({format_string(stem + '-report.html')}{', validation=other' if tried else ''})")
+        lines.append(
+            f"result.report({format_string(stem + '-report.html')}{', validation=other' if has_validation else ''})"
+        )
         return "\n".join(lines) + "\n"
 
 
@@ -273,14 +275,14 @@ def structure_of(text: str) -> Structure:
 
 def parse_structures(recipe: FitRequest) -> list[Structure]:
     """Return the structures of a request; raise for options that contradict each other."""
-    for name, value, known in (
+    for name, value, choices in (
         ("way", recipe.way, SELECTION_MODES),
         ("method", recipe.method, ("", *METHOD_NAMES)),
         ("offset", recipe.offset, ("", *OFFSET_KINDS)),
         ("loss", recipe.loss, ("", *LOSS_NAMES)),
     ):
-        if value not in known:
-            raise ModelError(f"{name} = {value!r} is not known; use {' or '.join(filter(None, known))}")
+        if value not in choices:
+            raise ModelError(f"{name} = {value!r} is not known; use {' or '.join(filter(None, choices))}")
     if recipe.way == "offered" and len(recipe.structure) < 2:
         raise ModelError("one structure leaves no choice; fit it, or select its terms")
     if recipe.way in ("fit", "inside") and len(recipe.structure) != 1:
@@ -305,9 +307,9 @@ def structure_expression(structure: str) -> str:
     return f"ftlm.{structure}" if structure in NAMED_STRUCTURES else f"ftlm.equation({format_string(structure)})"
 
 
-def format_call(target: str, function: str, values: list[str], named: Mapping[str, Any]) -> list[str]:
+def format_call(target: str, function: str, values: list[str], keywords: Mapping[str, Any]) -> list[str]:
     """Python call; one line per argument if one line is too long."""
-    parts = [*values, *(f"{name}={format_literal(value)}" for name, value in named.items())]
+    parts = [*values, *(f"{name}={format_literal(value)}" for name, value in keywords.items())]
     line = f"{target} = {function}({', '.join(parts)})"
     if len(line) <= MAX_SCRIPT_LINE_CHARACTERS:
         return [line]
@@ -344,12 +346,12 @@ COLUMN_ROLES = ("", "time", "input", "output")
 MAX_SIGNALS = 500
 
 
-def parse_fields(said: Mapping[str, Any]) -> dict[str, Any]:
+def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
     """Convert form fields to arguments; an empty field is omitted.
 
     Parameters
     ----------
-    said
+    texts
         ``columns``: a list of name, role, signal and unit; ``step``, ``resample``, ``from``, ``to``: text of numbers;
         ``time_unit``, ``missing`` and the fields of the layout: text.
 
@@ -358,21 +360,23 @@ def parse_fields(said: Mapping[str, Any]) -> dict[str, Any]:
     DataError
         An unknown field, or a field without the number that it needs.
     """
-    asked: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for name in ("step", "resample"):
-        if _text(said, name):
-            asked[name] = parse_number(name, _text(said, name))
+        if _text(texts, name):
+            options[name] = parse_number(name, _text(texts, name))
     for name in ("time_unit", "missing"):
-        if _text(said, name):
-            asked[name] = _text(said, name)
-    ends = [parse_number(name, _text(said, name)) if _text(said, name) else None for name in ("from", "to")]
+        if _text(texts, name):
+            options[name] = _text(texts, name)
+    ends = [parse_number(name, _text(texts, name)) if _text(texts, name) else None for name in ("from", "to")]
     if ends != [None, None]:
-        asked["window"] = ends
-    layout: dict[str, Any] = {name: _text(said, name) for name in TEXT_LAYOUT_FIELDS if _text(said, name)}
-    layout |= {name: _parse_line_count(name, _text(said, name)) for name in INTEGER_LAYOUT_FIELDS if _text(said, name)}
+        options["window"] = ends
+    layout: dict[str, Any] = {name: _text(texts, name) for name in TEXT_LAYOUT_FIELDS if _text(texts, name)}
+    layout |= {
+        name: _parse_line_count(name, _text(texts, name)) for name in INTEGER_LAYOUT_FIELDS if _text(texts, name)
+    }
     if layout:
-        asked["layout"] = layout
-    return asked | _roles(said.get("columns"))
+        options["layout"] = layout
+    return options | _roles(texts.get("columns"))
 
 
 def _roles(columns: Any) -> dict[str, Any]:
@@ -381,7 +385,7 @@ def _roles(columns: Any) -> dict[str, Any]:
         return {}
     if not isinstance(columns, list) or len(columns) > MAX_SIGNALS:
         raise DataError(f"columns is not a list of at most {MAX_SIGNALS} columns")
-    asked: dict[str, Any] = {}
+    roles: dict[str, Any] = {}
     for entry in columns:
         if not isinstance(entry, Mapping):
             raise DataError("a column is not an object with name, role, signal and unit")
@@ -390,17 +394,17 @@ def _roles(columns: Any) -> dict[str, Any]:
         if role not in COLUMN_ROLES:
             raise DataError(f"the role {role!r} of column {name!r} is not known; take time, input, output or none")
         if role == "time":
-            if "time" in asked:
-                raise DataError(f"{asked['time']!r} and {name!r} are both the time; keep one of them")
-            asked["time"] = name
+            if "time" in roles:
+                raise DataError(f"{roles['time']!r} and {name!r} are both the time; keep one of them")
+            roles["time"] = name
         elif role:
-            signals = asked.setdefault(f"{role}s", {})
-            if signal in signals or signal in asked.get("inputs", {}) or signal in asked.get("outputs", {}):
+            signals = roles.setdefault(f"{role}s", {})
+            if signal in signals or signal in roles.get("inputs", {}) or signal in roles.get("outputs", {}):
                 raise DataError(f"two columns are called {signal!r}; give each signal a name of its own")
             signals[signal] = name
             if unit:
-                asked.setdefault("units", {})[signal] = unit
-    return asked
+                roles.setdefault("units", {})[signal] = unit
+    return roles
 
 
 def parse_number(name: str, text: str) -> float:
@@ -418,8 +422,8 @@ def _parse_line_count(name: str, text: str) -> int:
     return int(text)
 
 
-def _text(said: Mapping[str, Any], name: str) -> str:
-    value = said.get(name)
+def _text(texts: Mapping[str, Any], name: str) -> str:
+    value = texts.get(name)
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
@@ -435,13 +439,13 @@ MAX_DELAY_SHARE = 0.1
 
 def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: float) -> list[dict[str, str]]:
     """Structures suggested for each output of a run of some duration [s]: name, purpose, equation, output."""
-    made: list[dict[str, str]] = []
+    suggestions: list[dict[str, str]] = []
     driven = list(inputs)[:MAX_SUGGESTED_SIGNALS]
     for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:
         drives = "".join(f" + b{k} {name}" for k, name in enumerate(driven))
         ends = f"0:{MAX_DELAY_SHARE * duration:.2g} s"
         late = "".join(f" + b{k} {name}(t - {ends})" for k, name in enumerate(driven))
-        for name, why, left, own, right in (
+        for name, why, lhs, own, right in (
             ("Lag", "first order: heating, filling, a motor's speed", "D", "a0 {y}", drives),
             ("Lag with dead time", "a lag that answers late: its delay is estimated", "D", "a0 {y}", late),
             ("Lag of free order", "diffusion, batteries, creep: its order is estimated", "D^alpha", "a0 {y}", drives),
@@ -458,11 +462,11 @@ def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: 
             ("Integrator", "an angle or a level driven by a torque or a flow", "D^2", "a1 D {y}", drives),
             ("Integrator, dry friction", "a motor's angle that sticks", "D^2", "a1 D {y} - fc sign(D {y})", drives),
         ):
-            text = f"{left} {output} = {own.format(y=output)}{right}"
-            made.append({"name": name, "why": why, "structure": text, "output": output})
+            text = f"{lhs} {output} = {own.format(y=output)}{right}"
+            suggestions.append({"name": name, "why": why, "structure": text, "output": output})
     for stage in (1, 2):
         if {f"I{stage}", f"theta{stage}1", f"theta{stage}2"} <= {*inputs, *outputs}:
-            made.append(
+            suggestions.append(
                 {
                     "name": f"Flexible link {stage}",
                     "why": "hub and deflection of a flexible arm",
@@ -470,4 +474,4 @@ def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: 
                     "output": f"theta{stage}1, theta{stage}2",
                 }
             )
-    return made
+    return suggestions

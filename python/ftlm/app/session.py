@@ -171,10 +171,10 @@ class Session:
             raise DataError(f"the files together are larger than {MAX_TOTAL_BYTES >> 20} MB; remove one")
 
     def _free_name(self, name: str) -> str:
-        taken = {f.name.casefold() for f in self.files.values()}
+        names = {f.name.casefold() for f in self.files.values()}
         stem, dot, suffixes = name.partition(".")
         free, count = name, 1
-        while free.casefold() in taken:
+        while free.casefold() in names:
             count += 1
             free = f"{stem}-{count}{dot}{suffixes}"
         return free
@@ -189,14 +189,14 @@ class Session:
         """
         free = self.check_room(name, size)
         # Its name is taken from here on; a second one of that name gets another.
-        file, written = File(secrets.token_hex(8), free, 0), 0
+        file, byte_count = File(secrets.token_hex(8), free, 0), 0
         self.files[file.key] = file
         try:
             with open(self.folder / file.stored_name, "xb") as stream:
                 async for chunk in chunks:
-                    written += len(chunk)
-                    self._check_size(name, written, file)
-                    file.size = written
+                    byte_count += len(chunk)
+                    self._check_size(name, byte_count, file)
+                    file.size = byte_count
                     stream.write(chunk)
         except OSError as error:
             self.remove_file(file.key)
@@ -218,16 +218,16 @@ class Session:
         """Read the preview of a file with the user's options; an earlier reading is stopped."""
         if file.task is not None:
             file.task.stop()
-        asked = {"do": "open", "file": str(self.folder / file.stored_name), "options": file.user_options}
-        file.task = task = Task(asked, lambda _: None)
+        request = {"do": "open", "file": str(self.folder / file.stored_name), "options": file.user_options}
+        file.task = task = Task(request, lambda _: None)
         try:
             async with self._openings:
-                told, error = self._with_names(await task.answer(OPEN_TIMEOUT_S)), ""
+                preview, error = self._with_names(await task.answer(OPEN_TIMEOUT_S)), ""
         except TaskError as failed:
-            told, error = None, self.without_paths(str(failed))
+            preview, error = None, self.without_paths(str(failed))
         if file.task is not task:
             return
-        file.task, file.preview, file.error = None, told, error
+        file.task, file.preview, file.error = None, preview, error
         file.version += 1
 
     def remove_file(self, key: str) -> None:
@@ -249,7 +249,7 @@ class Session:
 
     # ----------------------------------------------------------------------------------------------------------- models
 
-    def parse_request(self, told: Mapping[str, Any]) -> FitRequest:
+    def parse_request(self, fields: Mapping[str, Any]) -> FitRequest:
         """Return the fit request of the page's form.
 
         Raises
@@ -257,21 +257,21 @@ class Session:
         DataError, ModelError
             A file that is absent, still being read or no run; an unknown option; an invalid equation.
         """
-        other = str(told.get("validation") or "")
-        share = real_number("share", told.get("share", 0))
-        texts = told.get("structure") or []
+        other = str(fields.get("validation") or "")
+        share = real_number("share", fields.get("share", 0))
+        texts = fields.get("structure") or []
         texts = [texts] if isinstance(texts, str) else texts
         if not isinstance(texts, list) or len(texts) > 20 or not all(isinstance(t, str) for t in texts):
             raise ModelError("structure is not an equation; write one, such as D y = a0 y + b0 u")
         if sum(map(len, texts)) > 4000:
             raise ModelError("the equation has more than 4000 letters; write a shorter one")
         recipe = FitRequest(
-            self._run(str(told.get("estimation") or "")),
+            self._run(str(fields.get("estimation") or "")),
             self._run(other) if other else None,
             0.0 if other else share,
             tuple(t.strip() for t in texts if t.strip()),
             *(
-                str(told.get(name) or default)
+                str(fields.get(name) or default)
                 for name, default in (("way", "fit"), ("method", ""), ("offset", ""), ("loss", ""))
             ),
         )
@@ -341,22 +341,22 @@ class Session:
                 return
             model.state, model.phase, model.started_at = STATE_RUNNING, "starting", time.monotonic()
             model.version += 1
-            asked = {
+            request = {
                 "do": "model",
                 "recipe": model.recipe.to_dict(),
                 "model": str(self.folder / f"{model.key}.json"),
                 "report": str(self.folder / f"{model.key}.html"),
                 "store": str(self.folder / f"{model.key}.ftlm") if model.recipe.is_choice else None,
             }
-            model.task = Task(asked, lambda said: _record_progress(model, said))
+            model.task = Task(request, lambda message: _record_progress(model, message))
             try:
-                told = await model.task.answer()
+                description = await model.task.answer()
             except TaskError as failed:
                 if model.state == STATE_RUNNING:
                     model.state, model.error = STATE_FAILED, self.without_paths(str(failed))
             else:
                 if model.state == STATE_RUNNING:
-                    model.state, model.description = STATE_MADE, self._with_names(told)
+                    model.state, model.description = STATE_MADE, self._with_names(description)
             model.took += time.monotonic() - model.started_at
             model.task = None
             model.version += 1
@@ -412,11 +412,11 @@ class Session:
 
 def _check_signals(structure: Structure, reading: RunSource) -> None:
     """Raise if the run lacks a signal of the structure, before a process is started."""
-    there = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
+    names = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
     for name in structure.signals:
-        if name not in there:
+        if name not in names:
             raise ModelError(
-                f"{reading.file!r} has no signal {name!r}{nearest(name, there)}; it has {', '.join(there)}, as its "
+                f"{reading.file!r} has no signal {name!r}{nearest(name, names)}; it has {', '.join(names)}, as its "
                 "columns are named above"
             )
 
@@ -425,16 +425,16 @@ def _file_names(recipe: FitRequest) -> set[str]:
     return {recipe.estimation.file, *(() if recipe.validation is None else (recipe.validation.file,))}
 
 
-def _record_progress(model: Model, said: Mapping[str, Any]) -> None:
+def _record_progress(model: Model, message: Mapping[str, Any]) -> None:
     """Store a progress report of a task process in its model."""
-    if "phase" in said:
-        model.phase, model.share, model.time_left = str(said["phase"]), None, ""
+    if "phase" in message:
+        model.phase, model.share, model.time_left = str(message["phase"]), None, ""
         model.phase_started_at = time.monotonic()
-    elif said.get("total") and model.phase.startswith(SELECTION_PHASE):
+    elif message.get("total") and model.phase.startswith(SELECTION_PHASE):
         # Candidates come up as others are fitted: a share of those known so far would go back.
-        model.time_left = f"{said['done']} of {said['total']} candidates known so far are fitted"
-    elif said.get("total"):
-        share = min(max(float(said["done"]) / float(said["total"]), 0.0), 1.0)
+        model.time_left = f"{message['done']} of {message['total']} candidates known so far are fitted"
+    elif message.get("total"):
+        share = min(max(float(message["done"]) / float(message["total"]), 0.0), 1.0)
         passed = time.monotonic() - model.phase_started_at
         model.share = share
         if share > 0.02 and passed > 1.0:

@@ -29,15 +29,15 @@ class Task:
 
     Parameters
     ----------
-    asked
+    request
         Task for :mod:`ftlm.app.worker`, as JSON.
-    told
+    listener
         Called with each progress report.
     """
 
-    def __init__(self, asked: Mapping[str, Any], told: Callable[[Mapping[str, Any]], None]) -> None:
-        self._asked = asked
-        self._told = told
+    def __init__(self, request: Mapping[str, Any], listener: Callable[[Mapping[str, Any]], None]) -> None:
+        self._request = request
+        self._listener = listener
         self._process: asyncio.subprocess.Process | None = None
         self._ended = False
 
@@ -84,7 +84,7 @@ class Task:
         assert process.stdin is not None
         assert process.stdout is not None
         with contextlib.suppress(ConnectionError):
-            process.stdin.write(json.dumps(self._asked).encode() + b"\n")
+            process.stdin.write(json.dumps(self._request).encode() + b"\n")
             await process.stdin.drain()
         while True:
             try:
@@ -94,14 +94,14 @@ class Task:
             if not line:
                 raise TaskError("stopped" if self._ended else _describe_exit(await process.wait()))
             try:
-                said = json.loads(line)
+                message = json.loads(line)
             except ValueError:
                 continue
-            if "error" in said:
-                raise TaskError(str(said["error"]))
-            if "answer" in said:
-                return dict(said["answer"])
-            self._told(said)
+            if "error" in message:
+                raise TaskError(str(message["error"]))
+            if "answer" in message:
+                return dict(message["answer"])
+            self._listener(message)
 
     def stop(self) -> None:
         """Kill the task; :meth:`answer` then raises."""

@@ -54,11 +54,11 @@ _PHRASE_REPLACEMENTS = (
 _VERDICT_RANKS = {"trust": 0, "with care": 1, "do not use": 2}
 
 
-def _field_label(found: re.Match[str]) -> str:
+def _field_label(match: re.Match[str]) -> str:
     """Label of the form field of an argument, with its value."""
-    name, value = found[1] or found[4], found[2] or found[3]
-    shown = "the role “time”" if name == "time" else f"the field “{_FIELD_LABELS.get(name, name)}”"
-    return f"{shown} {value}" if value else shown
+    name, value = match[1] or match[4], match[2] or match[3]
+    label = "the role “time”" if name == "time" else f"the field “{_FIELD_LABELS.get(name, name)}”"
+    return f"{label} {value}" if value else label
 
 
 def _read(name: str) -> str:
@@ -116,49 +116,49 @@ def page(desk: Session) -> str:
     )
 
 
-def file(shown: File) -> str:
+def file(item: File) -> str:
     """Return a file with its columns and assumptions."""
-    preview = shown.preview
-    chosen = {} if preview is None else preview["options"]
+    preview = item.preview
+    options = {} if preview is None else preview["options"]
     facts = {
-        "name": shown.name,
-        "run": shown.is_run,
+        "name": item.name,
+        "run": item.is_run,
         "offers": [] if preview is None else preview["offers"],
-        "outputs": list(chosen.get("outputs", {})),
+        "outputs": list(options.get("outputs", {})),
     }
     return _render_template(
         "file.html.j2",
-        file=shown,
+        file=item,
         preview=preview,
-        chosen=chosen,
-        layout=chosen.get("layout", {}),
+        chosen=options,
+        layout=options.get("layout", {}),
         facts=json.dumps(facts),
         separators=list(SEPARATOR_CHARACTERS),
         decimals=list(DECIMAL_CHARACTERS),
         groups=list(THOUSANDS_CHARACTERS),
         dates=DATE_ORDERS,
         time_units=list(TIME_UNITS),
-        asked=shown.user_options,
+        asked=item.user_options,
     )
 
 
-def model(shown: Model) -> str:
+def model(item: Model) -> str:
     """Return a model in any state."""
-    return _render_template("model.html.j2", model=shown, description=shown.description, recipe=shown.recipe)
+    return _render_template("model.html.j2", model=item, description=item.description, recipe=item.recipe)
 
 
 def comparison(desk: Session) -> str:
     """Return a table of the models, the most trustworthy first."""
-    made = [m for m in desk.models.values() if m.state == STATE_MADE and m.description is not None]
-    made.sort(key=lambda m: (_VERDICT_RANKS.get((m.description or {})["verdict"]["level"], 3), -_worst_fit(m)))
-    outputs = list(dict.fromkeys(f["output"] for m in made for f in (m.description or {})["fits"]))
-    fits = {m.key: {f["output"]: f for f in (m.description or {})["fits"]} for m in made}
-    return _render_template("comparison.html.j2", models=made, outputs=outputs, fits=fits)
+    models = [m for m in desk.models.values() if m.state == STATE_MADE and m.description is not None]
+    models.sort(key=lambda m: (_VERDICT_RANKS.get((m.description or {})["verdict"]["level"], 3), -_worst_fit(m)))
+    outputs = list(dict.fromkeys(f["output"] for m in models for f in (m.description or {})["fits"]))
+    fits = {m.key: {f["output"]: f for f in (m.description or {})["fits"]} for m in models}
+    return _render_template("comparison.html.j2", models=models, outputs=outputs, fits=fits)
 
 
-def _worst_fit(shown: Model) -> float:
+def _worst_fit(item: Model) -> float:
     """Worst fit of a model, on validation data if there are any."""
-    fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (shown.description or {})["fits"]]
+    fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (item.description or {})["fits"]]
     return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
 
 
@@ -184,11 +184,11 @@ MAX_CHART_POINTS = 1500
 MAX_FIGURES = 12
 
 
-def model_summary(made: FittedModel) -> dict[str, Any]:
+def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
     """Return the page content of a model; markup consists of escaped parts."""
-    result, checked = made.result, made.validation
-    judged = verdict(result, checked)
-    warnings, left = first_findings([*result.findings, *(checked.findings if checked else ())])
+    result, checked = fitted_model.result, fitted_model.validation
+    judgement = verdict(result, checked)
+    warnings, rest = first_findings([*result.findings, *(checked.findings if checked else ())])
     figures = []
     if checked is not None:
         figures += comparison_charts(checked, units=result.model.units, label="validation", points=MAX_CHART_POINTS)
@@ -196,11 +196,11 @@ def model_summary(made: FittedModel) -> dict[str, Any]:
         result.comparison, units=result.model.units, label="estimation", points=MAX_CHART_POINTS
     )
     tables = [parameter_table(result.model, result.joint), *behavior_tables(result.model)]
-    choice = made.choice
+    choice = fitted_model.choice
     return {
         "title": title_of(result.model),
-        "verdict": judged.to_dict(),
-        "box": str(verdict_box(judged)),
+        "verdict": judgement.to_dict(),
+        "box": str(verdict_box(judgement)),
         "equations": [str(e) for e in equations_html(result.model, result.comparison.offsets)],
         "numbers": len(result.joint.names) if result.joint is not None else len(result.coefficients),
         "fits": [
@@ -213,13 +213,13 @@ def model_summary(made: FittedModel) -> dict[str, Any]:
             }
             for output, own in result.output_error.items()
         ],
-        "runs": [made.run.name, None if made.other is None else made.other.name],
+        "runs": [fitted_model.run.name, None if fitted_model.other is None else fitted_model.other.name],
         "warnings": [str(Markup("{}").format(w)) for w in warnings],
-        "more": [str(Markup("{}").format(w)) for w in left],
+        "more": [str(Markup("{}").format(w)) for w in rest],
         "figures": figure_markup(figures),
         "tables": [str(t.to_html()) for t in tables],
         "choice": None if choice is None else {"reason": choice.reason, "table": str(choice.table().to_html())},
-        "script": made.script,
+        "script": fitted_model.script,
     }
 
 

@@ -23,7 +23,7 @@ from ftlm.app.forms import parse_fields
 from ftlm.app.session import STATE_MADE, File, Model, Session
 from ftlm.errors import FtlmError
 
-Kept = TypeVar("Kept", File, Model)
+Item = TypeVar("Item", File, Model)
 Endpoint = Callable[[Request], Awaitable[Response]]
 
 #: Longest body of a request that uploads no file.
@@ -72,12 +72,12 @@ async def read_json(request: Request) -> dict[str, Any]:
         if len(body) > MAX_BODY_BYTES:
             raise HTTPException(413, f"the request is longer than {MAX_BODY_BYTES >> 10} kB")
     try:
-        said = json.loads(body)
+        document = json.loads(body)
     except (ValueError, RecursionError):
         raise HTTPException(400, "the request is not valid JSON") from None
-    if not isinstance(said, dict):
+    if not isinstance(document, dict):
         raise HTTPException(400, "the request is not a JSON object")
-    return said
+    return document
 
 
 class WebApplication:
@@ -195,9 +195,9 @@ class WebApplication:
 
     async def _check(self, request: Request) -> Response:
         """Return the error message of a fit request, or "" if it is valid."""
-        wanted = await read_json(request)
+        request_body = await read_json(request)
         try:
-            self._desk.parse_request(wanted)
+            self._desk.parse_request(request_body)
         except FtlmError as error:
             return json_response({"error": self._words(error)})
         return json_response({"error": ""})
@@ -205,9 +205,11 @@ class WebApplication:
     async def _upload(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
             raise HTTPException(415, "a file is sent as it is (application/octet-stream), not as a form")
-        said = request.headers.get("content-length")
+        header = request.headers.get("content-length")
         # Of more digits than Python reads none is a size; what comes is counted whatever is said.
-        size = int(said) if said is not None and said.isascii() and said.isdigit() and len(said) < 20 else None
+        size = (
+            int(header) if header is not None and header.isascii() and header.isdigit() and len(header) < 20 else None
+        )
         name = request.query_params.get("name", "")
         try:
             self._desk.check_room(name, size)
@@ -277,12 +279,12 @@ def _view(make: Callable[[], str], media_type: str) -> Endpoint:
     return endpoint
 
 
-def _find(kept: Mapping[str, Kept], request: Request, kind: str) -> Kept:
+def _find(items: Mapping[str, Item], request: Request, kind: str) -> Item:
     """Return the file or model whose key is in the path."""
-    found = kept.get(request.path_params["key"])
-    if found is None:
+    item = items.get(request.path_params["key"])
+    if item is None:
         raise HTTPException(404, f"this {kind} is no longer on the page")
-    return found
+    return item
 
 
 #: Time that a client may take for a request head, between two parts of a body, and to read a part of an answer.
@@ -307,9 +309,9 @@ class TimedConnection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Restart the timeout at each part of a body, and at the end of a head."""
-        before = self.conn.their_state
+        state_before = self.conn.their_state
         super().data_received(data)
-        if self.conn.their_state is not before or before is h11.SEND_BODY:
+        if self.conn.their_state is not state_before or state_before is h11.SEND_BODY:
             self._since = self.loop.time()
 
     def on_response_complete(self) -> None:
@@ -328,9 +330,9 @@ class TimedConnection(H11Protocol):
 
     def _check_timeout(self) -> None:
         """Abort the connection if the client sends nothing or does not read its answer."""
-        unread, before = self.transport.get_write_buffer_size(), self._unread
+        unread, size_before = self.transport.get_write_buffer_size(), self._unread
         self._unread = unread
-        if unread < before or (unread and not before):
+        if unread < size_before or (unread and not size_before):
             self._since = self.loop.time()
         owes = bool(unread) or self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
         if owes and self.loop.time() - self._since >= CLIENT_TIMEOUT_S:

@@ -50,12 +50,12 @@ class Reports(Progress):
         """Announce the next phase."""
         self.send(phase=words)
 
-    def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
+    def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
         """Report progress at most once per interval."""
         now = time.monotonic()
-        if now - self._last >= REPORT_INTERVAL_S or done >= total:
+        if now - self._last >= REPORT_INTERVAL_S or count >= total:
             self._last = now
-            self.send(done=int(done), total=int(total))
+            self.send(done=int(count), total=int(total))
 
 
 def main() -> None:
@@ -87,44 +87,44 @@ def _end_with_parent() -> None:
 
 def describe_file(task: Mapping[str, Any]) -> dict[str, Any]:
     """Return the preview of a file for the page."""
-    found = open_file(task["file"], **task["options"])
-    told = found.to_dict()
+    opened = open_file(task["file"], **task["options"])
+    description = opened.to_dict()
     return {
-        "kind": found.kind,
-        "rows": found.rows,
-        "columns": told["columns"][:MAX_SHOWN_COLUMNS],
-        "hidden": max(len(found.columns) - MAX_SHOWN_COLUMNS, 0),
-        "assumed": [a.words for a in found.assumed],
-        "options": told["options"],
-        "step": found.step,
-        "problem": found.problem,
-        "notes": list(found.notes),
-        "offers": [] if found.problem else suggest_structures(*_signals(found), (found.step or 1.0) * found.rows),
-        **_run_preview(found),
+        "kind": opened.kind,
+        "rows": opened.rows,
+        "columns": description["columns"][:MAX_SHOWN_COLUMNS],
+        "hidden": max(len(opened.columns) - MAX_SHOWN_COLUMNS, 0),
+        "assumed": [a.words for a in opened.assumed],
+        "options": description["options"],
+        "step": opened.step,
+        "problem": opened.problem,
+        "notes": list(opened.notes),
+        "offers": [] if opened.problem else suggest_structures(*_signals(opened), (opened.step or 1.0) * opened.rows),
+        **_run_preview(opened),
     }
 
 
-def _signals(found: OpenedFile) -> tuple[list[str], list[str]]:
-    inputs, outputs = ([c.signal for c in found.columns if c.role == role] for role in ("input", "output"))
+def _signals(opened: OpenedFile) -> tuple[list[str], list[str]]:
+    inputs, outputs = ([c.signal for c in opened.columns if c.role == role] for role in ("input", "output"))
     return inputs, outputs
 
 
-def _run_preview(found: OpenedFile) -> dict[str, Any]:
+def _run_preview(opened: OpenedFile) -> dict[str, Any]:
     """Return charts and advice of a file's run."""
-    if found.problem:
+    if opened.problem:
         return {"figures": [], "advice": [], "length": 0}
     # The file is read again with all options fixed, so that the fit uses the rows of the preview.
-    run = found.load()
+    run = opened.load()
     return {"figures": run_figures(run), "advice": [a.sentence for a in run.advice()], "length": run.length}
 
 
 def make_model(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
     """Fit a model, write its files, and return its summary for the page."""
-    made = FitRequest.of(task["recipe"]).fit_model(reports, task["store"])
+    fitted_model = FitRequest.of(task["recipe"]).fit_model(reports, task["store"])
     reports.phase("writing the report")
-    made.result.model.save(task["model"])
-    made.result.report(task["report"], validation=made.other)
-    return model_summary(made)
+    fitted_model.result.model.save(task["model"])
+    fitted_model.result.report(task["report"], validation=fitted_model.other)
+    return model_summary(fitted_model)
 
 
 if __name__ == "__main__":

@@ -369,23 +369,23 @@ def flexible_link(
     coefficient_law: list[tuple[str, float, tuple[str, ...]]] = []
     reference: dict[str, float] = {}
     for j in stages:
-        named = input_order if form == "published" else None
-        orders = order_law(j, form=form, input_order=named, velocities="velocities" in laws)
-        made = _joint_equations(j, form, orders, laws, bool(friction) and coupling == "measured")
+        order_option = input_order if form == "published" else None
+        orders = order_law(j, form=form, input_order=order_option, velocities="velocities" in laws)
+        pair = _joint_equations(j, form, orders, laws, bool(friction) and coupling == "measured")
         if friction and coupling == "simulated":
             near = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else UNSET
-            made = (replace(made[0], coulomb=Friction(f"fc{j}", more=near)), made[1])
+            pair = (replace(pair[0], coulomb=Friction(f"fc{j}", more=near)), pair[1])
         if cross_stage:
-            made = (
-                _add_cross_inertia(made, j, laws, stage == "both")
+            pair = (
+                _add_cross_inertia(pair, j, laws, stage == "both")
                 if cross_stage == "inertial"
-                else _add_cross_torques(made, j)
+                else _add_cross_torques(pair, j)
             )
         if cross_damping:
-            made = (made[0], _append_terms(made[1], [Term(f"theta{3 - j}2", Order(1.0), f"w{2 * j}")]))
+            pair = (pair[0], _append_terms(pair[1], [Term(f"theta{3 - j}2", Order(1.0), f"w{2 * j}")]))
         if cross_sensitivity:
-            made = (made[0], _add_cross_sensitivity(made[1], j, other=cross_stage == "inertial"))
-        equations += made if hub else made[1:]
+            pair = (pair[0], _add_cross_sensitivity(pair[1], j, other=cross_stage == "inertial"))
+        equations += pair if hub else pair[1:]
         h, d = 2 * j - 1, 2 * j
         ratio = f"j{j}" if form == "lagrange" else f"r{j}"
         tied: tuple[tuple[str, tuple[str, ...]], ...] = (("a", (ratio,)), ("d", (ratio,)))
@@ -396,11 +396,11 @@ def flexible_link(
             # Both angles of stage 1 turn what stands on its tip.
             coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
         link = PARAMETER_SETS[parameters][j]
-        known = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
-        reference |= {n: v for n, v in known.items() if any(n in e.coefficient_names for e in equations)}
+        values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
+        reference |= {n: v for n, v in values.items() if any(n in e.coefficient_names for e in equations)}
     if sensor_filter == "stock":
-        seen = {s for e in equations for s in e.signals}
-        sensor_filter = SensorFilter.low_pass([s for s in ("theta12", "theta22") if s in seen])
+        signals = {s for e in equations for s in e.signals}
+        sensor_filter = SensorFilter.low_pass([s for s in ("theta12", "theta22") if s in signals])
     if not (sensor_filter is None or isinstance(sensor_filter, SensorFilter)):
         raise ModelError(f"{setting('sensor_filter')} {sensor_filter!r} is not known; use 'stock' or a SensorFilter")
     structure = Structure(
@@ -461,19 +461,19 @@ def _append_terms(item: Equation, terms: Sequence[Term]) -> Equation:
     return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
 
 
-def _add_cross_torques(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
+def _add_cross_torques(pair: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
     """Add the torques of the other joint: terms in its angles and its current, of order 0."""
     other, first = 3 - stage, 2 * stage - 1
     signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
     hub, deflection = (
         _append_terms(item, [Term(s, Order(CROSS_ORDER), f"{c}{n}") for c, s in zip("pqs", signals, strict=True)])
-        for n, item in enumerate(made, first)
+        for n, item in enumerate(pair, first)
     )
     return hub, deflection
 
 
 def _add_cross_inertia(
-    made: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool
+    pair: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool
 ) -> tuple[Equation, Equation]:
     """Add the inertial terms of the other joint, from the energies of the planar arm with the absolute rates of (8).
 
@@ -490,7 +490,7 @@ def _add_cross_inertia(
         orders = [Order.parse(f"alpha{n} - {damping} + {rate}" if law else f"alpha{n}") for rate in rates]
         return [Term(f"theta{other}{k}", order, f"{c}{n}") for k, c, order in zip((1, 2), "pq", orders, strict=True)]
 
-    hub, deflection = made
+    hub, deflection = pair
     # The order of D that makes of the rate of a hub its acceleration is alpha_3 - gamma_3, of a link alpha_2 - mu_2.
     own = f"mu{d}" if "velocities" in laws else f"gamma{h}"
     return hub if stage == 1 else _append_terms(hub, terms(h, own)), _append_terms(deflection, terms(d, f"mu{d}"))
@@ -541,10 +541,14 @@ def link_model(
     ModelError
         A name that is not known, orders out of range.
     """
-    named = parameters if isinstance(parameters, str) else "effective"
+    parameters_name = parameters if isinstance(parameters, str) else "effective"
     form, order = _resolve_form(form, input_order)
     structure = flexible_link(
-        stage=stage, form=form, input_order=order if form == "published" else None, coupling=coupling, parameters=named
+        stage=stage,
+        form=form,
+        input_order=order if form == "published" else None,
+        coupling=coupling,
+        parameters=parameters_name,
     )
     values = dict(structure.reference)
     if not isinstance(parameters, str):
@@ -558,5 +562,5 @@ def link_model(
         structure.with_orders(free).with_coefficients(values),
         orders=free,
         units={s: "A" if s.startswith("I") else "rad" for s in structure.signals},
-        about={"origin": f"parameters {named}" if isinstance(parameters, str) else "given parameters"},
+        about={"origin": f"parameters {parameters_name}" if isinstance(parameters, str) else "given parameters"},
     )

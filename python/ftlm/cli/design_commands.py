@@ -106,16 +106,16 @@ def control(
     out : FILE
         Write the controller to this .json file.
     """
-    given = dict(locals())
+    arguments = dict(locals())
     check_ending(out, ".json")
     check_ending(trajectory, ".csv")
     if trajectory is not None and path is None:
         raise ModelError("--trajectory is of a move; give --path SIZE:SECONDS")
-    wrong = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if given[n] not in (None, [])]
+    wrong = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if arguments[n] not in (None, [])]
     if wrong:
         other = "lqg" if design == "pid" else "pid"
-        shown = ", ".join(map(parameter, wrong))
-        raise ModelError(f"{shown}: of --design {other}, not used with {design}; leave out what is not meant")
+        text = ", ".join(map(parameter, wrong))
+        raise ModelError(f"{text}: of --design {other}, not used with {design}; leave out what is not meant")
     loaded = load_model(model)
     most = np.inf if limit is None else limit
     # A sum moves along the path; the loop itself has one output.
@@ -123,16 +123,16 @@ def control(
     if path is not None and output is not None and "+" in output:
         followed = output.partition("+")[0].strip() if design == "pid" else None
     common: dict[str, Any] = {"input": input, "output": followed, "rate": rate, "samples": samples, "seed": seed}
-    found: designs.PidDesign | designs.LqgDesign
+    result: designs.PidDesign | designs.LqgDesign
     running: designs.DiscretePid | designs.Lqg
     if design == "pid":
         if crossover is None:
             raise ModelError("--crossover is missing: where the loop's gain is to be 1 [rad/s]")
         announce_design(design, samples)
-        found = designs.fractional_pid(
+        result = designs.fractional_pid(
             loaded, crossover=crossover, phase_margin=60.0 if phase_margin is None else phase_margin, **common
         )
-        running = designs.DiscretePid(found.pid, rate, limit=most)
+        running = designs.DiscretePid(result.pid, rate, limit=most)
     else:
         if max_input is None or not max_deviation:
             raise ModelError(
@@ -140,7 +140,7 @@ def control(
             )
         low_high = None if band is None else parse_numbers("--band", band, 2)
         announce_design(design, samples)
-        found = designs.lqg(
+        result = designs.lqg(
             loaded,
             max_deviation=numbers("--max-deviation", max_deviation),
             max_input=max_input,
@@ -152,15 +152,15 @@ def control(
             band=None if low_high is None else (low_high[0], low_high[1]),
             **common,
         )
-        running = found.controller
+        running = result.controller
     planned = None
     if path is not None:
         size, seconds = parse_numbers("--path", path, 2)
-        told = found.plants[0].output if design == "pid" else running.tracked  # type: ignore[union-attr]
+        tracked = result.plants[0].output if design == "pid" else running.tracked  # type: ignore[union-attr]
         planned = designs.inverse_dynamics(
-            found,
+            result,
             designs.point_to_point(size, seconds, rate),
-            output=output or told,
+            output=output or tracked,
             limit=most,
             samples=min(samples, 40),
             seed=seed,
@@ -170,9 +170,9 @@ def control(
     if trajectory is not None and planned is not None:
         _write_trajectory(planned, rate, trajectory, force=force)
     if as_json:
-        show_json(found.to_dict() | {"planned": None if planned is None else planned.to_dict()})
+        show_json(result.to_dict() | {"planned": None if planned is None else planned.to_dict()})
         return
-    for line in (found, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
+    for line in (result, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
         print_text(str(line))
     say_written(out, trajectory)
 
@@ -205,15 +205,15 @@ def input_shaper(
         Write its impulse response to this .csv file.
     """
     check_ending(out, ".csv")
-    made = designs.input_shaper(load_model(model), kind, modes=modes, coupling=coupling)
-    taps = made.impulses(rate)
+    shaper = designs.input_shaper(load_model(model), kind, modes=modes, coupling=coupling)
+    taps = shaper.impulses(rate)
     if out is not None:
         rows = np.column_stack([np.arange(taps.size) / rate, taps])
         _write_table(rows, ("time_s", "share"), out, force=force)
     if as_json:
-        show_json(made.to_dict() | {"rate": rate, "samples": taps})
+        show_json(shaper.to_dict() | {"rate": rate, "samples": taps})
         return
-    print_text(str(made))
+    print_text(str(shaper))
     say_written(out)
 
 
@@ -283,7 +283,7 @@ def design_input(
     loaded = load_model(model)
     run = None if reference_run is None else reading.runs([reference_run], loaded.structure)[0]
     with Progress("designing", quiet=as_json) as progress:
-        found = experiment.design_input(
+        result = experiment.design_input(
             loaded,
             reference_run=run,
             duration=duration,
@@ -299,19 +299,19 @@ def design_input(
             progress=progress,
         )
     if out is not None:
-        found.save(out, force=force)
+        result.save(out, force=force)
     if plot is not None:
-        write_figure(design_plots.design(found), plot, force=force)
-    show(found, as_json=as_json)
+        write_figure(design_plots.design(result), plot, force=force)
+    show(result, as_json=as_json)
     if not as_json:
         say_written(out, plot)
 
 
-def _sizes(option: str, given: list[str] | None) -> float | dict[str, float] | None:
+def _sizes(option: str, texts: list[str] | None) -> float | dict[str, float] | None:
     """Return one number for all inputs, or numbers by name."""
-    if given and len(given) == 1 and "=" not in given[0]:
+    if texts and len(texts) == 1 and "=" not in texts[0]:
         try:
-            return float(given[0])
+            return float(texts[0])
         except ValueError:
-            raise ModelError(f"{option} {given[0]!r} is neither a number nor INPUT=NUMBER") from None
-    return numbers(option, given) or None
+            raise ModelError(f"{option} {texts[0]!r} is neither a number nor INPUT=NUMBER") from None
+    return numbers(option, texts) or None

@@ -75,9 +75,9 @@ def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure
         return parsed[0]
     if len(texts) > 1:
         raise ModelError("--structure auto cannot be combined with another structure; leave one of them out")
-    given = replace(shape, delay=None, only=None).given_options()
-    if given:
-        raise ModelError(f"{', '.join(given)}: options of a given structure, not used with --structure auto")
+    options = replace(shape, delay=None, only=None).given_options()
+    if options:
+        raise ModelError(f"{', '.join(options)}: options of a given structure, not used with --structure auto")
     return None
 
 
@@ -97,13 +97,13 @@ def select_structure(
     drivers = {name: text.split(",") for name, text in pairs("--driven-by", driven_by).items()}
     if automatic and shape.only is not None:
         runs = [run.select([shape.only, *run.inputs]) for run in runs]
-    tried = [candidates] if isinstance(candidates, Structure) else candidates
-    grown = (
+    structure_list = [candidates] if isinstance(candidates, Structure) else candidates
+    largest = (
         [IntegerOrderForm(4, 3).structure(problem) for problem in automatic_problems(runs, driven_by=drivers)]
-        if isinstance(tried, str)
-        else tried
+        if isinstance(structure_list, str)
+        else structure_list
     )
-    seconds = sum(fit_seconds(runs, one, threads) for one in grown)
+    seconds = sum(fit_seconds(runs, one, threads) for one in largest)
     with Progress("fitting candidates", quiet=quiet) as progress:
         progress.expect("choosing", *duration_bounds(seconds, LIST_TIME_FACTORS if listed else STEPWISE_TIME_FACTORS))
         return choice.select(
@@ -183,25 +183,25 @@ def identify(
     equation = check_structures([structure], shape)
     if driven_by and structure != "auto":
         raise ModelError("--driven-by is used with --structure auto; give the terms to the equation instead")
-    given = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
-    given |= {} if grid.grid() is None else {"order_grid": grid.grid()}
-    given |= {} if fit.start is None else {"start": load_model(fit.start)}
-    given |= {} if fit.bounds is None else {"bounds": ranges("--bounds", fit.bounds)}
-    chosen = method_with_options(method, given)
+    options = given_fields(replace(grid, increment=None), ranking, weighting, fit, genetic)
+    options |= {} if grid.grid() is None else {"order_grid": grid.grid()}
+    options |= {} if fit.start is None else {"start": load_model(fit.start)}
+    options |= {} if fit.bounds is None else {"bounds": ranges("--bounds", fit.bounds)}
+    estimator = method_with_options(method, options)
     runs = reading.runs(files, equation)
     others = validation_runs(reading, validation, validation_window, equation)
     selection = None
     if structure == "auto":
         selection = select_structure(runs, "auto", shape, driven_by=driven_by, threads=threads, quiet=as_json)
-    wanted = shape.structure_for_runs(structure, runs) if selection is None else selection.structure
+    target = shape.structure_for_runs(structure, runs) if selection is None else selection.structure
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(ranking.store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
-            progress.expect("the fit", *duration_bounds(fit_seconds(runs, wanted, threads)))
-        if selection is not None and chosen == OutputError() and m is None:
+            progress.expect("the fit", *duration_bounds(fit_seconds(runs, target, threads)))
+        if selection is not None and estimator == OutputError() and m is None:
             result = selection.best
         else:
-            result = estimation.identify(runs, wanted, method=chosen, m=m, threads=threads, progress=progress)
+            result = estimation.identify(runs, target, method=estimator, m=m, threads=threads, progress=progress)
     if out is not None:
         result.model.save(out, force=force)
     if report is not None:
@@ -209,10 +209,10 @@ def identify(
         result.report(report, validation=others or None, force=force)
     checked = result.validate(others) if others else None
     if as_json:
-        judged = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
+        verdict_entry = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
         chosen_from = {} if selection is None else {"selection": selection.ranking_dict()}
-        found = {**judged, **result.to_dict(), **chosen_from}
-        show_json({**found, "validation": None if checked is None else checked.to_dict()})
+        content = {**verdict_entry, **result.to_dict(), **chosen_from}
+        show_json({**content, "validation": None if checked is None else checked.to_dict()})
         return
     if selection is not None:
         print_text("\n".join([selection.reason, *(f"! {w}" for w in selection.warnings), ""]))
@@ -251,12 +251,12 @@ def search(
         Estimation method of the coefficients.
     """
     runs = reading.runs(files, shape.structure(structure))
-    wanted = shape.structure_for_runs(structure, runs)
-    parts = wanted.independent_groups() or {e.output: wanted.equation(e.output) for e in wanted.equations}
+    target = shape.structure_for_runs(structure, runs)
+    parts = target.independent_groups() or {e.output: target.equation(e.output) for e in target.equations}
     every = grid.grid() or OrderGrid()
-    check_order_names(every, wanted)
-    given = given_fields(replace(ranking, store=None), weighting)
-    settings = SearchSettings(coefficients=coefficients, **given)
+    check_order_names(every, target)
+    options = given_fields(replace(ranking, store=None), weighting)
+    settings = SearchSettings(coefficients=coefficients, **options)
     results = {}
     with resumable(ranking.store), contextlib.ExitStack() as stack:
         jobs = {
@@ -270,15 +270,15 @@ def search(
             )
             for name, part in parts.items()
         }
-        kept = None
+        open_store = None
         if ranking.store is not None:
-            kept = stack.enter_context(Store(ranking.store, [job.request(name) for name, job in jobs.items()]))
-            show_notes(kept)
-        announce_time(Progress("", quiet=as_json), list(jobs.values()), kept)
+            open_store = stack.enter_context(Store(ranking.store, [job.request(name) for name, job in jobs.items()]))
+            show_notes(open_store)
+        announce_time(Progress("", quiet=as_json), list(jobs.values()), open_store)
         for number, (name, job) in enumerate(jobs.items()):
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
-                found = run_job(replace(job, progress=progress), store=kept, number=number)
-            results[name] = with_verdict(found, runs, parts[name], settings, restrict_grid(every, parts[name]), m=m)
+                result = run_job(replace(job, progress=progress), store=open_store, number=number)
+            results[name] = with_verdict(result, runs, parts[name], settings, restrict_grid(every, parts[name]), m=m)
     show_by_output(results, as_json=as_json)
 
 
@@ -314,12 +314,12 @@ def certify(
         Maximum number of boxes of orders.
     """
     runs = reading.runs(files, shape.structure(structure))
-    wanted = shape.structure_for_runs(structure, runs)
+    target = shape.structure_for_runs(structure, runs)
     every = grid.grid() or OrderGrid()
-    check_order_names(every, wanted)
+    check_order_names(every, target)
     results = {}
-    for item in wanted.equations:
-        part = wanted.equation(item.output)
+    for item in target.equations:
+        part = target.equation(item.output)
         with Progress(f"certifying orders of {item.output}", quiet=as_json) as progress:
             results[item.output] = certify_orders(
                 runs,
@@ -391,14 +391,16 @@ def resume(
         Continue a corrupt file; the corrupt one is kept beside it.
     """
     results = {}
-    with resumable(store), Store(store, recover=recover) as kept:
-        show_notes(kept)
-        told = Progress("", quiet=as_json)
-        if not told.quiet:
-            announce_time(told, [job_of(kept, n, threads) for n in range(len(kept.contents.requests))], kept)
-        for number, request in enumerate(kept.contents.requests):
+    with resumable(store), Store(store, recover=recover) as open_store:
+        show_notes(open_store)
+        listener = Progress("", quiet=as_json)
+        if not listener.quiet:
+            announce_time(
+                listener, [job_of(open_store, n, threads) for n in range(len(open_store.contents.requests))], open_store
+            )
+        for number, request in enumerate(open_store.contents.requests):
             with Progress(f"searching orders of {request.name}", quiet=as_json) as progress:
-                results[request.name] = resume_job(kept, number, threads=threads, progress=progress)
+                results[request.name] = resume_job(open_store, number, threads=threads, progress=progress)
     show_by_output(results, as_json=as_json)
 
 
@@ -534,8 +536,8 @@ def identify_frequency(
     if report is not None:
         result.report(report, validation=checked, force=force)
     if as_json:
-        judged = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
-        show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
+        judgement = {"verdict": (result.verdict if checked is None else checked.verdict).to_dict()}
+        show_json({**judgement, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
     print_text(result.summary(checked))
     if verbose:
@@ -578,14 +580,14 @@ def select(
     """
     equation = check_structures(structures, shape)
     runs = reading.runs(files, equation)
-    made = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
-    candidates = "auto" if not made else made[0] if len(made) == 1 else made
+    targets = [shape.structure_for_runs(text, runs) for text in structures if text != "auto"]
+    candidates = "auto" if not targets else targets[0] if len(targets) == 1 else targets
     of_its_own = validation if validation not in ("runs", "blocks") else None
     if of_its_own is not None and not Path(of_its_own).exists():
         raise ModelError(f"--validation {of_its_own!r} is neither runs nor blocks nor a file; check the path")
     judges = validation_runs(reading, of_its_own, validation_window, equation) or validation
     with resumable(store, "the same command"):
-        found = select_structure(
+        selection = select_structure(
             runs,
             candidates,
             shape,
@@ -596,10 +598,10 @@ def select(
             quiet=as_json,
         )
     if out is not None:
-        found.best.model.save(out, force=force)
+        selection.best.model.save(out, force=force)
     if report is not None:
-        found.report(report, force=force)
-    show(found, as_json=as_json)
+        selection.report(report, force=force)
+    show(selection, as_json=as_json)
 
 
 @command
@@ -624,14 +626,14 @@ def consistency(
         Segments of one run; several runs are segments; default 2.
     """
     runs = reading.runs(files, shape.structure(structure))
-    wanted = shape.structure_for_runs(structure, runs)
+    target = shape.structure_for_runs(structure, runs)
     method = OutputError() if loss is None else OutputError(loss=loss)
     with Progress("fitting segments", quiet=as_json) as progress:
         count = max(segments or 0, 2) if len(runs) == 1 else len(runs)
-        progress.expect("fitting all segments", *duration_bounds(fit_seconds(runs, wanted, threads, count)))
-        found = parts_of_runs.consistency(
-            runs, wanted, segments=segments, method=method, threads=threads, progress=progress
+        progress.expect("fitting all segments", *duration_bounds(fit_seconds(runs, target, threads, count)))
+        result = parts_of_runs.consistency(
+            runs, target, segments=segments, method=method, threads=threads, progress=progress
         )
     if report is not None:
-        found.report(report, force=force)
-    show(found, as_json=as_json)
+        result.report(report, force=force)
+    show(result, as_json=as_json)

@@ -28,10 +28,10 @@ from ftlm.utils.parameters import use_interface
 from ftlm.utils.resources import duration_bounds, estimate_duration
 
 
-def pairs(option: str, given: list[str] | None) -> dict[str, str]:
+def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
     """Parse NAME=VALUE options; a bare NAME stands for NAME=NAME."""
     values: dict[str, str] = {}
-    for item in given or []:
+    for item in texts or []:
         name, equals, value = item.partition("=")
         value = value if equals else name
         if not equals and name and not re.fullmatch(r"[^\W\d][\w.\[\]]*", name):
@@ -47,10 +47,10 @@ def pairs(option: str, given: list[str] | None) -> dict[str, str]:
     return values
 
 
-def numbers(option: str, given: list[str] | None) -> dict[str, float]:
+def numbers(option: str, texts: list[str] | None) -> dict[str, float]:
     """Parse NAME=NUMBER options."""
     values = {}
-    for name, value in pairs(option, given).items():
+    for name, value in pairs(option, texts).items():
         try:
             values[name] = float(value)
         except ValueError:
@@ -58,11 +58,11 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
     return values
 
 
-def ranges(option: str, given: list[str] | None) -> dict[str, float | tuple[float, float]]:
+def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[float, float]]:
     """Parse INPUT=NUMBER options, or INPUT=LOW:HIGH for a number to estimate."""
     what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
-    for name, value in pairs(option, given).items():
+    for name, value in pairs(option, texts).items():
         ends = split_numbers(value)
         if len(ends) not in (1, 2):
             raise ModelError(f"{option} {name}={value}: {value!r} is neither {what} nor LOW:HIGH, as in {example}")
@@ -128,10 +128,10 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse options; raise for an alias with the option that is meant."""
-        known = {name for parameter in self.params for name in parameter.opts}
-        for given in (a.partition("=")[0] for a in args):
-            if given not in known and OPTION_ALIASES.get(given) in known:
-                ctx.fail(f"No such option: {given}; {OPTION_ALIASES[given]} takes equations in words, too.")
+        names = {name for parameter in self.params for name in parameter.opts}
+        for option_name in (a.partition("=")[0] for a in args):
+            if option_name not in names and OPTION_ALIASES.get(option_name) in names:
+                ctx.fail(f"No such option: {option_name}; {OPTION_ALIASES[option_name]} takes equations in words, too.")
         ctx.meta["method"] = self._chosen_method(args)
         if HELP_ALL_FLAG in args:
             ctx.meta["method"] = None
@@ -143,12 +143,12 @@ class Command(TyperCommand):
         option: Any = next((p for p in self.params if not set(METHOD_FLAGS).isdisjoint(p.opts)), None)
         if option is None:
             return None
-        chosen = option.default
+        choice = option.default
         for word, following in zip(args, [*args, ""][1:], strict=True):
             flag, equals, value = word.partition("=")
             if flag in option.opts:
-                chosen = value if equals else following
-        return str(chosen)
+                choice = value if equals else following
+        return str(choice)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options by panel; of the options of methods those of the chosen one."""
@@ -157,23 +157,23 @@ class Command(TyperCommand):
             "Arguments": [],
             **{name: [] for name in (*OPTION_PANELS, OTHER_PANEL)},
         }
-        hidden = False
+        is_method_section = False
         for parameter in self.get_params(ctx):
-            told: Any = parameter
-            record = told.get_help_record(ctx)
-            methods = self.methods_by_field.get(told.name)
+            shown_parameter: Any = parameter
+            record = shown_parameter.get_help_record(ctx)
+            methods = self.methods_by_field.get(shown_parameter.name)
             if methods is not None and method is not None and method not in methods:
-                hidden = True
-            elif record is not None and told.param_type_name == "argument":
+                is_method_section = True
+            elif record is not None and shown_parameter.param_type_name == "argument":
                 # Versions of typer write different types behind the name.
-                panels["Arguments"].append((told.metavar, record[1]))
+                panels["Arguments"].append((shown_parameter.metavar, record[1]))
             elif record is not None:
-                panels[getattr(told, "rich_help_panel", None) or OTHER_PANEL].append(record)
+                panels[getattr(shown_parameter, "rich_help_panel", None) or OTHER_PANEL].append(record)
         if self.methods_by_field and self._chosen_method([]) is not None:
             panels[OTHER_PANEL].append((HELP_ALL_FLAG, "Show the options of all methods and exit."))
         for name, records in panels.items():
             if records:
-                with formatter.section(f"{name} of {method}" if name == "Method" and hidden else name):
+                with formatter.section(f"{name} of {method}" if name == "Method" and is_method_section else name):
                     formatter.write_dl(records)
 
 
@@ -269,16 +269,18 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     outputs = [option.name for option in options if option.annotation.__metadata__[0].is_output]
 
     @functools.wraps(work)
-    def run(**given: Any) -> None:
+    def run(**arguments: Any) -> None:
         with use_interface("command line"):
-            execute(**given)
+            execute(**arguments)
 
-    def execute(**given: Any) -> None:
-        made = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in records.items()}
+    def execute(**arguments: Any) -> None:
+        option_records = {
+            name: kind(**{f.name: arguments.pop(f.name) for f in fields(kind)}) for name, kind in records.items()
+        }
         try:
             if outputs:
-                check_free(*(given[name] for name in outputs), force=given["force"], words=COMMAND_MESSAGES)
-            work(**given, **made)
+                check_free(*(arguments[name] for name in outputs), force=arguments["force"], words=COMMAND_MESSAGES)
+            work(**arguments, **option_records)
             sys.stdout.flush()
         except KeyboardInterrupt:
             print("ftlm: interrupted; nothing was written", file=sys.stderr)
@@ -362,7 +364,7 @@ def print_text(text: str, end: str = "\n") -> None:
     Table rows and commands to copy are not wrapped.
     """
     if sys.stdout.isatty():
-        text = "\n".join(broken for line in text.split("\n") for broken in broken_line(line))
+        text = "\n".join(piece for line in text.split("\n") for piece in broken_line(line))
     print(text, end=end)
 
 

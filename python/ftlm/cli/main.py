@@ -57,9 +57,9 @@ class CommandTable(UserDict[str, Any]):
         function = getattr(commands, name.replace("-", "_"), None) or getattr(commands, f"{name}_")
         own = typer.Typer(rich_markup_mode=None, add_completion=False, context_settings=CONTEXT_SETTINGS)
         own.command(name, cls=Command, short_help=short)(function)
-        found = typer.main.get_command(own)
-        assert isinstance(found, TyperCommand)
-        return found
+        subcommand = typer.main.get_command(own)
+        assert isinstance(subcommand, TyperCommand)
+        return subcommand
 
 
 class Program(TyperGroup):

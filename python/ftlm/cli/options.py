@@ -262,10 +262,10 @@ class OrderGridOptions(MethodOptions):
         """Order grid of the search; None without options."""
         if self.increment is None and not self.order_grid:
             return None
-        named: dict[str, Any] = dict(pairs("--order-grid", self.order_grid))
-        alpha = named.pop("alpha", None)
-        made = order_grid(**named) if self.increment is None else order_grid(increment=self.increment, **named)
-        return made if alpha is None else replace(made, orders={**made.orders, "alpha": alpha})
+        axes: dict[str, Any] = dict(pairs("--order-grid", self.order_grid))
+        alpha = axes.pop("alpha", None)
+        grid = order_grid(**axes) if self.increment is None else order_grid(increment=self.increment, **axes)
+        return grid if alpha is None else replace(grid, orders={**grid.orders, "alpha": alpha})
 
 
 @dataclass(frozen=True)

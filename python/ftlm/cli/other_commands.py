@@ -116,11 +116,11 @@ def reproduce(
         check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
         raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
-    measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
+    measurements = reading.runs([f for f in (square, sine) if f is not None], apart=True)
     rival = given_fields(genetic)
     with Progress("", quiet=as_json) as progress:
         result = reproduction.reproduce(
-            *measured,
+            *measurements,
             increment=increment,
             noise=noise,
             seed=seed,
@@ -160,13 +160,13 @@ def orders(
     """
     runs = reading.runs(files, apart=True)
     with Progress("", quiet=as_json) as progress:
-        found = cross_validate_orders(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
+        result = cross_validate_orders(runs, filtered=filtered, threads=threads, log=progress.say, progress=progress)
         progress.say("writing the page")
-        page = cross_validation_page(found, out, force=force)
+        page = cross_validation_page(result, out, force=force)
     if as_json:
-        show_json({**found.to_dict(), "files": [str(page)]})
+        show_json({**result.to_dict(), "files": [str(page)]})
     else:
-        print_text(f"{cross_validation_text(found)}\n\nwritten: {page}")
+        print_text(f"{cross_validation_text(result)}\n\nwritten: {page}")
 
 
 @command

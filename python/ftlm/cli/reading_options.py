@@ -22,8 +22,8 @@ from ftlm.structure.structure import Structure
 
 def layout_options(record: object) -> dict[str, Any]:
     """Layout options that a dataclass has and the user has set."""
-    said = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
-    return {name: value for name, value in said.items() if value is not None}
+    options = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
+    return {name: value for name, value in options.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,8 @@ class ReadingOptions:
                 print(f"ftlm: {len(files)} .mat files read as one run", file=sys.stderr)
                 return [run]
         # Columns that are named by their group choose one run.
-        named = any("/" in text for text in (*(self.inputs or ()), *(self.outputs or ()), self.time or ""))
-        paths = files if named else [path for file in files for path in run_paths(file)]
+        has_paths = any("/" in text for text in (*(self.inputs or ()), *(self.outputs or ()), self.time or ""))
+        paths = files if has_paths else [path for file in files for path in run_paths(file)]
         return [self._load(path, signals) for path in paths]
 
     def _load(self, path: str | list[str], signals: Signals | None) -> Run:
@@ -119,7 +119,7 @@ class ReadingOptions:
 
     def _selection(self) -> tuple[ColumnSelection, LoadOptions]:
         """Columns, layout and further arguments of :func:`ftlm.load`."""
-        wanted = select_columns(
+        selection = select_columns(
             self.columns,
             self.time,
             self.step,
@@ -130,7 +130,7 @@ class ReadingOptions:
             layout_options(self),
         )
         window = None if self.window is None else interval(self.window, "--window", "1.1:19.5")
-        return wanted, LoadOptions(window, self.resample, None, self.time_unit, self.missing)
+        return selection, LoadOptions(window, self.resample, None, self.time_unit, self.missing)
 
     def preview_file(self, file: str) -> OpenedFile:
         """Preview a file that is not loaded as a run."""

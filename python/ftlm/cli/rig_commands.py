@@ -128,10 +128,10 @@ class LiveOptions:
     @property
     def settings(self) -> SearchSettings:
         """Settings of the estimate after the last sample."""
-        given = {
+        options = {
             n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance") and v is not None
         }
-        return SearchSettings(row_basis="time", **given)
+        return SearchSettings(row_basis="time", **options)
 
     def findings(self, run: Run, stream: Streaming) -> list[Finding]:
         """Return the findings on the estimate of a stream after a recorded run."""
@@ -260,8 +260,8 @@ def record(
         for finding in live.findings(run, stream):
             print(f"! {finding}", file=sys.stderr)
     if as_json:
-        told = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}
-        print(json.dumps(told, indent=1, ensure_ascii=False))
+        summary = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}
+        print(json.dumps(summary, indent=1, ensure_ascii=False))
     else:
         print(f"{run}\nwritten to {out}")
     missed = run.metadata["missed_deadlines"]
@@ -273,10 +273,10 @@ def live_reporter(stream: Streaming | None, rate: float, progress: Progress) -> 
     """Return a callback that updates the bar and prints the live estimate once per second of the run."""
     due = 1.0
 
-    def report_progress(done: int, total: int) -> None:
+    def report_progress(count: int, total: int) -> None:
         nonlocal due
-        progress(done, total)
-        seconds = done / rate
+        progress(count, total)
+        seconds = count / rate
         if stream is not None and seconds >= due:
             print(f"{seconds:7.2f} s: {stream}", file=sys.stderr, flush=True)
             due = math.floor(seconds) + 1.0

@@ -33,15 +33,15 @@ def same_rate(first: float, second: float) -> bool:
     return abs(first - second) <= 1e-9 * second
 
 
-def select_outputs(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
+def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Return the given outputs, or all without a list."""
-    if given is None:
+    if choice is None:
         return outputs
-    names = [] if isinstance(given, str) or not isinstance(given, Sequence) else [*given[: len(outputs) + 1]]
+    names = [] if isinstance(choice, str) or not isinstance(choice, Sequence) else [*choice[: len(outputs) + 1]]
     absent = [n for n in names if not (isinstance(n, str) and n in outputs)]
     if not names or (not absent and len(set(names)) < len(names)):
         raise ModelError(
-            f"{what} = {short_repr(given)} is not a list of outputs, each once; the input reaches {', '.join(outputs)}"
+            f"{what} = {short_repr(choice)} is not a list of outputs, each once; the input reaches {', '.join(outputs)}"
         )
     if absent:
         near = nearest(absent[0], outputs) if isinstance(absent[0], str) else ""

@@ -92,12 +92,12 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
         a, b, c, correction, feedback = (
             np.array(m, dtype=np.float64) for m in (self.a, self.b, self.c, self.correction, self.feedback)
         )
-        size, seen = len(self.a), len(self.measured)
+        size, count = len(self.a), len(self.measured)
         shapes = {
             "a": (a, (size, size)),
             "b": (b, (size, 1)),
             "c": (c, (len(self.outputs), size)),
-            "correction": (correction, (size + 1, seen)),
+            "correction": (correction, (size + 1, count)),
             "feedback": (feedback, (1, size)),
         }
         for name, (matrix, shape) in shapes.items():
@@ -112,7 +112,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
         absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
         if absent:
             raise ModelError(f"{absent[0]} is not one of its outputs")
-        if not (self.rate > 0 and len(self.noise) == seen):
+        if not (self.rate > 0 and len(self.noise) == count):
             raise ModelError("its rate is not above 0, or not every measured output has its noise")
         lists = (self.gain_error_db, self.phase_error_degrees, self.deviations)
         if any(len(one) != len(self.outputs) for one in lists):
@@ -175,14 +175,14 @@ def save_controller(
         The file exists and ``force`` is not set, or it cannot be written.
     """
     if isinstance(controller, DiscretePid):
-        written: PidFile | LqgFile = _pid(controller)
+        record: PidFile | LqgFile = _pid(controller)
     elif isinstance(controller, Lqg):
-        written = _lqg(controller)
+        record = _lqg(controller)
     else:
         raise ModelError(f"controller is a {type(controller).__name__}; give a DiscretePid or an Lqg")
-    kind = "pid" if isinstance(written, PidFile) else "lqg"
+    kind = "pid" if isinstance(record, PidFile) else "lqg"
     file = ControllerFile(
-        "ftlm-controller", CONTROLLER_SCHEMA, f"ftlm {__version__}", str(model), ALGORITHM_TEXTS[kind], written
+        "ftlm-controller", CONTROLLER_SCHEMA, f"ftlm {__version__}", str(model), ALGORITHM_TEXTS[kind], record
     )
     write_atomically(path, msgspec.json.format(msgspec.json.encode(file), indent=1) + b"\n", force=force)
 
@@ -222,27 +222,27 @@ def _pid(controller: DiscretePid) -> PidFile:
 
 def _lqg(controller: Lqg) -> LqgFile:
     observer = controller.observer
-    made = observer.realisation
+    realisation = observer.realisation
     return LqgFile(
-        made.rate,
+        realisation.rate,
         _limit(controller.limit),
-        made.input,
-        list(made.outputs),
+        realisation.input,
+        list(realisation.outputs),
         list(observer.measured),
         controller.tracked,
-        made.a.tolist(),
-        made.b.tolist(),
-        made.c.tolist(),
+        realisation.a.tolist(),
+        realisation.b.tolist(),
+        realisation.c.tolist(),
         observer.gain.tolist(),
         controller.feedback.tolist(),
         controller.ahead,
-        [(p.real, p.imag) for p in made.poles],
-        made.band,
-        [made.gain_error[o] for o in made.outputs],
-        [made.phase_error[o] for o in made.outputs],
+        [(p.real, p.imag) for p in realisation.poles],
+        realisation.band,
+        [realisation.gain_error[o] for o in realisation.outputs],
+        [realisation.phase_error[o] for o in realisation.outputs],
         list(observer.noise),
         observer.process_noise,
-        [observer.deviations[o] for o in made.outputs],
+        [observer.deviations[o] for o in realisation.outputs],
     )
 
 

@@ -146,9 +146,11 @@ class DiscretePid:
     ) -> None:
         if not isinstance(pid, FractionalPid):
             raise ModelError(f"pid is a {type(pid).__name__}, no FractionalPid; tune one, or write its five numbers")
-        for name, given in (("lam", pid.lam), ("mu", pid.mu)):
-            if given > 1:
-                raise ModelError(f"{name} = {given:g} cannot be realised; give a controller whose orders are at most 1")
+        for name, order_value in (("lam", pid.lam), ("mu", pid.mu)):
+            if order_value > 1:
+                raise ModelError(
+                    f"{name} = {order_value:g} cannot be realised; give a controller whose orders are at most 1"
+                )
         value = checked_rate(rate)
         most = check_limit(limit)
         half = math.pi * value
@@ -285,9 +287,9 @@ def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: f
     safe = np.where(small, 1.0, x)
     mean = np.where(small, 1.0 - x / 2.0, -np.expm1(-safe) / safe)
     now = step * np.where(small, 0.5, (1.0 - mean) / safe)
-    before = step * np.where(small, 0.5, (mean - keeps) / safe)
+    coefficients_before = step * np.where(small, 0.5, (mean - keeps) / safe)
     with np.errstate(over="ignore"):
-        return _Bank(factor * direct, factor * residues, keeps, now, before)
+        return _Bank(factor * direct, factor * residues, keeps, now, coefficients_before)
 
 
 #: Range of the orders of integral and derivative, and values per order and round.
@@ -428,23 +430,23 @@ def fractional_pid(
             f"{setting('crossover')} {short_repr(crossover)} rad/s is outside [{MIN_CROSSOVER_SHARE * plant.rate:.4g}, "
             f"{math.pi * plant.rate / 4:.4g}), from a millionth to an eighth of the rate of {plant.rate:g} Hz"
         )
-    asked = real_number("phase_margin", phase_margin)
-    if not 10 <= asked <= 80:
+    margin = real_number("phase_margin", phase_margin)
+    if not 10 <= margin <= 80:
         raise ModelError(f"{setting('phase_margin')} {short_repr(phase_margin)} degrees is outside [10, 80]")
     count, start = check_samples(samples, seed)
     plant.check_stable()
-    drawn = plant.samples(count, start)
-    target = np.exp(1j * (math.radians(asked) - math.pi)) / plant.response(np.array([wc]))[0]
+    samples_drawn = plant.samples(count, start)
+    target = np.exp(1j * (math.radians(margin) - math.pi)) / plant.response(np.array([wc]))[0]
     near = np.array([wc * (1 - 1e-5), wc * (1 + 1e-5)])
     slope = float(np.diff(np.unwrap(np.angle(plant.response(near))))[0] / (near[1] - near[0]))
     w = np.geomspace(wc / 100, min(30 * wc, 0.999 * math.pi * plant.rate), COMPARISON_FREQUENCIES)
-    curves = np.array([one.response(w) for one in [plant, *drawn[:50]]])
+    curves = np.array([one.response(w) for one in [plant, *samples_drawn[:50]]])
     best = _best(target, slope, wc, w, curves)
     if best is None:
         raise ModelError(
             f"no fractional PID with gains from 0 and orders from {MIN_ORDER:g} to {MAX_ORDER:g} has a flat phase "
             "margin of "
-            f"{asked:g} degrees at {wc:g} rad/s on this model, whose phase there is "
+            f"{margin:g} degrees at {wc:g} rad/s on this model, whose phase there is "
             f"{np.degrees(np.angle(plant.response(np.array([wc]))[0])):.4g} degrees; move the crossover, or ask for "
             "another phase margin"
         )
@@ -456,9 +458,9 @@ def fractional_pid(
         """Whether the loop gain stays below 1 above the crossover."""
         return bool(np.all(np.abs(pid.response(fine[above]) * high) < 1.0))
 
-    chosen = best if is_last(best) else _best(target, slope, wc, w, curves, is_last)
-    acting = (chosen or best).response(fine)
-    lam = (chosen or best).lam if (chosen or best).ki > 0 else 0.0
+    choice = best if is_last(best) else _best(target, slope, wc, w, curves, is_last)
+    acting = (choice or best).response(fine)
+    lam = (choice or best).lam if (choice or best).ki > 0 else 0.0
 
     def loop_margins(one: Plant, factor: float = 1.0) -> Margins:
         order = one.integral_order() + lam
@@ -467,29 +469,29 @@ def fractional_pid(
     nominal = loop_margins(plant)
     if not nominal.stable:
         raise ModelError(
-            f"the loop with a phase margin of {asked:g} degrees at {wc:g} rad/s is not stable on this model: its gain "
+            f"the loop with a phase margin of {margin:g} degrees at {wc:g} rad/s is not stable on this model: its gain "
             "is 1 elsewhere too, at a resonance; move the crossover away from it"
         )
-    if chosen is None:
+    if choice is None:
         raise ModelError(
             f"the loop with a crossover of {wc:g} rad/s crosses a gain of 1 again on this model, last at "
             f"{nominal.crossover:.4g} rad/s, whatever the orders; move the crossover above the resonance, or further "
             "below it"
         )
-    margins = tuple(map(loop_margins, drawn))
-    broken = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_SHARE * asked)]
-    if len(broken) > MAX_BROKEN_SHARE * len(margins):
+    margins = tuple(map(loop_margins, samples_drawn))
+    failures = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_SHARE * margin)]
+    if len(failures) > MAX_BROKEN_SHARE * len(margins):
         raise ModelError(
-            f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
-            f"numbers the loop is not stable or has less than {MIN_PHASE_MARGIN_SHARE * asked:g} degrees of the "
+            f"the intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the model's "
+            f"numbers the loop is not stable or has less than {MIN_PHASE_MARGIN_SHARE * margin:g} degrees of the "
             "phase margin; "
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run, or lower the crossover"
         )
     flat = tuple(loop_margins(plant, factor).phase for factor in (GAIN_VARIATIONS[0], 1.0, GAIN_VARIATIONS[1]))
     others = [replace(plant, output=o) for o in model.outputs if o != plant.output]
-    moved = (plant, *(p for p in others if p.has_response()))
-    return PidDesign(chosen, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), moved)
+    plants = (plant, *(p for p in others if p.has_response()))
+    return PidDesign(choice, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), plants)
 
 
 def plant_of(
@@ -503,15 +505,15 @@ def plant_of(
     check_no_input_nonlinearity(model, "a loop's margin")
     inputs = response_inputs(model, coupled=is_coupled(coupling))
     names = []
-    for what, name, known in (("output", output, model.outputs), ("input", driver, inputs)):
-        if name is None and len(known) == 1:
-            names.append(known[0])
+    for what, name, choices in (("output", output, model.outputs), ("input", driver, inputs)):
+        if name is None and len(choices) == 1:
+            names.append(choices[0])
         elif name is None:
-            raise ModelError(f"the model has several {what}s; name one with {parameter(what)}: {', '.join(known)}")
-        elif not isinstance(name, str) or name not in known:
-            near = nearest(name, known) if isinstance(name, str) else ""
+            raise ModelError(f"the model has several {what}s; name one with {parameter(what)}: {', '.join(choices)}")
+        elif not isinstance(name, str) or name not in choices:
+            near = nearest(name, choices) if isinstance(name, str) else ""
             raise ModelError(
-                f"{what} = {short_repr(name)} is not one of the model's{near}; it has {', '.join(known) or 'none'}"
+                f"{what} = {short_repr(name)} is not one of the model's{near}; it has {', '.join(choices) or 'none'}"
             )
         else:
             names.append(name)
@@ -527,7 +529,7 @@ def _best(
     is_allowed: Callable[[FractionalPid], bool] = lambda _: True,
 ) -> FractionalPid | None:
     """Controller with the largest low-frequency gain among those that meet all conditions with low sensitivity."""
-    found: list[tuple[float, float, FractionalPid]] = []
+    candidates: list[tuple[float, float, FractionalPid]] = []
     centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
     for _ in range(REFINEMENT_ROUNDS):
         around = [np.clip(c + reach * np.linspace(-1, 1, ORDERS_PER_ROUND), MIN_ORDER, MAX_ORDER) for c in centre]
@@ -537,11 +539,11 @@ def _best(
                 if pid is None or not is_allowed(pid):
                     continue
                 worst = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * curves)))
-                found.append((worst, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid))
-        if not found:
+                candidates.append((worst, float(abs(pid.response(np.array([LOW_FREQUENCY_SHARE * wc]))[0])), pid))
+        if not candidates:
             return None
-        calm = max(TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE * min(worst for worst, _, _ in found))
-        best = max((f for f in found if f[0] <= calm), key=lambda f: f[1])[2]
+        calm = max(TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE * min(worst for worst, _, _ in candidates))
+        best = max((f for f in candidates if f[0] <= calm), key=lambda f: f[1])[2]
         centre, reach = (best.lam, best.mu), reach / ORDERS_PER_ROUND * 2
     return best
 

@@ -122,17 +122,17 @@ class Shaper:
         ModelError
             As :meth:`impulses`.
         """
-        given = as_array("reference", reference)
-        if given.dtype.kind not in "fiu" or given.ndim not in (1, 2) or given.size == 0:
+        values = as_array("reference", reference)
+        if values.dtype.kind not in "fiu" or values.ndim not in (1, 2) or values.size == 0:
             raise DataError("reference is not an array of numbers of shape (rows,) or (rows, columns)")
-        x = as_floats("reference", given).reshape(len(given), -1)
+        x = as_floats("reference", values).reshape(len(values), -1)
         bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if bad.size:
             raise DataError(f"reference is not finite at row {bad[0]} ({bad.size} such rows in all)")
         taps = self.impulses(rate)
         rest = x[0]
         shaped = np.column_stack([_convolve(column, taps) for column in (x - rest).T]) + rest
-        return np.asarray(shaped.reshape(given.shape), dtype=np.float64)
+        return np.asarray(shaped.reshape(values.shape), dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
         """Return impulses and modes for JSON."""
@@ -142,8 +142,8 @@ class Shaper:
     def __str__(self) -> str:
         steps = ", ".join(f"{a:.4g} at {t:.4g} s" for a, t in zip(self.amplitudes, self.times, strict=True))
         within = "" if self.worst is None else f"; within their intervals at most {100 * self.worst:.2g} % is left"
-        shown = ", ".join(map(str, self.modes))
-        return f"{self.kind.upper()} shaper of {shown}: {steps}{within}"
+        modes_text = ", ".join(map(str, self.modes))
+        return f"{self.kind.upper()} shaper of {modes_text}: {steps}{within}"
 
 
 @check_arguments
@@ -202,18 +202,18 @@ def input_shaper(
             f"the model has {len(swings)} oscillatory modes, and {short_repr(count)} are to be shaped; relaxing modes "
             "need no shaper"
         )
-    chosen = tuple(swings[:count])
+    modes_used = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)
-    for mode in chosen:
-        half, kept = _half(mode)
+    for mode in modes_used:
+        half, decay = _half(mode)
         for _ in range(SHAPER_REPETITIONS[kind]):
             times = np.concatenate([times, times + half])
-            amplitudes = np.concatenate([amplitudes, amplitudes * kept]) / (1.0 + kept)
+            amplitudes = np.concatenate([amplitudes, amplitudes * decay]) / (1.0 + decay)
     instants, place = np.unique(np.round(times, 15), return_inverse=True)
     summed = np.bincount(place, weights=amplitudes)
-    worst = _worst_residual(np.asarray(instants, dtype=np.float64), np.asarray(summed, dtype=np.float64), chosen)
+    worst = _worst_residual(np.asarray(instants, dtype=np.float64), np.asarray(summed, dtype=np.float64), modes_used)
     if worst is not None and not worst <= MAX_RESIDUAL_VIBRATION:
-        widest = max(chosen, key=lambda m: (m.frequency_error or 0.0) / m.frequency + (m.damping_error or 0.0))
+        widest = max(modes_used, key=lambda m: (m.frequency_error or 0.0) / m.frequency + (m.damping_error or 0.0))
         raise ModelError(
             f"the intervals are too wide to design on: within those of the mode at "
             f"{with_error(widest.frequency, widest.frequency_error)} rad/s, damping "
@@ -221,7 +221,7 @@ def input_shaper(
             f"vibration, more than {100 * MAX_RESIDUAL_VIBRATION:.0f} %; identify from a longer run, or from one "
             "that excites this mode" + (f", or use {parameter('kind', 'zvd')}" if kind == "zv" else "")
         )
-    return Shaper(kind, chosen, tuple(instants.tolist()), tuple(summed.tolist()), worst)
+    return Shaper(kind, modes_used, tuple(instants.tolist()), tuple(summed.tolist()), worst)
 
 
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
@@ -230,8 +230,8 @@ def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, 
     if not (np.all(np.abs(w) < POLE_RANGE_RAD_S[1]) and np.all(np.abs(z) <= 1.0)):
         raise DataError("frequency or damping is out of range; give rad/s, finite, and damping ratios from -1 to 1")
     pole = w * (-z + 1j * np.sqrt(np.maximum(1.0 - z * z, 0.0)))
-    left = np.sum(amplitudes * np.exp(pole[..., None] * (times[-1] - times)), axis=-1)
-    return np.asarray(np.abs(left), dtype=np.float64)
+    phasors = np.sum(amplitudes * np.exp(pole[..., None] * (times[-1] - times)), axis=-1)
+    return np.asarray(np.abs(phasors), dtype=np.float64)
 
 
 def _convolve(x: Floats, taps: Floats) -> Floats:
@@ -242,15 +242,15 @@ def _convolve(x: Floats, taps: Floats) -> Floats:
     return out
 
 
-def _mode_of(given: complex | np.number[Any]) -> Mode:
+def _mode_of(value: complex | np.number[Any]) -> Mode:
     try:
-        pole = complex(given)
+        pole = complex(value)
         size = abs(pole)
     except (TypeError, ValueError, OverflowError):
         pole, size = complex("nan"), math.nan
     low, high = POLE_RANGE_RAD_S
     if not (low <= abs(pole.imag) and size <= high):
-        raise ModelError(f"pole = {short_repr(given)} does not swing; give one such as -2 + 17j [rad/s]")
+        raise ModelError(f"pole = {short_repr(value)} does not swing; give one such as -2 + 17j [rad/s]")
     slow = abs(pole.real)
     return Mode(complex(pole.real, abs(pole.imag)), size, -pole.real / size, 1 / slow if slow else math.inf, True)
 
@@ -263,7 +263,7 @@ def _half(mode: Mode) -> tuple[float, float]:
 
 def _zv_samples(mode: Mode, step: float) -> Floats:
     """Discrete zero-vibration shaper of a mode: 1 + K e^(-s half) = 0 exactly at its pole."""
-    half, kept = _half(mode)
+    half, decay_ratio = _half(mode)
     whole = math.floor(half / step)
     rest = half - whole * step
     # a + b e^(-s step) = e^(-s rest) at the pole; both are positive below half the sampling rate.
@@ -272,20 +272,20 @@ def _zv_samples(mode: Mode, step: float) -> Floats:
     sooner = math.exp(-decay * rest) * math.sin(turn * (step - rest)) / math.sin(turn * step)
     taps = np.zeros(whole + 2)
     taps[0] = 1.0
-    taps[whole] += kept * sooner
-    taps[whole + 1] += kept * later
+    taps[whole] += decay_ratio * sooner
+    taps[whole + 1] += decay_ratio * later
     return np.asarray(taps / taps.sum())
 
 
-def _worst_residual(times: Floats, amplitudes: Floats, chosen: tuple[Mode, ...]) -> float | None:
+def _worst_residual(times: Floats, amplitudes: Floats, modes: tuple[Mode, ...]) -> float | None:
     """Largest residual vibration over the confidence intervals of frequency and damping."""
     worst: float | None = None
-    for mode in chosen:
+    for mode in modes:
         if mode.frequency_error is None or mode.damping_error is None:
             continue
         across = NORMAL_95 * np.linspace(-1.0, 1.0, INTERVAL_GRID_POINTS)
         w = np.maximum(mode.frequency + mode.frequency_error * across, 1e-6 * mode.frequency)
         z = np.clip(mode.damping + mode.damping_error * across, -0.99, 0.99)
-        left = residual_vibration(times, amplitudes, w[:, None], z)
-        worst = max(worst or 0.0, float(np.max(np.where(np.isfinite(left), left, np.inf))))
+        vibration = residual_vibration(times, amplitudes, w[:, None], z)
+        worst = max(worst or 0.0, float(np.max(np.where(np.isfinite(vibration), vibration, np.inf))))
     return worst

@@ -198,14 +198,14 @@ def inverse_dynamics(
 
     def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
         """Command and outputs of the closed loop per reference."""
-        held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
-        loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
+        responses = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
+        loop = np.sum([a * responses[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
         command = asks / (1.0 + loop)
-        return command, held * command
+        return command, responses * command
 
     command, outputs = closed_loop_response(design.plants[0].model)
-    held = np.concatenate([rows, np.full(size - len(rows), rows[-1])]) - rows[0]
-    spectrum = np.fft.rfft(held * weight)[inside]
+    extended = np.concatenate([rows, np.full(size - len(rows), rows[-1])]) - rows[0]
+    spectrum = np.fft.rfft(extended * weight)[inside]
     needed = spectrum / (row @ outputs)
 
     def inverse_transform(part: Complex) -> Floats:
@@ -221,25 +221,25 @@ def inverse_dynamics(
             f"the reference has to begin before the path does: at its first row it is {off:.3g} away from rest, more "
             f"than {MAX_INITIAL_OFFSET_SHARE:g} of the move; let the path rest longer before its move"
         )
-    asked = inverse_transform(needed * command)
+    effort = inverse_transform(needed * command)
     if not np.max(np.abs(reference - rows[0])) < MAX_REFERENCE_RATIO * move:
         raise ModelError(
             "the reference diverges: the output first moves the other way, more slowly than the path; give the path "
             "more time, or choose another output"
         )
-    if np.max(np.abs(asked)) > most:
-        at = int(np.argmax(np.abs(asked)))
+    if np.max(np.abs(effort)) > most:
+        at = int(np.argmax(np.abs(effort)))
         raise ModelError(
-            f"the path needs a command of {np.max(np.abs(asked)):.3g} at {at / design.rate:.4g} s, over the limit of "
+            f"the path needs a command of {np.max(np.abs(effort)):.3g} at {at / design.rate:.4g} s, over the limit of "
             f"{most:g}; give it more time, or a smaller move"
         )
     ends = int(np.flatnonzero(np.abs(rows - rows[-1]) > MAX_INITIAL_OFFSET_SHARE * move)[-1]) + 1
     plain = _residual_rms(inverse_transform(spectrum * (row @ outputs)) + rows[0], rows, ends)
-    left = [
+    errors = [
         _residual_rms(inverse_transform(needed * (row @ closed_loop_response(one.model)[1])) + rows[0], rows, ends)
         for one in design.plants[0].samples(count, start)
     ]
-    worst = float(np.quantile(left, 0.975)) if left else None
+    worst = float(np.quantile(errors, 0.975)) if errors else None
     if worst is not None and not worst <= MAX_RESIDUAL_SHARE * plain:
         raise ModelError(
             f"the intervals are too wide to design on: within them {worst:.2g} may be off the path after its end, and "
@@ -248,7 +248,7 @@ def inverse_dynamics(
             "from a longer or richer run (ftlm design-input lays it out)"
         )
     ways = {n: inverse_transform(needed * line) for n, line in zip(names, outputs, strict=True)}
-    return Trajectory(reference, rows, asked, ways, worst, plain)
+    return Trajectory(reference, rows, effort, ways, worst, plain)
 
 
 def _path(path: ArrayLike) -> Floats:
@@ -273,6 +273,6 @@ def _path(path: ArrayLike) -> Floats:
     return rows
 
 
-def _residual_rms(found: Floats, rows: Floats, ends: int) -> float:
+def _residual_rms(output: Floats, rows: Floats, ends: int) -> float:
     """RMS deviation from a path after its end."""
-    return float(np.sqrt(np.mean(np.square((found - rows)[min(ends, len(rows) - 1) :]))))
+    return float(np.sqrt(np.mean(np.square((output - rows)[min(ends, len(rows) - 1) :]))))

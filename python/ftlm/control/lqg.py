@@ -90,13 +90,13 @@ class Observer:
             )
         a, b, c = self.matrices
         y = np.array([run[n] for n in self.measured])
-        kept = np.eye(len(a)) - self.gain @ c
+        projection = np.eye(len(a)) - self.gain @ c
         start = np.append(self.rest(y[:, 0]), 0.0)
         # From one corrected state to the next: x' = kept (a x + b u) + gain y'.
         library = python_control()
         system = library.ss(
-            kept @ a,
-            np.column_stack([kept @ b, self.gain]),
+            projection @ a,
+            np.column_stack([projection @ b, self.gain]),
             np.eye(len(a)),
             np.zeros((len(a), 1 + len(self.measured))),
             1.0 / self.realisation.rate,
@@ -104,8 +104,8 @@ class Observer:
         time = np.arange(y.shape[1]) / self.realisation.rate
         inputs = np.vstack([run[self.realisation.input], np.column_stack([y[:, 1:], y[:, -1:]])])
         states = library.forced_response(system, time, inputs, start).states
-        shown = self.realisation.c @ states[:-1]
-        return dict(zip(self.realisation.outputs, shown, strict=True)) | {UNKNOWN_INPUT: states[-1]}
+        estimates = self.realisation.c @ states[:-1]
+        return dict(zip(self.realisation.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: states[-1]}
 
     @check_arguments
     def rest(self, measured: Floats) -> Floats:
@@ -118,8 +118,10 @@ class Observer:
         return states
 
     def __str__(self) -> str:
-        shown = ", ".join(f"{o} to {d:.3g}" for o, d in self.deviations.items())
-        return f"observer from {', '.join(self.measured)}: {self.realisation}; estimates {shown} (standard deviation)"
+        estimates = ", ".join(f"{o} to {d:.3g}" for o, d in self.deviations.items())
+        return (
+            f"observer from {', '.join(self.measured)}: {self.realisation}; estimates {estimates} (standard deviation)"
+        )
 
 
 def _measured_values(observer: Observer, measured: Sequence[float] | Floats) -> Floats:
@@ -211,32 +213,32 @@ def kalman_filter(
     with catch_numerical_errors(f"no observer from {', '.join(measured)}", "measure more, or narrow the band"):
         _, spread, _ = python_control().dlqe(a, np.eye(len(a)), c, inside, outside)
         gain = np.linalg.solve(c @ spread @ c.T + outside, c @ spread).T
-        left = spread - gain @ c @ spread
+        posterior = spread - gain @ c @ spread
         good = bool(np.isfinite(gain).all())
     if not good or np.max(np.abs(np.linalg.eigvals(a - a @ gain @ c))) >= 1.0:
         raise ModelError(
             f"no observer from {', '.join(measured)} is stable: not all states are observable; measure more outputs"
         )
-    variances = np.einsum("ij,jk,ik->i", realisation.c, left[:-1, :-1], realisation.c)
+    variances = np.einsum("ij,jk,ik->i", realisation.c, posterior[:-1, :-1], realisation.c)
     deviations = np.sqrt(np.maximum(variances, 0.0)).tolist()
     return Observer(
         realisation, measured, noise, process_noise, gain, dict(zip(realisation.outputs, deviations, strict=True))
     )
 
 
-def noise_deviations(model: Model, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
+def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str, float] | None) -> tuple[float, ...]:
     """Standard deviation of the noise of each measured output."""
-    if given is not None and not isinstance(given, Mapping):
-        raise ModelError(f"{setting('noise')} {short_repr(given)} is not a mapping from outputs to standard deviations")
-    for name in given or {}:
+    if noise is not None and not isinstance(noise, Mapping):
+        raise ModelError(f"{setting('noise')} {short_repr(noise)} is not a mapping from outputs to standard deviations")
+    for name in noise or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
             raise ModelError(f"noise of {short_repr(name)} is of nothing that is measured{near}")
     free = msgspec.UNSET if model.estimate is None else model.estimate.free
-    left = {} if free is msgspec.UNSET else dict(free.noise)
+    noise_of_fit = {} if free is msgspec.UNSET else dict(free.noise)
     out = []
     for name in measured:
-        value = (given or {}).get(name, left.get(name))
+        value = (noise or {}).get(name, noise_of_fit.get(name))
         if value is None:
             raise ModelError(
                 f"the noise of {name} is not known, since this model does not say what its fit left; give its standard "
@@ -303,8 +305,8 @@ class Lqg:
     def estimate(self) -> dict[str, float]:
         """Prediction of all outputs at the next sample, and estimate of the input disturbance."""
         states = np.zeros(len(self._a)) if self._states is None else self._states
-        shown = (self.observer.realisation.c @ states[:-1]).tolist()
-        return dict(zip(self.observer.realisation.outputs, shown, strict=True)) | {UNKNOWN_INPUT: float(states[-1])}
+        estimates = (self.observer.realisation.c @ states[:-1]).tolist()
+        return dict(zip(self.observer.realisation.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: float(states[-1])}
 
     def reset(self) -> None:
         """Reset all states."""
@@ -404,8 +406,8 @@ class LqgDesign(LoopDesign):
     @check_arguments
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return the measured outputs, and responses to each of them and to the reference at frequencies [rad/s]."""
-        heard, asked = self.controller.response(w)
-        return self.controller.observer.measured, -heard, asked
+        heard, reference_response = self.controller.response(w)
+        return self.controller.observer.measured, -heard, reference_response
 
     @check_arguments
     def with_limit(self, limit: float) -> Lqg:
@@ -414,17 +416,17 @@ class LqgDesign(LoopDesign):
 
     def to_dict(self) -> dict[str, Any]:
         """Return design and margins for JSON, without the matrices."""
-        made = self.realisation
+        realisation = self.realisation
         return {
             "design": "lqg",
             "rate": self.rate,
-            "input": made.input,
+            "input": realisation.input,
             "tracked": self.controller.tracked,
             "measured": list(self.controller.observer.measured),
-            "states": made.states,
-            "band": list(made.band),
-            "gain_error_db": made.gain_error,
-            "phase_error_degrees": made.phase_error,
+            "states": realisation.states,
+            "band": list(realisation.band),
+            "gain_error_db": realisation.gain_error,
+            "phase_error_degrees": realisation.phase_error,
             **self._margins(),
         }
 
@@ -503,7 +505,7 @@ def lqg(
     weights = _weights(max_deviation, names)
     tracked = _tracked_output(output, plants)
     realisation = fit_realization(plants, band, poles)
-    seen = kalman_filter(realisation, read, noise_deviations(model, read, noise), walks)
+    kalman = kalman_filter(realisation, read, noise_deviations(model, read, noise), walks)
     c = realisation.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
     no = "no state feedback brings the model to rest; allow for deviations of every output that integrates"
@@ -511,13 +513,13 @@ def lqg(
         gains, _, own = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
     if np.max(np.abs(own)) >= 1.0 - INTEGRATOR_TOLERANCE:
         raise ModelError(no)
-    controller = Lqg(seen, gains, tracked, limit=limit)
+    controller = Lqg(kalman, gains, tracked, limit=limit)
     w = np.geomspace(BAND_EXTENSION * realisation.band[0], 0.999 * math.pi * plants[0].rate, CURVE_POINTS)
     acting = -controller.response(w)[0]
     poles_of_it = controller.poles()
     at_one = np.abs(poles_of_it - 1.0) < INTEGRATOR_TOLERANCE
     integral, grows = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
-    heard = [plants[names.index(o)] for o in seen.measured]
+    heard = [plants[names.index(o)] for o in kalman.measured]
 
     def loop_margins(which: Model) -> Margins:
         parts = [replace(p, model=which) for p in heard]
@@ -532,10 +534,10 @@ def lqg(
             "margins; make max_input smaller, process_noise larger or the noise smaller, or allow for larger deviations"
         )
     margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
-    broken = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
-    if len(broken) > MAX_BROKEN_SHARE * len(margins):
+    failures = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
+    if len(failures) > MAX_BROKEN_SHARE * len(margins):
         raise ModelError(
-            f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
+            f"the intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run (ftlm design-input lays it out), or make max_input smaller"
@@ -575,7 +577,7 @@ def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
     matrix[:size, size:] = realisation.b
     matrix[size, :size] = realisation.c[realisation.outputs.index(tracked)]
     try:
-        found = np.linalg.solve(matrix, np.eye(size + 1)[-1])
+        equilibrium = np.linalg.solve(matrix, np.eye(size + 1)[-1])
     except np.linalg.LinAlgError:
         raise ModelError(f"{tracked} cannot be held at a value by {realisation.input}: its steady gain is 0") from None
-    return np.asarray(found, dtype=np.float64)
+    return np.asarray(equilibrium, dtype=np.float64)

@@ -132,12 +132,12 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     best: Realisation | None = None
     for count in counts:
         with catch_numerical_errors(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
-            found = _fit(
+            poles_and_residues = _fit(
                 np.asarray(1j * w, dtype=np.complex128), exact, integrates, _initial_poles(own, low, high, count)
             )
-            made = _discretize(library, plants, (low, high), *found)
-        if best is None or _scaled_error(made) < _scaled_error(best):
-            best = made
+            realisation = _discretize(library, plants, (low, high), *poles_and_residues)
+        if best is None or _scaled_error(realisation) < _scaled_error(best):
+            best = realisation
         if _scaled_error(best) <= 1.0:
             break
     assert best is not None
@@ -232,24 +232,27 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
         solved = _least(matrix / scale, vector) / scale
         a, b = _system(poles)
-        moved = np.linalg.eigvals(a - b @ solved[None, each * len(exact) :])
+        relocated = np.linalg.eigvals(a - b @ solved[None, each * len(exact) :])
         # A stable model has no poles on the right; where noise of the fit puts one, it is mirrored.
-        moved = -np.abs(moved.real) + 1j * moved.imag
-        before, poles = poles, np.array(sorted(moved[moved.imag >= 0], key=lambda p: (p.imag == 0, abs(p))))
-        if len(before) == len(poles) and np.max(np.abs(before - poles) / np.abs(poles)) < POLE_TOLERANCE:
+        relocated = -np.abs(relocated.real) + 1j * relocated.imag
+        poles_before, poles = (
+            poles,
+            np.array(sorted(relocated[relocated.imag >= 0], key=lambda p: (p.imag == 0, abs(p)))),
+        )
+        if len(poles_before) == len(poles) and np.max(np.abs(poles_before - poles) / np.abs(poles)) < POLE_TOLERANCE:
             break
     residues = _residues(s, exact, integrates, poles)
     # Of a model with fewer poles than were asked for the others do nothing, and no observer would find their states.
     # Nor those of a second integral beside the one that is there.
-    at, kept = 1, []
+    at, is_significant = 1, []
     slow = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(integrates) else 0.0
     for p in poles:
         wide = 1 if p.imag == 0 else 2
         part = residues[:, at : at + wide] @ _basis(s, np.array([p])).T
-        kept.append(bool(np.max(np.abs(part) * weight) > MIN_POLE_CONTRIBUTION and abs(p) > slow))
+        is_significant.append(bool(np.max(np.abs(part) * weight) > MIN_POLE_CONTRIBUTION and abs(p) > slow))
         at += wide
-    if not all(kept) and any(kept):
-        poles = poles[kept]
+    if not all(is_significant) and any(is_significant):
+        poles = poles[is_significant]
         residues = _residues(s, exact, integrates, poles)
     return poles, residues, any(integrates)
 
@@ -269,8 +272,8 @@ def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Com
         matrix = (np.column_stack([1.0 / s, basis]) if integrates[i] else basis) / np.abs(line)[:, None]
         scale = np.linalg.norm(matrix, axis=0)
         ones = line / np.abs(line)
-        found = _least(matrix / scale, ones) / scale
-        residues[i, -len(found) :] = found
+        solution = _least(matrix / scale, ones) / scale
+        residues[i, -len(solution) :] = solution
     return residues
 
 
@@ -289,7 +292,7 @@ def _discretize(
     system = library.sample_system(library.ss(a, b, c, np.zeros((len(c), 1))), 1.0 / rate, "zoh")
     # Scale the states, so that units have no influence on the weights of a design.
     size = np.maximum(np.sqrt(np.sum(c * c, axis=0)), 1e-300)
-    made = Realisation(
+    realisation = Realisation(
         tuple(p.output for p in plants),
         plants[0].input,
         rate,
@@ -302,14 +305,14 @@ def _discretize(
         {},
     )
     w = np.geomspace(*band, 2 * FIT_FREQUENCIES - 1)
-    quotient = made.response(w) / np.array([p.held_response(w) for p in plants])
-    for name, line in zip(made.outputs, quotient, strict=True):
-        made.gain_error[name] = float(np.max(np.abs(20.0 * np.log10(np.abs(line)))))
-        made.phase_error[name] = float(np.degrees(np.max(np.abs(np.angle(line)))))
-    return made
+    quotient = realisation.response(w) / np.array([p.held_response(w) for p in plants])
+    for name, line in zip(realisation.outputs, quotient, strict=True):
+        realisation.gain_error[name] = float(np.max(np.abs(20.0 * np.log10(np.abs(line)))))
+        realisation.phase_error[name] = float(np.degrees(np.max(np.abs(np.angle(line)))))
+    return realisation
 
 
-def _scaled_error(made: Realisation) -> float:
+def _scaled_error(realisation: Realisation) -> float:
     """Largest approximation error relative to its target."""
-    worst = max(max(made.gain_error.values()) / GAIN_DB, max(made.phase_error.values()) / PHASE_DEGREES)
+    worst = max(max(realisation.gain_error.values()) / GAIN_DB, max(realisation.phase_error.values()) / PHASE_DEGREES)
     return worst if math.isfinite(worst) else math.inf

@@ -81,10 +81,10 @@ class LoopDesign:
 
     def _margins(self) -> dict[str, Any]:
         """Nominal and sampled margins for JSON."""
-        told = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
-        for one in told:
+        margins = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
+        for one in margins:
             one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
-        return {"nominal": told[0], "samples": told[1:]}
+        return {"nominal": margins[0], "samples": margins[1:]}
 
     def _margin_lines(self) -> list[str]:
         """Margins as lines of text."""
@@ -165,8 +165,8 @@ class Plant:
 
     def count_unstable_poles(self) -> float:
         """Number of unstable poles; NaN with a pole on the imaginary axis."""
-        found = stability(self.model, coupling=self.coupling)
-        return math.nan if found.on_axis else found.unstable_poles
+        result = stability(self.model, coupling=self.coupling)
+        return math.nan if result.on_axis else result.unstable_poles
 
     def has_response(self) -> bool:
         """Whether the output depends on the input."""
@@ -191,9 +191,9 @@ class Plant:
         matrix = np.nan_to_num(matrix, nan=0.0, posinf=1e12, neginf=-1e12)
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         spread = vectors * np.sqrt(np.maximum(values, 0.0))
-        drawn = np.random.default_rng(seed).standard_normal((count, len(values))) @ spread.T
+        shifts = np.random.default_rng(seed).standard_normal((count, len(values))) @ spread.T
         centre = parameter_vector(self.model)
-        return [replace(self, model=with_parameter_vector(self.model, centre + d)) for d in drawn]
+        return [replace(self, model=with_parameter_vector(self.model, centre + d)) for d in shifts]
 
 
 def nyquist_frequencies(crossover: float, rate: float) -> Floats:

@@ -118,8 +118,8 @@ class RunArguments:
                     times, data = self._insert_missing_samples(times, data, missing, first)
                 step, jitter = regular_step(times, self.time_label, first, clock.resolution, self.known_step)
                 facts += jitter
-        data, said = self._fill_input_gaps(data, behaviour, missing)
-        facts += said
+        data, notes = self._fill_input_gaps(data, behaviour, missing)
+        facts += notes
         readings = None
         if new_step is not None:
             step, since = new_step, times - times[0]
@@ -150,15 +150,15 @@ class RunArguments:
         self, times: Floats, data: dict[str, Floats], missing: MissingPolicy, first: int
     ) -> tuple[Floats, dict[str, Floats]]:
         """Insert rows at the missing positions of a regular time grid, if all existing rows lie on one."""
-        found = grid_positions(times)
-        if found is None or found[0].size == found[0][-1] + 1:
+        grid = grid_positions(times)
+        if grid is None or grid[0].size == grid[0][-1] + 1:
             return times, data
-        places, step = found
-        lost = int(places[-1]) + 1 - places.size
+        places, step = grid
+        count = int(places[-1]) + 1 - places.size
         if self.inputs and missing != "hold":
             row = first + int(np.flatnonzero(np.diff(places) > 1)[0]) + 1
             raise DataError(
-                f"{self.time_label}: {lost} rows are missing of a regular grid of {step:.6g} s, the first before row "
+                f"{self.time_label}: {count} rows are missing of a regular grid of {step:.6g} s, the first before row "
                 f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or hold "
                 f"the inputs over them with {parameter('missing', 'hold')}"
             )
@@ -174,36 +174,38 @@ class RunArguments:
         self, data: dict[str, Floats], behaviour: Mapping[str, Intersample], missing: MissingPolicy
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
         """Fill missing input samples, and describe the missing samples of all signals."""
-        said, out = [], dict(data)
+        notes, out = [], dict(data)
         for name, values in data.items():
-            gone = missing_mask(values)
-            if not gone.any():
+            is_missing = missing_mask(values)
+            if not is_missing.any():
                 continue
             if name in self.outputs:
                 if has_too_few_values(values):
                     raise bad_rows(
                         self.label_of(name),
-                        f"{gone.size - int(gone.sum())} values, {MIN_RUN_SAMPLES} are needed",
+                        f"{is_missing.size - int(is_missing.sum())} values, {MIN_RUN_SAMPLES} are needed",
                         0,
-                        int(gone.sum()),
+                        int(is_missing.sum()),
                         "use a longer record",
                     )
-                said.append(
-                    describe_missing(f"output {name}", gone, "they weigh nothing in output-error fits and figures")
+                notes.append(
+                    describe_missing(
+                        f"output {name}", is_missing, "they weigh nothing in output-error fits and figures"
+                    )
                 )
                 continue
-            if gone[0]:
+            if is_missing[0]:
                 raise bad_rows(
                     self.label_of(name),
                     "no value before which there is none to hold",
                     0,
-                    int(gone.sum()),
+                    int(is_missing.sum()),
                     f"begin where the input is known, with {parameter('window')}",
                 )
             out[name] = fill_input_gaps(values, behaviour[name])
             how = "its last value was held" if behaviour[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
-            said.append(describe_missing(f"input {name}", gone, f"{how}, which is a guess"))
-        return out, tuple(said)
+            notes.append(describe_missing(f"input {name}", is_missing, f"{how}, which is a guess"))
+        return out, tuple(notes)
 
     def _check_names(self) -> None:
         check_run_name(self.name)
@@ -215,8 +217,8 @@ class RunArguments:
         if not self.outputs:
             raise DataError(f"{parameter('outputs')}: there is none; name at least one output")
         if (self.step is None) == (self.time is None):
-            given = "neither is given" if self.step is None else "both are given"
-            raise DataError(f"{parameter('step')} and {parameter('time')}: {given}; pass exactly one of them")
+            reason = "neither is given" if self.step is None else "both are given"
+            raise DataError(f"{parameter('step')} and {parameter('time')}: {reason}; pass exactly one of them")
 
     def _time_axis(self, vectors: Mapping[str, Floats]) -> _TimeAxis:
         """Return the time axis; raise if the signals differ in length."""
@@ -245,8 +247,8 @@ class RunArguments:
             times = times * TIME_UNITS[self.time_unit]
             single = dtype.kind == "f" and dtype.itemsize < 8
             precision = float(np.finfo(dtype if single else np.float64).eps)
-            said = (dated[1],) if dated is not None and dated[1] else ()
-            clock = _TimeAxis(times, None, precision * float(np.abs(times).max()), said)
+            notes = (dated[1],) if dated is not None and dated[1] else ()
+            clock = _TimeAxis(times, None, precision * float(np.abs(times).max()), notes)
         check_lengths(lengths)
         return clock
 
@@ -310,6 +312,6 @@ def describe_resampling(since: Floats, step: float, first: int, how: str) -> str
 
 def describe_nonuniform_resampling(behaviour: Mapping[str, Intersample]) -> str:
     """Describe how nonuniformly sampled signals are used after resampling."""
-    kept = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
-    means = f"held: {', '.join(kept)}, by means over the new intervals; " if kept else ""
+    held_inputs = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
+    means = f"held: {', '.join(held_inputs)}, by means over the new intervals; " if held_inputs else ""
     return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"

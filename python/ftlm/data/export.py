@@ -61,14 +61,16 @@ def arguments_from_frame(
     elif step is None and index is not None and _is_time_index(*index):
         time, clock = index
         label = "time (the index)" if time is None else f"time (the index {time!r})"
-    wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
-    units = _stated_units(frame, wanted[0] | wanted[1]) | dict(units or {})
-    labels = {s: f"signal {s!r} (column {column!r})" for part in wanted for s, column in part.items()}
-    given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in wanted)
+    columns_by_role = [
+        names_to_columns(argument, names) for argument, names in (("inputs", inputs), ("outputs", outputs))
+    ]
+    units = _stated_units(frame, columns_by_role[0] | columns_by_role[1]) | dict(units or {})
+    labels = {s: f"signal {s!r} (column {column!r})" for part in columns_by_role for s, column in part.items()}
+    given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in columns_by_role)
     if isinstance(time, str):
-        unit, said = time_unit_of(time, label, time_unit)
+        unit, notes = time_unit_of(time, label, time_unit)
     else:
-        unit, said = time_unit or "s", ()
+        unit, notes = time_unit or "s", ()
     return RunArguments(
         given_inputs,
         given_outputs,
@@ -78,7 +80,7 @@ def arguments_from_frame(
         time_unit=unit,
         window=window,
         labels=labels,
-        notes=said,
+        notes=notes,
         time_label=label,
         **more,
     )
@@ -87,14 +89,14 @@ def arguments_from_frame(
 def _stated_units(frame: object, columns: Mapping[str, Hashable]) -> dict[str, str]:
     """Return the units that attributes of a frame or of its columns state, by signal; unknown ones are left out."""
     whole = getattr(frame, "attrs", {}).get("units")
-    known = dict(whole) if isinstance(whole, Mapping) else {}
+    units_by_column = dict(whole) if isinstance(whole, Mapping) else {}
     for column in set(columns.values()).intersection(_columns_of(frame)):
         with contextlib.suppress(KeyError, TypeError, ValueError, IndexError):
             own = getattr(cast("Mapping[Any, object]", frame)[column], "attrs", {})
-            stated = own.get("units", own.get("unit"))
+            stated_unit = own.get("units", own.get("unit"))
             # A column of a pandas frame has the attributes of the frame.
-            known[column] = stated if isinstance(stated, str) else known.get(column)
-    units = {name: parse_unit(str(known.get(column) or "")) for name, column in columns.items()}
+            units_by_column[column] = stated_unit if isinstance(stated_unit, str) else units_by_column.get(column)
+    units = {name: parse_unit(str(units_by_column.get(column) or "")) for name, column in columns.items()}
     return {name: unit for name, unit in units.items() if unit}
 
 
@@ -152,8 +154,8 @@ def dataset_of(run: Run) -> Any:
 
 
 def _frame_attributes(run: Run) -> dict[str, Any]:
-    told = {"name": run.name, "inputs": list(run.inputs), "outputs": list(run.outputs), "step": run.step}
-    return {**told, "warnings": list(run.warnings)}
+    attributes = {"name": run.name, "inputs": list(run.inputs), "outputs": list(run.outputs), "step": run.step}
+    return {**attributes, "warnings": list(run.warnings)}
 
 
 CSV_MARK = "# ftlm-run "
@@ -212,12 +214,12 @@ class Header:
 
     def text(self) -> str:
         """Return the header as text, ``VERSION JSON``."""
-        told = {
+        content = {
             f.name: getattr(self, f.name)
             for f in fields(self)
             if f.name not in _OPTIONAL_DEFAULTS or getattr(self, f.name)
         }
-        words = json.dumps(told, ensure_ascii=False, allow_nan=False)
+        words = json.dumps(content, ensure_ascii=False, allow_nan=False)
         # A lone surrogate cannot be encoded in UTF-8 and is written as a JSON escape.
         return f"{CSV_VERSION} {words.encode('utf-8', 'backslashreplace').decode()}"
 
@@ -250,10 +252,10 @@ class Header:
             ) from None
 
 
-def _parse_fields(told: Any) -> Header:
+def _parse_fields(fields: Any) -> Header:
     values: dict[str, Any] = {}
     for key, kind in _FIELD_TYPES.items():
-        value = told.get(key, _OPTIONAL_DEFAULTS[key]) if key in _OPTIONAL_DEFAULTS else told[key]
+        value = fields.get(key, _OPTIONAL_DEFAULTS[key]) if key in _OPTIONAL_DEFAULTS else fields[key]
         if not isinstance(value, kind):
             raise ValueError(f"{key!r} is {str(value)[:40]!r}")
         values[key] = tuple(value) if isinstance(value, list) else value
@@ -302,11 +304,11 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> Non
 
 def digest(columns: Mapping[str, Floats], header: str) -> str:
     """SHA-256 of the columns of a run and of its header; the isolated reader computes the same digest."""
-    made = hashlib.sha256(header.encode())
+    digest = hashlib.sha256(header.encode())
     for name, values in columns.items():
-        made.update(f"\0{name}\0{len(values)}\0".encode())
-        made.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
-    return made.hexdigest()
+        digest.update(f"\0{name}\0{len(values)}\0".encode())
+        digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
+    return digest.hexdigest()
 
 
 def _columns(run: Run) -> dict[str, Floats]:

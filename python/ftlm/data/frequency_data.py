@@ -120,8 +120,8 @@ class FrequencyData:
         """
         factor = frequency_factor(frequency_unit)
         omega = _column(f"{name}: frequency", frequency) * factor
-        known = None if deviation is None else _column(f"{name}: deviation", deviation)
-        return cls(omega, as_complex(f"{name}: response", response), known, output, input, unit, name)
+        deviations = None if deviation is None else _column(f"{name}: deviation", deviation)
+        return cls(omega, as_complex(f"{name}: response", response), deviations, output, input, unit, name)
 
     @property
     def gain(self) -> Floats:
@@ -155,16 +155,16 @@ class FrequencyData:
             default if end is None else real_number(name, end)
             for name, end, default in (("low", low, 0.0), ("high", high, math.inf))
         ]
-        kept = (self.frequency >= ends[0]) & (self.frequency <= ends[1])
-        if not kept.any():
+        is_inside = (self.frequency >= ends[0]) & (self.frequency <= ends[1])
+        if not is_inside.any():
             raise DataError(
                 f"{self.name}: nothing was measured from {ends[0]:g} to {ends[1]:g} rad/s; it reaches from "
                 f"{self.frequency.min():.5g} to {self.frequency.max():.5g} rad/s"
             )
-        deviation = None if self.deviation is None else self.deviation[kept]
+        deviation = None if self.deviation is None else self.deviation[is_inside]
         return FrequencyData(
-            self.frequency[kept],
-            self.response[kept],
+            self.frequency[is_inside],
+            self.response[is_inside],
             deviation,
             self.output,
             self.input,
@@ -183,12 +183,12 @@ class FrequencyData:
         size = np.abs(self.response)
         unit = f" {self.unit}" if self.unit else ""
         pair = f" of {self.output} from {self.input}" if self.output and self.input else ""
-        known = "with" if self.deviation is not None else "without"
+        with_or_without = "with" if self.deviation is not None else "without"
         return "\n".join(
             [
                 f"{self.name}: frequency response{pair}, {self.frequency.size} frequencies from {low:.5g} to "
                 f"{high:.5g} rad/s ({low / (2 * math.pi):.4g} to {high / (2 * math.pi):.4g} Hz)",
-                f"  size {size.min():.5g} to {size.max():.5g}{unit}, {known} standard deviations",
+                f"  size {size.min():.5g} to {size.max():.5g}{unit}, {with_or_without} standard deviations",
                 *(f"  note: {w}" for w in self.warnings),
             ]
         )
@@ -234,6 +234,6 @@ def _refuse(bad: np.ndarray, values: np.ndarray, name: str, way_out: str) -> Non
 
 
 def _read_only_copy(values: np.ndarray) -> np.ndarray:
-    kept = values.copy()
-    kept.setflags(write=False)
-    return kept
+    copy = values.copy()
+    copy.setflags(write=False)
+    return copy

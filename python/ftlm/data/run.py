@@ -300,11 +300,11 @@ class Run:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Notes on processing and warnings about the data, as sentences."""
-        there = {name: drop_missing(self._data[name]) for name in self.outputs}
+        samples = {name: drop_missing(self._data[name]) for name in self.outputs}
         constant = tuple(
             f"output {name!r} is constant ({float(values[0])!r} in all {values.size} rows): nothing can be identified "
             "from it"
-            for name, values in there.items()
+            for name, values in samples.items()
             if values.size and is_constant(values)
         )
         return self.notes + constant
@@ -313,8 +313,8 @@ class Run:
     def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
         """Mask of missing samples (of the run or of its `sample_times`) for every output with gaps."""
         data = self._data if self.sample_times is None else self.sample_times.data
-        gone = {name: missing_mask(data[name]) for name in self.outputs}
-        return {name: rows for name, rows in gone.items() if rows.any()}
+        masks = {name: missing_mask(data[name]) for name in self.outputs}
+        return {name: rows for name, rows in masks.items() if rows.any()}
 
     def with_interpolated_gaps(self) -> Run:
         """Return a copy with linearly interpolated gaps, for plots and data checks; never used for estimation."""
@@ -488,12 +488,12 @@ class Run:
         """
         if kind not in ("constant", "linear"):
             raise DataError(f"detrend: kind = {kind!r} is not known; use 'constant' or 'linear'")
-        wanted = self.signals if signals is None else tuple(names_to_columns("signals", signals))
-        unknown = next((name for name in wanted if name not in self), None)
+        names = self.signals if signals is None else tuple(names_to_columns("signals", signals))
+        unknown = next((name for name in names if name not in self), None)
         if unknown is not None:
             raise self._unknown_signal_error(unknown)
         data, facts, readings = dict(self._data), list(self.notes), self.sample_times
-        for name in wanted:
+        for name in names:
             trend, words = fit_trend(self._data[name], self.step, linear=kind == "linear")
             data[name] = self._data[name] - trend(self.time)
             if readings is not None:
@@ -538,10 +538,10 @@ class Run:
         """Return this run, a copy of another one with masked outputs, with the initial state of that one."""
         return self._with(unmasked_run=run)
 
-    def _checked_samples(self, argument: str, given: object, length: int) -> dict[str, Floats]:
+    def _checked_samples(self, argument: str, values_by_name: object, length: int) -> dict[str, Floats]:
         """Return new samples of some signals by name; raise if they do not fit this run."""
         checked: dict[str, Floats] = {}
-        for name, values in as_mapping(argument, given).items():
+        for name, values in as_mapping(argument, values_by_name).items():
             if name not in self:
                 raise self._unknown_signal_error(name)
             what, gaps = f"signal {name!r}", name in self.outputs
@@ -630,8 +630,8 @@ class Run:
         DataError
             If a name is an input of this run, is no name, or its values are not N finite numbers.
         """
-        given = {n: as_vector(v, f"output {n!r}")[0] for n, v in as_mapping("values", values).items()}
-        for name, numbers in given.items():
+        values_by_name = {n: as_vector(v, f"output {n!r}")[0] for n, v in as_mapping("values", values).items()}
+        for name, numbers in values_by_name.items():
             check_signal_name(name)
             if name in self.inputs:
                 raise DataError(f"with_outputs: {name!r} is an input of run {self.name!r}; give it another name")
@@ -640,12 +640,12 @@ class Run:
         readings = self.sample_times
         if readings is not None:
             readings = readings.replace_signals(
-                **{n: np.interp(readings.times, self.time, v) for n, v in given.items()}
+                **{n: np.interp(readings.times, self.time, v) for n, v in values_by_name.items()}
             )
         return self._with(
-            outputs=tuple(dict.fromkeys([*self.outputs, *given])),
-            _data={**self._data, **given},
-            _units={**dict.fromkeys(given, ""), **self._units},
+            outputs=tuple(dict.fromkeys([*self.outputs, *values_by_name])),
+            _data={**self._data, **values_by_name},
+            _units={**dict.fromkeys(values_by_name, ""), **self._units},
             sample_times=readings,
         )
 
@@ -667,14 +667,14 @@ class Run:
         DataError
             If a name is unknown or given twice, or no output is left.
         """
-        kept = list(names_to_columns("names", names))
-        for name in kept:
+        signals = list(names_to_columns("names", names))
+        for name in signals:
             if name not in self:
                 raise self._unknown_signal_error(name)
-        outputs = tuple(name for name in kept if name in self.outputs)
+        outputs = tuple(name for name in signals if name in self.outputs)
         if not outputs:
             raise DataError(f"select: no output is left; keep at least one of {join_names(self.outputs)}")
-        inputs = tuple(name for name in kept if name in self.inputs)
+        inputs = tuple(name for name in signals if name in self.inputs)
         return self._with(inputs=inputs, outputs=outputs)
 
     @check_arguments
@@ -698,14 +698,14 @@ class Run:
                     f"its outputs are {join_names(self.outputs)}"
                 )
             values = self._data[name]
-            there = drop_missing(values)
-            if there.size == 0:
+            samples = drop_missing(values)
+            if samples.size == 0:
                 raise DataError(
                     f"output {name!r} of run {self.name!r}: none of its {values.size} rows holds a value; use a part "
                     "of the record in which it was read"
                 )
             if is_constant(values):
-                thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(there[0])!r}"
+                thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(samples[0])!r}"
                 way_out = (
                     "check the sensor and the column, or load a part of the record in which it moves with "
                     f"{parameter('window')}"
@@ -919,12 +919,12 @@ class Runs(tuple[Run, ...]):
 
     def get_or_compute(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
         """Return the cached result of a key, or compute it; the oldest entry is evicted when the cache is full."""
-        made = self._cache.get(key)
-        if made is None:
-            made = self._cache[key] = tuple(make())
+        entry = self._cache.get(key)
+        if entry is None:
+            entry = self._cache[key] = tuple(make())
             for old in list(self._cache)[:-MAX_CACHED_RESULTS]:
                 self._cache.pop(old, None)
-        return made
+        return entry
 
 
 def as_runs(runs: Run | Iterable[Run]) -> Runs:

@@ -47,14 +47,14 @@ def make_read_only(values: Floats) -> Floats:
 
 def is_constant(values: Floats) -> bool:
     """Whether all samples that are not missing are equal."""
-    there = values[~np.isnan(values)]
-    return bool((there == there[:1]).all())
+    finite = values[~np.isnan(values)]
+    return bool((finite == finite[:1]).all())
 
 
-def check_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
+def check_intersample(kinds: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
     """Return the intersample behavior of inputs; raise for unknown inputs or words."""
     checked: dict[str, Intersample] = {}
-    for signal, kind in as_mapping("intersample", {} if given is None else given).items():
+    for signal, kind in as_mapping("intersample", {} if kinds is None else kinds).items():
         if signal not in inputs:
             raise DataError(
                 f"{parameter('intersample')}: {signal!r} is not an input{nearest(signal, inputs)}; the inputs are "
@@ -79,26 +79,26 @@ def check_step(step: object, argument: str) -> float:
     return value
 
 
-def as_number(given: object) -> float | None:
+def as_number(value: object) -> float | None:
     """Return a real number as a float: infinity on overflow, None if it is not a number."""
-    if isinstance(given, bool) or not isinstance(given, (int, float, np.integer, np.floating)):
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         return None
     try:
-        return float(given)
+        return float(value)
     except OverflowError:
         return math.inf
 
 
-def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
+def as_vector(values: object, thing: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
     """Return a float64 copy of a vector and its original dtype; with `gaps`, masked values and None become NaN."""
-    if gaps and isinstance(given, (list, tuple)):
-        given = [np.nan if value is None else value for value in given]
-    array = as_array(thing, given, gaps=gaps)
+    if gaps and isinstance(values, (list, tuple)):
+        values = [np.nan if value is None else value for value in values]
+    array = as_array(thing, values, gaps=gaps)
     # pandas columns that allow missing values come as objects although they hold numbers.
-    if array.dtype.kind == "O" and getattr(getattr(given, "dtype", None), "kind", "O") in "biuf":
-        array = cast("Any", given).to_numpy(dtype=np.float64, na_value=np.nan)
+    if array.dtype.kind == "O" and getattr(getattr(values, "dtype", None), "kind", "O") in "biuf":
+        array = cast("Any", values).to_numpy(dtype=np.float64, na_value=np.nan)
     if array.dtype.kind in "USTO" or (array.ndim == 1 and array.dtype.kind in "MmV"):
-        raise _not_numbers(given, array, thing)
+        raise _not_numbers(values, array, thing)
     if array.ndim != 1:
         raise DataError(
             f"{thing}: shape {array.shape}, not one-dimensional; pass one column at a time, such as x[:, 0]"
@@ -110,29 +110,29 @@ def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats,
         first, count = (int(rows[0]), rows.size) if rows.size else (0, array.size)
         raise bad_rows(thing, f"complex number {array[first]}", first, count, "pass a real array, such as x.real")
     if array.dtype.kind not in "biuf":
-        raise _not_numbers(given, array, thing)
+        raise _not_numbers(values, array, thing)
     with np.errstate(over="ignore"):
         return np.array(array, dtype=np.float64, order="C"), array.dtype
 
 
-def as_seconds(given: object, thing: str) -> tuple[Floats, str] | None:
+def as_seconds(values: object, thing: str) -> tuple[Floats, str] | None:
     """Convert dates to seconds since the first (and a note), time differences to seconds; None for other types."""
     try:
-        array = as_array(thing, given)
+        array = as_array(thing, values)
         first = array.flat[0] if array.dtype.kind == "O" and array.size else None
         if isinstance(first, datetime.date):
             # Dates with a time zone are in universal time then, as pandas knows and NumPy does not.
-            plain = getattr(given, "dtype", None) is not None and array.dtype != getattr(given, "dtype", None)
+            plain = getattr(values, "dtype", None) is not None and array.dtype != getattr(values, "dtype", None)
             array = np.asarray(
-                given if plain else [_to_universal_time(moment) for moment in array.tolist()], "datetime64[ns]"
+                values if plain else [_to_universal_time(moment) for moment in array.tolist()], "datetime64[ns]"
             )
     except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"{thing}: not one date per row ({error}); pass datetime64, or seconds") from None
     if array.dtype.kind not in "mM" or array.ndim != 1 or array.size == 0:
         return None
-    gone = np.flatnonzero(np.isnat(array))
-    if gone.size:
-        raise bad_rows(thing, "no date", int(gone[0]), gone.size, "remove or fill these rows yourself")
+    rows = np.flatnonzero(np.isnat(array))
+    if rows.size:
+        raise bad_rows(thing, "no date", int(rows[0]), rows.size, "remove or fill these rows yourself")
     lapses = array - array[0] if array.dtype.kind == "M" else array
     nanoseconds = lapses.astype("timedelta64[ns]")
     if (nanoseconds.astype(lapses.dtype) != lapses).any():
@@ -147,13 +147,13 @@ def _to_universal_time(moment: Any) -> Any:
     return moment if zone is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
-def _not_numbers(given: object, array: npt.NDArray[Any], thing: str) -> DataError:
+def _not_numbers(values: object, array: npt.NDArray[Any], thing: str) -> DataError:
     if array.dtype.kind in "Mm":
         return bad_rows(thing, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
     if array.ndim == 0:
         return DataError(f"{thing}: {_short(array.item())} is not an array; pass one number per row")
     # NumPy turns a list of numbers and text into an array of text; the list still distinguishes them.
-    flat = list(given) if isinstance(given, (list, tuple)) and array.ndim == 1 else array.ravel().tolist()
+    flat = list(values) if isinstance(values, (list, tuple)) and array.ndim == 1 else array.ravel().tolist()
     bad = [index for index, value in enumerate(flat) if not isinstance(value, (int, float, np.number, np.bool_))]
     if not bad:
         what = f"objects, not numbers (dtype {array.dtype})"
@@ -182,14 +182,14 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
 
 def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Floats], Floats], str]:
     """Fit the mean or the least-squares line of a signal: a function of time [s] and its text."""
-    there = ~np.isnan(values)
-    mean = float(np.mean(values[there]))
+    is_present = ~np.isnan(values)
+    mean = float(np.mean(values[is_present]))
     if not linear:
         return (lambda t: np.full(t.size, mean)), f"{mean:.6g}"
     clock = np.arange(values.size) * step
-    middle = float(np.mean(clock[there]))
-    late = clock[there] - middle
-    slope = float(late @ (values[there] - mean)) / float(late @ late)
+    middle = float(np.mean(clock[is_present]))
+    late = clock[is_present] - middle
+    slope = float(late @ (values[is_present] - mean)) / float(late @ late)
     sign = "-" if slope < 0 else "+"
     return (lambda t: mean + slope * (t - middle)), f"{mean - slope * middle:.6g} {sign} {abs(slope):.6g} t"
 
@@ -228,9 +228,9 @@ def check_increasing(clock: Floats, thing: str, offset: int) -> None:
     steps = np.diff(clock)
     if (steps > 0).all():
         return
-    before = int(np.flatnonzero(~(steps > 0))[0])
-    row, (earlier, later) = offset + before + 1, clock[before : before + 2].tolist()
-    if steps[before] == 0:
+    row_before = int(np.flatnonzero(~(steps > 0))[0])
+    row, (earlier, later) = offset + row_before + 1, clock[row_before : row_before + 2].tolist()
+    if steps[row_before] == 0:
         way_out = "remove the repeated rows, or write the time with more digits"
         raise bad_rows(thing, f"repeated time {later!r} s", row, int((steps == 0).sum()), way_out)
     way_out = "sort the rows, or split the file where the clock starts again"
@@ -238,7 +238,7 @@ def check_increasing(clock: Floats, thing: str, offset: int) -> None:
 
 
 def regular_step(
-    clock: Floats, thing: str, offset: int, resolution: float, known: float | None
+    clock: Floats, thing: str, offset: int, resolution: float, stated_step: float | None
 ) -> tuple[float, tuple[str, ...]]:
     """Return the step [s] of a regular time axis, rounded to a short decimal, and a note on its jitter."""
     count = clock.size - 1
@@ -272,13 +272,13 @@ def regular_step(
         row = offset + int(deviation.argmax())
         share = f"{100.0 * worst / mean:.2g} % of a step, the most at row {row}"
         fact = (f"time jitters by up to {share}; it was taken as regular",)
-    if known is not None:
-        if not abs(known - mean) * count <= max(4.0 * resolution, 2.0 * worst, 1e-8 * mean):
+    if stated_step is not None:
+        if not abs(stated_step - mean) * count <= max(4.0 * resolution, 2.0 * worst, 1e-8 * mean):
             raise DataError(
-                f"{thing}: the mean step is {mean!r} s where the file's header says {known!r} s; "
+                f"{thing}: the mean step is {mean!r} s where the file's header says {stated_step!r} s; "
                 "correct the header, or remove its first line and name the columns"
             )
-        return known, fact
+        return stated_step, fact
     return _short_decimal(mean, count, 4.0 * resolution, 2.0 * worst), fact
 
 
@@ -372,8 +372,8 @@ def resample_uniform(
 
 def describe_interpolation(behaviour: Mapping[str, Intersample]) -> str:
     """Describe how :func:`resample_uniform` treats each signal."""
-    held = [signal for signal, kind in behaviour.items() if kind == "zoh"]
-    means = f"held: {', '.join(held)}, by means over the new intervals; " if held else ""
+    signals = [signal for signal, kind in behaviour.items() if kind == "zoh"]
+    means = f"held: {', '.join(signals)}, by means over the new intervals; " if signals else ""
     return f"{means}others linear; no anti-alias filter"
 
 
@@ -386,13 +386,13 @@ GRID_TOLERANCE_STEPS = 0.02
 _RELATIVE_TIME_TOLERANCE = 1e-12
 
 
-def check_missing_policy(given: object) -> MissingPolicy:
+def check_missing_policy(policy: object) -> MissingPolicy:
     """Return the treatment of missing samples; raise for an unknown word."""
-    for known in MISSING_POLICIES:
-        if given == known:
-            return known
+    for choice in MISSING_POLICIES:
+        if policy == choice:
+            return choice
     raise DataError(
-        f"{parameter('missing', given)} is unknown; use 'refuse', 'weight' (missing outputs get no weight) "
+        f"{parameter('missing', policy)} is unknown; use 'refuse', 'weight' (missing outputs get no weight) "
         "or 'hold' (as 'weight', and missing inputs keep their last value)"
     )
 
@@ -409,19 +409,19 @@ def drop_missing(values: Floats) -> Floats:
 
 def interpolate_gaps(values: Floats) -> Floats:
     """Interpolate missing samples linearly; use the nearest value at the ends."""
-    gone = np.isnan(values)
-    if not gone.any() or gone.all():
+    is_missing = np.isnan(values)
+    if not is_missing.any() or is_missing.all():
         return values
     rows = np.arange(values.size)
-    return np.asarray(np.where(gone, np.interp(rows, rows[~gone], values[~gone]), values))
+    return np.asarray(np.where(is_missing, np.interp(rows, rows[~is_missing], values[~is_missing]), values))
 
 
 def fill_input_gaps(values: Floats, kind: Intersample) -> Floats:
     """Fill missing input samples: last value for a zero-order hold, else linear interpolation."""
     if kind != ZERO_ORDER_HOLD:
         return interpolate_gaps(values)
-    gone = np.isnan(values)
-    last = np.maximum.accumulate(np.where(gone, 0, np.arange(values.size)))
+    is_missing = np.isnan(values)
+    last = np.maximum.accumulate(np.where(is_missing, 0, np.arange(values.size)))
     return np.asarray(values[last])
 
 
@@ -477,17 +477,17 @@ class NonuniformSamples:
     ) -> NonuniformSamples:
         """Return the samples between two times [s], with the input values at the start."""
         tiny = 1e-9 * step
-        kept = np.flatnonzero((self.times >= start - tiny) & (self.times <= stop + step))
-        times, data = np.maximum(self.times[kept] - start, 0.0), {n: v[kept] for n, v in self.data.items()}
-        if kept.size == 0 or times[0] > tiny:
+        rows = np.flatnonzero((self.times >= start - tiny) & (self.times <= stop + step))
+        times, data = np.maximum(self.times[rows] - start, 0.0), {n: v[rows] for n, v in self.data.items()}
+        if rows.size == 0 or times[0] > tiny:
             times = np.append(0.0, times)
             # Times that differ from a switching instant only by rounding count as equal.
-            before = start + _RELATIVE_TIME_TOLERANCE * float(self.times[-1])
-            row = max(int(np.searchsorted(self.times, before, side="right")) - 1, 0)
+            limit_time = start + _RELATIVE_TIME_TOLERANCE * float(self.times[-1])
+            row = max(int(np.searchsorted(self.times, limit_time, side="right")) - 1, 0)
             for name, values in self.data.items():
                 kind = behaviour.get(name)
-                held = kind == ZERO_ORDER_HOLD
-                first = np.nan if kind is None else values[row] if held else np.interp(start, self.times, values)
+                is_constant = kind == ZERO_ORDER_HOLD
+                first = np.nan if kind is None else values[row] if is_constant else np.interp(start, self.times, values)
                 data[name] = np.append(first, data[name])
         return NonuniformSamples(times, data)
 
@@ -501,11 +501,11 @@ def has_too_few_values(values: Floats) -> bool:
     return int(np.sum(~np.isnan(values))) < MIN_RUN_SAMPLES
 
 
-def describe_missing(thing: str, gone: NDArray[np.bool_], what: str) -> str:
+def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> str:
     """Describe the missing samples of a signal and their treatment, as one sentence."""
-    first, count = int(np.flatnonzero(gone)[0]), int(gone.sum())
+    first, count = int(np.flatnonzero(is_missing)[0]), int(is_missing.sum())
     rows = "row holds" if count == 1 else "rows hold"
-    return f"{thing}: {count} of {gone.size} {rows} no value, the first is row {first}; {what}"
+    return f"{thing}: {count} of {is_missing.size} {rows} no value, the first is row {first}; {what}"
 
 
 #: Largest delay that is searched by default, in samples and as a share of a run.

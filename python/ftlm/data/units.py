@@ -47,8 +47,8 @@ def split_time_header(name: str) -> tuple[str, str | None]:
     if bracketed and bracketed[2]:
         return bracketed[1], _TIME_UNIT_ALIASES.get(bracketed[2].rstrip("."), bracketed[2])
     otherwise = _UNBRACKETED_UNIT_PATTERN.fullmatch(folded)
-    stated = "" if otherwise is None else next((part for part in otherwise.groups()[1:] if part), "")
-    unit = _TIME_UNIT_ALIASES.get(stated.rstrip("."))
+    unit_text = "" if otherwise is None else next((part for part in otherwise.groups()[1:] if part), "")
+    unit = _TIME_UNIT_ALIASES.get(unit_text.rstrip("."))
     return (folded, None) if otherwise is None or unit is None else (otherwise[1], unit)
 
 
@@ -73,14 +73,14 @@ def is_time_name(name: str) -> bool:
     return split_time_header(name)[0] in _TIME_NAMES
 
 
-def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[str, ...]]:
+def time_unit_of(name: str, label: str, choice: str | None) -> tuple[str, tuple[str, ...]]:
     """Return the unit of a time column, and a note for the run.
 
     Parameters
     ----------
     name, label
         Name of the column, and its label in error messages.
-    given
+    choice
         Unit given by the user, or None.
 
     Raises
@@ -88,30 +88,32 @@ def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[s
     DataError
         Two units that contradict each other, or a unit in the header that is not known where none is given.
     """
-    if given is not None and (not isinstance(given, str) or given not in TIME_UNITS):
-        raise DataError(f"{parameter('time_unit', given)} is unknown; the known ones are {join_names(TIME_UNITS)}")
-    stated = split_time_header(name)[1]
-    if stated is None:
-        return given or "s", ()
-    if stated not in TIME_UNITS:
-        if given is None:
+    if choice is not None and (not isinstance(choice, str) or choice not in TIME_UNITS):
+        raise DataError(f"{parameter('time_unit', choice)} is unknown; the known ones are {join_names(TIME_UNITS)}")
+    unit_in_header = split_time_header(name)[1]
+    if unit_in_header is None:
+        return choice or "s", ()
+    if unit_in_header not in TIME_UNITS:
+        if choice is None:
             raise DataError(
-                f"{label}: its header states the unit {stated!r}, which is unknown; the known ones are "
+                f"{label}: its header states the unit {unit_in_header!r}, which is unknown; the known ones are "
                 f"{join_names(TIME_UNITS)}; say with {parameter('time_unit')} in which the numbers are"
             )
-        return given, ()
-    if given is not None and TIME_UNITS[given] != TIME_UNITS[stated]:
+        return choice, ()
+    if choice is not None and TIME_UNITS[choice] != TIME_UNITS[unit_in_header]:
         raise DataError(
-            f"{label}: its header states {stated!r}, and {parameter('time_unit', given)} is asked for; leave "
+            f"{label}: its header states {unit_in_header!r}, and {parameter('time_unit', choice)} is asked for; leave "
             f"{parameter('time_unit')} out, or rename the column"
         )
-    return stated, () if stated == "s" else (f"time read in {stated}, as the header {name!r} says",)
+    return unit_in_header, () if unit_in_header == "s" else (
+        f"time read in {unit_in_header}, as the header {name!r} says",
+    )
 
 
 def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> dict[str, tuple[str, float]]:
     """Return SI unit and conversion factor of every signal; a signal without a unit is not converted."""
-    given = as_mapping("units", {} if units is None else units)
-    for signal, unit in given.items():
+    units_by_signal = as_mapping("units", {} if units is None else units)
+    for signal, unit in units_by_signal.items():
         if signal not in signals:
             raise DataError(
                 f"{parameter('units')}: {signal!r} is not a signal{nearest(signal, signals)}; the signals are "
@@ -122,7 +124,7 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
                 f"unit {unit!r} of signal {signal!r} is unknown{nearest(unit, SIGNAL_UNITS)}; "
                 f"the known units are {join_names(SIGNAL_UNITS, len(SIGNAL_UNITS))}; convert other data before loading"
             )
-    return {signal: SIGNAL_UNITS[str(given.get(signal, ""))] for signal in signals}
+    return {signal: SIGNAL_UNITS[str(units_by_signal.get(signal, ""))] for signal in signals}
 
 
 def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
@@ -157,11 +159,11 @@ def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[st
         case "add":
             return expression_unit(units, next(a for a in expression.arguments if a.channels))
         case "multiply":
-            found: dict[str, float] | None = {}
+            powers: dict[str, float] | None = {}
             for argument in expression.arguments:
                 more = expression_unit(units, argument)
-                found = None if found is None or more is None else _multiply_units(found, more)
-            return found
+                powers = None if powers is None or more is None else _multiply_units(powers, more)
+            return powers
         case "power" | "abs" | "sqrt":
             exponent = {"power": expression.value, "abs": 1.0, "sqrt": 0.5}[expression.operation]
             inner = expression_unit(units, expression.arguments[0])

@@ -59,12 +59,12 @@ class CircuitProblem(ResponseProblem):
 
     def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Return intervals of given half-widths. Those of positive parameters are symmetric in the logarithm."""
-        found = super().intervals(values, widths)
+        intervals = super().intervals(values, widths)
         for name, value, is_log in zip(self.names, values.tolist(), self.is_log.tolist(), strict=True):
             if is_log:
                 ratio = float(np.exp(np.minimum(widths[name] / value, MAX_LOG_WIDTH)))
-                found[name] = (value / ratio, value * ratio)
-        return found
+                intervals[name] = (value / ratio, value * ratio)
+        return intervals
 
     def jacobian_in_seconds(self, values: Floats, jacobian: Floats) -> Floats:
         """Convert a Jacobian with respect to logarithms to one with respect to the parameters."""
@@ -72,10 +72,10 @@ class CircuitProblem(ResponseProblem):
 
     def responses(self, values: Floats, *, jacobian: bool = True) -> list[tuple[Complex, Complex | None]]:
         """Return the impedance at every record, and its derivatives by all parameters (one column each)."""
-        named = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
+        by_parameter = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
         out: list[tuple[Complex, Complex | None]] = []
         for record in self.records:
-            z, by_name = impedance_and_derivatives(self.circuit, record.frequency, named)
+            z, by_name = impedance_and_derivatives(self.circuit, record.frequency, by_parameter)
             z = z + np.zeros(record.frequency.size)
             columns = [by_name[n] + np.zeros_like(z) for n in self.names] if jacobian else None
             out.append((z, None if columns is None else np.stack(columns, axis=1)))
@@ -103,12 +103,12 @@ class CircuitProblem(ResponseProblem):
         if kind != "series" or self.circuit.values or self.bounds:
             return values
         out = values.copy()
-        named = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
+        by_parameter = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
         every = np.concatenate([r.frequency for r in self.records])
         w = np.geomspace(every.min() / 1e3, every.max() * 1e3, 2000)
         alike: dict[str, list[tuple[float, list[int]]]] = {}
         for part in (p for p in rest if p[0] == "parallel"):
-            z, derivatives = impedance_and_derivatives(self.circuit, w, named, part)
+            z, derivatives = impedance_and_derivatives(self.circuit, w, by_parameter, part)
             places = [self.names.index(n) for n in derivatives]
             shape = re.sub(r"_?\d+'", "'", repr(part))
             alike.setdefault(shape, []).append((-float(w[np.argmin(z.imag)]), places))
@@ -129,7 +129,7 @@ class CircuitProblem(ResponseProblem):
         weight = np.concatenate([r.weight for r in self.records])
         goal = np.concatenate([r.response for r in self.records]) * weight
         _, limits, _ = self.constraints()
-        found = []
+        guesses = []
         for point in halton(START_POINTS, 2 * len(self.circuit.elements)):
             unit: dict[str, float] = {}
             for k, (letters, name) in enumerate(self.circuit.elements):
@@ -160,25 +160,25 @@ class CircuitProblem(ResponseProblem):
             values = self.in_problem_units(np.array([unit[n] for n in self.names]))
             # Each constraint is an end of one parameter: its largest value, then its smallest.
             inside = np.clip(values, -limits[1::2], limits[0::2])
-            left, _ = self.residuals(inside, jacobian=False)
-            cost = float(left @ left)
+            residuals, _ = self.residuals(inside, jacobian=False)
+            cost = float(residuals @ residuals)
             if math.isfinite(cost):
-                found.append((cost, inside))
-        found.sort(key=lambda pair: pair[0])
-        return [values for _, values in found[:MAX_STARTS]]
+                guesses.append((cost, inside))
+        guesses.sort(key=lambda pair: pair[0])
+        return [values for _, values in guesses[:MAX_STARTS]]
 
 
 def _positive_least_squares(table: Floats, goal: Floats) -> Floats:
     """Return least-squares sizes above 0; those that would not be are small."""
     lengths = np.linalg.norm(table, axis=0)
     scaled = table / lengths
-    kept = np.ones(lengths.size, dtype=bool)
+    is_active = np.ones(lengths.size, dtype=bool)
     sizes = np.zeros(lengths.size)
-    while np.any(kept):
+    while np.any(is_active):
         sizes[:] = 0.0
-        sizes[kept] = np.linalg.lstsq(scaled[:, kept], goal, rcond=None)[0]
-        if np.all(sizes[kept] > 0):
+        sizes[is_active] = np.linalg.lstsq(scaled[:, is_active], goal, rcond=None)[0]
+        if np.all(sizes[is_active] > 0):
             break
-        kept &= sizes > 0
+        is_active &= sizes > 0
     least = 1e-3 * max(float(np.max(sizes)), 1e-30)
     return np.asarray(np.maximum(sizes, least) / lengths)

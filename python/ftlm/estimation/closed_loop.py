@@ -81,15 +81,15 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     answers: dict[str, list[Floats]] = {}
     findings = []
     for name in inputs:
-        measured = np.concatenate([run[name] for run in runs])
+        output = np.concatenate([run[name] for run in runs])
         # Every coefficient too many takes a share of the noise with it: the least Bayesian criterion.
-        fits = [columns @ minimum_norm_solution(columns, measured, 1e-10) for columns in laws]
-        costs = [_criterion(measured - fit, columns.shape[1]) for fit, columns in zip(fits, laws, strict=True)]
+        fits = [columns @ minimum_norm_solution(columns, output, 1e-10) for columns in laws]
+        costs = [_criterion(output - fit, columns.shape[1]) for fit, columns in zip(fits, laws, strict=True)]
         best = int(np.argmin(costs))
         answers[name] = np.split(fits[best], ends)
-        found = first_stage_f(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
-        if found < MIN_FIRST_STAGE_F:
-            numbers = {"f": found, "needed": MIN_FIRST_STAGE_F}
+        statistic = first_stage_f(answers[name], np.split(output - fits[best], ends), laws[best].shape[1])
+        if statistic < MIN_FIRST_STAGE_F:
+            numbers = {"f": statistic, "needed": MIN_FIRST_STAGE_F}
             findings.append(make_finding("reference_weak", input=name, reference=reference, **numbers))
     return [run_with_inputs(run, {n: a[k] for n, a in answers.items()}) for k, run in enumerate(runs)], findings
 
@@ -101,9 +101,9 @@ def past_regressors(signal: Floats, first: int, reach: int, *, dense: int = DENS
     """
     count = signal.size
     padded = np.concatenate([np.full(count, signal[0]), signal])
-    moved = padded - signal[0]
-    sums = np.concatenate([[0.0], np.cumsum(moved)])
-    columns = [moved[count - lag : 2 * count - lag] for lag in range(first, min(dense, reach) + 1)]
+    deviations = padded - signal[0]
+    sums = np.concatenate([[0.0], np.cumsum(deviations)])
+    columns = [deviations[count - lag : 2 * count - lag] for lag in range(first, min(dense, reach) + 1)]
     start, width = dense + 1, max(2, dense // 4)
     while start + width <= reach:
         end = count - start + 1

@@ -37,11 +37,11 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
         A name that is not a free order or coefficient, no rising pair of numbers, or a start out of its bounds.
     """
     check_intervals(bounds or {})
-    out, given = {}, bounds or {}
+    out, limits = {}, bounds or {}
     inputs = {item.name: item for item in structure.free_inputs}
     # A coefficient that follows from a law is not a free parameter.
     laws = {name: (factor, factors) for name, factor, factors in structure.coefficient_law}
-    for name in given:
+    for name in limits:
         if name in laws:
             factor, factors = laws[name]
             product = " ".join([*([] if factor == 1.0 else ["-" if factor == -1.0 else f"{factor:g}"]), *factors])
@@ -51,8 +51,8 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
                 f"{f'bound {allowed}, or ' if allowed else ''}identify without the law"
             )
     free = [n for n in structure.coefficient_names if n not in laws]
-    check_known("bound of", given, [*free, *structure.order_names, *inputs])
-    for name, pair in given.items():
+    check_known("bound of", limits, [*free, *structure.order_names, *inputs])
+    for name, pair in limits.items():
         if name in inputs:
             item = inputs[name]
             raise ModelError(
@@ -86,17 +86,17 @@ def fit_within_bounds(
         ends = {n: (values[n], min(max(values[n], low), high)) for n, (low, high) in bounds.items() if n in values}
         return {n: end for n, (value, end) in ends.items() if value != end}
 
-    found, values = fit(structure, None)
+    result, values = fit(structure, None)
     fixed, outside = dict[str, float](), dict[str, float]()
     while out := violations(values):
         fixed |= out
         outside |= {n: values[n] for n in out}
-        found, values = fit(structure.with_coefficients(fixed), None)
+        result, values = fit(structure.with_coefficients(fixed), None)
     for name in list(fixed):
         others = {n: v for n, v in fixed.items() if n != name}
         with contextlib.suppress(ConvergenceError):
-            inner, there = fit(structure.with_coefficients(others), {**values, name: fixed[name]})
-            if not violations(there):
-                found, values, fixed = inner, there, others
+            inner, inner_values = fit(structure.with_coefficients(others), {**values, name: fixed[name]})
+            if not violations(inner_values):
+                result, values, fixed = inner, inner_values, others
     on = [make_finding("coefficient_on_bound", parameter=n, value=v, outside=outside[n]) for n, v in fixed.items()]
-    return found, on
+    return result, on

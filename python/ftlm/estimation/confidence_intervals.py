@@ -53,35 +53,35 @@ def with_intervals(
     ``"auto"`` profiles the parameters whose Wald interval is inaccurate, ``"profile"`` all. If a profile leads to a
     lower optimum, the fit is repeated from there.
     """
-    fitted = len(joint.names) + joint.initial_terms
+    count = len(joint.names) + joint.initial_terms
     # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
-    if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * fitted):
+    if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * count):
         return joint, []
     if intervals == "auto" and joint.unstable_optimum is not None and joint.unstable_optimum.at_stability_limit:
         # The cost has no minimum at the limit. A profile would lead to the unstable optimum that was discarded.
         return joint, []
     findings: list[Finding] = []
-    spent = 0
+    pulse_count = 0
     for turn in range(MAX_RESTARTS + 1):
         pulses = joint.samples * joint.refinement * (FREE_ORDER_COST_FACTOR if joint.orders else 1)
         auto = intervals == "auto"
-        budget = (max(MAX_AUTO_PULSES - spent, 0) // pulses, MIN_INITIAL_BUDGET_PER_BOUND) if auto else None
+        budget = (max(MAX_AUTO_PULSES - pulse_count, 0) // pulses, MIN_INITIAL_BUDGET_PER_BOUND) if auto else None
         names = None if auto else problem.names
         try:
-            found = profile_intervals(
+            profile = profile_intervals(
                 joint, problem, runs, names, DEFAULT_INTERVAL_LEVEL, threads=threads, progress=progress, budget=budget
             )
         except FtlmError:
             # No finite simulation where the weights of the last descent are taken anew: what is known stays.
             return joint, findings
-        spent += found.evaluations * pulses
-        if found.lower_optimum is None or turn == MAX_RESTARTS:
+        pulse_count += profile.evaluations * pulses
+        if profile.lower_optimum is None or turn == MAX_RESTARTS:
             break
-        if not found.lower_on_finer_grid:
+        if not profile.lower_on_finer_grid:
             # What only this grid carries is a mode of the scheme; along it the cost tells nothing of the numbers.
             return joint, findings
-        start = dict(zip(problem.names, found.lower_optimum.tolist(), strict=True))
-        tried, level = len(joint.starts), joint.noise
+        start = dict(zip(problem.names, profile.lower_optimum.tolist(), strict=True))
+        start_count, level = len(joint.starts), joint.noise
         try:
             again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
         except FtlmError:
@@ -90,11 +90,13 @@ def with_intervals(
             joint = replace(again, starts=joint.starts, origin=joint.origin)
             continue
         joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
-        before, after = (", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise))
-        findings = [make_finding("lower_optimum_found", starts=tried, before=before, after=after)]
-    if found.incomplete_names:
-        findings.append(make_finding("intervals_rough", parameter=", ".join(found.incomplete_names)))
-    return replace(joint, profiles=found.intervals), findings
+        before_text, after_text = (
+            ", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise)
+        )
+        findings = [make_finding("lower_optimum_found", starts=start_count, before=before_text, after=after_text)]
+    if profile.incomplete_names:
+        findings.append(make_finding("intervals_rough", parameter=", ".join(profile.incomplete_names)))
+    return replace(joint, profiles=profile.intervals), findings
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def profile_intervals(
     KeyboardInterrupt
         Ctrl-C, within one refit.
     """
-    found = _core.profile_intervals(
+    answer = _core.profile_intervals(
         problem.core,
         [recording(run, problem.structure) for run in runs],
         fit_state(joint, problem),
@@ -175,12 +177,12 @@ def profile_intervals(
     return ProfileResult(
         {
             problem.names[i]: ProfileInterval(low, high, level, tuple(points), took)
-            for i, low, high, points, took in found["intervals"]
+            for i, low, high, points, took in answer["intervals"]
         },
-        found["lower_optimum"],
-        found["lower_on_finer_grid"],
-        tuple(problem.names[i] for i in found["incomplete"]),
-        found["evaluations"],
+        answer["lower_optimum"],
+        answer["lower_on_finer_grid"],
+        tuple(problem.names[i] for i in answer["incomplete"]),
+        answer["evaluations"],
     )
 
 
@@ -218,13 +220,13 @@ def result_profiles(
     probability = real_number("level", level)
     if not 0.0 < probability < 1.0:
         raise ModelError(f"level = {level} is not a probability between 0 and 1, such as 0.95")
-    asked = list(dict.fromkeys(names)) or problem.names
-    found = profile_intervals(
-        result.joint, problem, result.task.runs, asked, probability, threads=threads, progress=progress
+    parameters = list(dict.fromkeys(names)) or problem.names
+    profile = profile_intervals(
+        result.joint, problem, result.task.runs, parameters, probability, threads=threads, progress=progress
     )
-    if found.lower_optimum is not None:
+    if profile.lower_optimum is not None:
         raise ConvergenceError(
             "the profile leads to an optimum below this fit's, so its estimates are not the likeliest; identify again "
             f"with {parameter('intervals', 'profile')}, which goes on from there"
         )
-    return found.intervals
+    return profile.intervals

@@ -122,32 +122,32 @@ class Consistency(ReportMixin):
 
     def describe_difference(self, difference: ParameterDifference) -> str:
         """Describe one parameter in two segments: values, intervals and difference in standard errors."""
-        said = []
+        ends = []
         for part in difference.parts:
             low, high = self.results[part].intervals[difference.name]
             value = f"{self._values(part)[difference.name]:.4g}"
-            said.append(f"{value} ({format_bound(low, '.4g')} to {format_bound(high, '.4g')}) in {self.names[part]}")
+            ends.append(f"{value} ({format_bound(low, '.4g')} to {format_bound(high, '.4g')}) in {self.names[part]}")
         return (
-            f"{difference.name} is {said[0]} and {said[1]}, {difference.difference_in_errors:.2g} standard errors apart"
+            f"{difference.name} is {ends[0]} and {ends[1]}, {difference.difference_in_errors:.2g} standard errors apart"
         )
 
     @property
     def reason(self) -> str:
         """Conclusion in one sentence, with the parameters and segments that decide it."""
-        told = [d for d in self.differences if not math.isnan(d.difference_in_errors)]
+        comparable = [d for d in self.differences if not math.isnan(d.difference_in_errors)]
         if self.consistent is None:
             return "Not told: no number is known by two parts"
         if self.consistent:
             words = "The same model as far as the parts tell: the 95 % intervals of every number overlap; the farthest "
-            words += f"from each other: {self.describe_difference(told[0])}"
+            words += f"from each other: {self.describe_difference(comparable[0])}"
             return words + (f"; all numbers together: {self._joint_test_text}" if self._joint_test_text else "")
-        far = [d for d in told if d.disjoint]
+        far = [d for d in comparable if d.disjoint]
         if far:
             words = f"Not the same model: {'; '.join(self.describe_difference(d) for d in far)}"
             return words + (f"; all numbers together: {self._joint_test_text}" if self._exceeds_limit else "")
         return (
             f"Not the same model: the 95 % intervals of each number overlap, but all numbers together do not agree "
-            f"({self._joint_test_text}); the farthest from each other: {self.describe_difference(told[0])}"
+            f"({self._joint_test_text}); the farthest from each other: {self.describe_difference(comparable[0])}"
         )
 
     @property
@@ -325,21 +325,21 @@ def consistency(
         A segment whose fit fails.
     """
     every = as_runs(runs)
-    given = None if segments is None else check_integer("segments", segments, DEFAULT_SEGMENTS)
-    if len(every) > 1 and given is not None:
+    count = None if segments is None else check_integer("segments", segments, DEFAULT_SEGMENTS)
+    if len(every) > 1 and count is not None:
         raise ModelError(
             f"{len(every)} runs are segments by themselves; leave {parameter('segments')} out, or give one run"
         )
-    chosen = resolve_method(method)
-    kept = [n for n in ("store", "start") if getattr(chosen, n, None) is not None]
-    if kept:
-        raise ModelError(f"{parameter(kept[0])} is of one identification, and each part has its own; leave it out")
-    pieces = split_run(every[0], given or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
+    estimator = resolve_method(method)
+    options = [n for n in ("store", "start") if getattr(estimator, n, None) is not None]
+    if options:
+        raise ModelError(f"{parameter(options[0])} is of one identification, and each part has its own; leave it out")
+    pieces = split_run(every[0], count or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
     names = _segment_names(pieces)
     results: list[Identification] = []
     for name, piece in zip(names, pieces, strict=True):
         try:
-            results.append(identify(piece, structure, method=chosen, offset=offset, m=m, threads=threads))
+            results.append(identify(piece, structure, method=estimator, offset=offset, m=m, threads=threads))
         except FtlmError as error:
             raise type(error)(f"{name}: {error}") from error
         if not results[0].standard_errors:
@@ -351,10 +351,10 @@ def consistency(
             progress(len(results), len(pieces))
     crossed = tuple(tuple(_cross_validated_fit(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results)
     distance, degrees = joint_distance(results)
-    found = Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
-    if found.consistent is not False or len(every) == 1:
-        return found
-    return replace(found, delays=tuple(_delay_findings(names, pieces, results)))
+    result = Consistency(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
+    if result.consistent is not False or len(every) == 1:
+        return result
+    return replace(result, delays=tuple(_delay_findings(names, pieces, results)))
 
 
 def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequence[Identification]) -> list[Finding]:
@@ -366,17 +366,21 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
             continue
         # A fit is 100 (1 - NR).
         own = results[k].fit
-        left: dict[int, dict[str, float]] = {}
+        misfits: dict[int, dict[str, float]] = {}
         for rows in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1):
             shifted = piece.with_samples({n: _shift_rows(piece[n], rows) for n in inputs})
             fits = _cross_validated_fit(result, shifted, results[k])
-            left[rows] = {o: 100.0 - fit for o, fit in fits.items()}
-        for output, before in left[0].items():
-            rows = min(left, key=lambda r: left[r].get(output, math.inf))
-            after = left[rows][output]
-            if rows and after < MAX_SHIFTED_SHARE * before and after <= MAX_OWN_RATIO * (100.0 - own[output]):
-                shown = f"{abs(rows)} row{'s' if abs(rows) > 1 else ''} {'later' if rows > 0 else 'earlier'}"
-                numbers = {"before": before, "after": after, "other": names[j], "shown": shown}
+            misfits[rows] = {o: 100.0 - fit for o, fit in fits.items()}
+        for output, misfit_before in misfits[0].items():
+            rows = min(misfits, key=lambda r: misfits[r].get(output, math.inf))
+            misfit_after = misfits[rows][output]
+            if (
+                rows
+                and misfit_after < MAX_SHIFTED_SHARE * misfit_before
+                and misfit_after <= MAX_OWN_RATIO * (100.0 - own[output])
+            ):
+                text = f"{abs(rows)} row{'s' if abs(rows) > 1 else ''} {'later' if rows > 0 else 'earlier'}"
+                numbers = {"before": misfit_before, "after": misfit_after, "other": names[j], "shown": text}
                 findings.append(make_finding("parts_differ_by_delay", run=names[k], output=output, **numbers))
     return findings
 
@@ -416,9 +420,9 @@ def _cross_validated_fit(result: Identification, piece: Run, own: Identification
     """
     if result is own:
         return dict(result.fit)
-    begun = replace(result.model.structure, initial=own.model.structure.initial)
+    structure = replace(result.model.structure, initial=own.model.structure.initial)
     try:
-        return dict(compare(replace(result.model, structure=begun), piece).fit)
+        return dict(compare(replace(result.model, structure=structure), piece).fit)
     except FtlmError:
         return {}
 
@@ -433,9 +437,11 @@ def differences(results: Sequence[Identification]) -> list[ParameterDifference]:
             # Of each interval the end that faces the other part: those by profile likelihood are not symmetric.
             width = (low[1] - first, second - high[0])
             error = math.hypot(*width) / NORMAL_95
-            told = 0.0 < error < math.inf and all(is_identifiable(r, name) for r in pair)
-            apart = told and second - first > sum(width)
-            out.append(ParameterDifference(name, places, (second - first) / error if told else math.nan, apart))
+            is_determined = 0.0 < error < math.inf and all(is_identifiable(r, name) for r in pair)
+            is_apart = is_determined and second - first > sum(width)
+            out.append(
+                ParameterDifference(name, places, (second - first) / error if is_determined else math.nan, is_apart)
+            )
     return sorted(
         out,
         key=lambda d: (
@@ -470,13 +476,13 @@ def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int
     joints = [r.joint for r in results if r.joint is not None]
     if len(joints) < len(results):
         return None, 0
-    known = np.array([all(is_quadratic(r, n) for r in results) for n in joints[0].names])
-    count = int(known.sum())
+    is_comparable = np.array([all(is_quadratic(r, n) for r in results) for n in joints[0].names])
+    count = int(is_comparable.sum())
     if count == 0:
         return None, 0
-    unit = np.sqrt(np.mean([np.diag(j.covariance)[known] for j in joints], axis=0))
-    spreads = [j.covariance[np.ix_(known, known)] / np.outer(unit, unit) for j in joints]
-    points = [j.values[known] / unit for j in joints]
+    unit = np.sqrt(np.mean([np.diag(j.covariance)[is_comparable] for j in joints], axis=0))
+    spreads = [j.covariance[np.ix_(is_comparable, is_comparable)] / np.outer(unit, unit) for j in joints]
+    points = [j.values[is_comparable] / unit for j in joints]
     weights = [np.linalg.pinv(s, hermitian=True) for s in spreads]
     centre = np.linalg.lstsq(np.sum(weights, axis=0), sum(w @ p for w, p in zip(weights, points, strict=True)))[0]
     distance = float(sum((p - centre) @ w @ (p - centre) for w, p in zip(weights, points, strict=True)))

@@ -75,9 +75,9 @@ def output_error_landscape(
         A name that is not a free order.
     """
     joint, task, pair = result.joint, result.task, orders
-    chosen = correlated_orders(result)
-    if pair is None and chosen is not None:
-        pair = chosen[:2]
+    pair_choice = correlated_orders(result)
+    if pair is None and pair_choice is not None:
+        pair = pair_choice[:2]
     if joint is None or task is None or pair is None:
         return None
     first, second = pair
@@ -100,14 +100,14 @@ def output_error_landscape(
         stop=stop_flag(),
     )
     least = min(least, float(costs.min()))
-    kept = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
+    subtitle = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
     i, j = names.index(first), names.index(second)
     return Landscape(
         (first, second),
         x,
         y,
         1.0 + costs - least,
-        kept,
+        subtitle,
         "1 + increase of the weighted sum of squares",
         float(joint.correlation[i, j]),
     )

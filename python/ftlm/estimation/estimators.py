@@ -68,35 +68,35 @@ def fit_with_instruments(
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
-    measured, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
+    data_objective, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
     values, converged = joint.values, False
-    here = _evaluate_moments(measured, clean, values)
+    moments = _evaluate_moments(data_objective, clean, values)
     for _ in range(MAX_GAUSS_NEWTON_STEPS):
-        attempt, slopes, instruments = here
+        attempt, slopes, instruments = moments
         residuals = np.asarray(attempt.outcome["residuals"])
         bread = np.linalg.pinv(instruments @ slopes.T)
         step = -bread @ (instruments @ residuals)
-        errors = np.sqrt(np.diag(_covariance(measured, attempt, bread @ instruments)))
+        errors = np.sqrt(np.diag(_covariance(data_objective, attempt, bread @ instruments)))
         if np.all(np.abs(step) <= STEP_TOLERANCE_ERRORS * errors):
             converged = True
             break
-        level = _moment_norm(here)
+        level = _moment_norm(moments)
         for halving in range(MAX_STEP_HALVINGS):
-            tried = problem.feasible_point(values, values + 0.5**halving * step)
+            trial = problem.feasible_point(values, values + 0.5**halving * step)
             try:
-                there = _evaluate_moments(measured, clean, tried)
+                trial_moments = _evaluate_moments(data_objective, clean, trial)
             except FtlmError:
                 # No finite simulation that far.
                 continue
-            if _moment_norm(there) < level:
-                values, here = tried, there
+            if _moment_norm(trial_moments) < level:
+                values, moments = trial, trial_moments
                 break
         else:
             break
-    attempt, slopes, instruments = here
-    covariance = _covariance(measured, attempt, np.linalg.pinv(instruments @ slopes.T) @ instruments)
+    attempt, slopes, instruments = moments
+    covariance = _covariance(data_objective, attempt, np.linalg.pinv(instruments @ slopes.T) @ instruments)
     orders, coefficients, inputs = problem.split(values.tolist())
-    levels = measured.rms_residuals(attempt)
+    levels = data_objective.rms_residuals(attempt)
     return replace(
         joint,
         orders=dict(zip(problem.orders, orders, strict=True)),
@@ -105,7 +105,7 @@ def fit_with_instruments(
         covariance=covariance,
         noise={o: level / w for (o, level), w in zip(levels.items(), weights, strict=True)},
         cost=float(attempt.outcome["cost"]),
-        residuals=measured.residuals(attempt),
+        residuals=data_objective.residuals(attempt),
         refinement=every,
         converged=converged,
     )
@@ -120,21 +120,21 @@ def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], an
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
     try:
-        measured, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
-        attempt, slopes, instruments = _evaluate_moments(measured, clean, joint.values)
+        data_objective, clean = (Objective(problem, each, weights, every=every) for each in (runs, answers))
+        attempt, slopes, instruments = _evaluate_moments(data_objective, clean, joint.values)
     except FtlmError:
         return math.inf
     step = np.linalg.pinv(instruments @ slopes.T) @ (instruments @ np.asarray(attempt.outcome["residuals"]))
     errors = np.array([joint.standard_errors[n] for n in joint.names])
-    known = np.isfinite(errors) & (errors > 0)
-    return float(np.max(np.abs(step[known]) / errors[known], initial=0.0))
+    is_finite = np.isfinite(errors) & (errors > 0)
+    return float(np.max(np.abs(step[is_finite]) / errors[is_finite], initial=0.0))
 
 
-def _evaluate_moments(measured: Objective, clean: Objective, values: Floats) -> tuple[Iterate, Floats, Floats]:
+def _evaluate_moments(data_objective: Objective, clean: Objective, values: Floats) -> tuple[Iterate, Floats, Floats]:
     """Return residuals, sensitivities on measured inputs, and sensitivities on noise-free inputs."""
-    orders, coefficients, inputs = measured.problem.split(values.tolist())
+    orders, coefficients, inputs = data_objective.problem.split(values.tolist())
     start = Iterate(orders, coefficients, "instruments", {}, inputs)
-    at = measured.minimize(start, 1, plain=True)
+    at = data_objective.minimize(start, 1, plain=True)
     instruments = clean.minimize(start, 1, plain=True)
     return at, np.asarray(at.outcome["jacobian"]), np.asarray(instruments.outcome["jacobian"])
 
@@ -175,34 +175,34 @@ def estimate_output_error(
     begin: Model | Mapping[str, float] | None = None,
     more: Mapping[str, float] | None = None,
     alone: bool = False,
-    fitted: JointFit | None = None,
+    joint_fit: JointFit | None = None,
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
     `answers` are the inputs explained by a reference and serve as instruments. With `alone`, `begin` is the only
-    initial guess. `fitted` is the joint fit of the task if it exists.
+    initial guess. `joint_fit` is the joint fit of the task if it exists.
     """
     # An order with one value is known.
-    known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
-    asked = task.structure.with_orders(known)
-    structure = resolve_start(task.runs, asked)
+    order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
+    request = task.structure.with_orders(order_values)
+    structure = resolve_start(task.runs, request)
     record = prepare(task.runs, structure.without_input_nonlinearities(), m, power_of_two=False, gaps=True)[0]
     start = record.initial
     begins: list[dict[str, float]] = []
     if begin is not None:
         free = FreeProblem.of(replace(structure, initial="rest"))
-        given = values_of_model(free, begin, more or {}) if isinstance(begin, Model) else begin
-        begins = warm_starts(free, given)
+        guess = values_of_model(free, begin, more or {}) if isinstance(begin, Model) else begin
+        begins = warm_starts(free, guess)
     # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
     course = ShareTracker(progress)
-    joint = fitted or fit_with_initial_conditions(
+    joint = joint_fit or fit_with_initial_conditions(
         answers or task.runs,
         structure,
         start,
         threads=threads,
         progress=course.subtask(0.7, 0.9),
         loss=loss,
-        known=begins,
+        guesses=begins,
         alone=alone,
     )
     course.advance_to(0.7)
@@ -220,15 +220,17 @@ def estimate_output_error(
         findings += multistart_findings(joint, problem, task.runs)
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
-        structure = asked = replace(structure, initial="history")
+        structure = request = replace(structure, initial="history")
         findings.append(make_finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
     coefficients = problem.coefficients_by_name(list(joint.coefficients.values()))
     # On another run the start is resolved anew.
-    identified = asked.with_orders(joint.orders).with_coefficients(coefficients)
+    identified = request.with_orders(joint.orders).with_coefficients(coefficients)
     return Fit(
         Task(task.runs, structure),
         "output-error",
-        make_model(task, "output-error", identified.with_inputs(joint.inputs), {**known, **joint.orders}, record.m),
+        make_model(
+            task, "output-error", identified.with_inputs(joint.inputs), {**order_values, **joint.orders}, record.m
+        ),
         len(joint.names),
         {
             "method": "output-error",
@@ -249,10 +251,10 @@ def estimate_output_error(
 
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
     """Return the covariance of the numbers of a model; None where a direction is not identifiable."""
-    moved = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
+    jacobian = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
     with np.errstate(invalid="ignore", over="ignore"):
         # Of directions that the runs do not see covariances are not numbers, or beyond them.
-        spread = moved @ joint.covariance @ moved.T
+        spread = jacobian @ joint.covariance @ jacobian.T
     return tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None
 
 
@@ -334,8 +336,8 @@ def prior_findings(
             continue
         (output,) = part.outputs
         records = prepare(task.runs, part, m, power_of_two=settings.needs_haar)
-        measured = np.concatenate([record.of(output) for record in records])
-        still = np.abs(measured).sum() if settings.norm == "l1" else np.sqrt(np.mean(measured**2))
+        outputs = np.concatenate([record.of(output) for record in records])
+        still = np.abs(outputs).sum() if settings.norm == "l1" else np.sqrt(np.mean(outputs**2))
         share = search.score / float(still)
         if share > MAX_PRIOR_SCORE_RATIO:
             findings.append(make_finding("prior_ranks", output=output, prior=settings.prior_covariance, share=share))
@@ -365,10 +367,10 @@ def run_order_searches(
     }
     with contextlib.ExitStack() as stack:
         requests = [job.request(name) for name, job in jobs.items()]
-        kept = None if store is None else stack.enter_context(Store(store, requests))
-        announce_time(progress, list(jobs.values()), kept)
+        store_file = None if store is None else stack.enter_context(Store(store, requests))
+        announce_time(progress, list(jobs.values()), store_file)
         return {
-            name: run_job(job, store=kept, number=number, executor=executor)
+            name: run_job(job, store=store_file, number=number, executor=executor)
             for number, (name, job) in enumerate(jobs.items())
         }
 
@@ -398,6 +400,8 @@ def fitted_model(joint: JointFit, structure: Structure) -> Model:
     """Return a fit as a model with its initial conditions and the covariance of its parameters."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
-    known = problem.structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
+    identified_structure = (
+        problem.structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
+    )
     estimate = Estimate("output-error", (), joint.values_by_name, covariance=number_covariance(joint, problem))
-    return Model(known, orders=joint.orders, estimate=estimate)
+    return Model(identified_structure, orders=joint.orders, estimate=estimate)

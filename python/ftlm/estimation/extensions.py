@@ -152,8 +152,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     colored = any(not o.whiteness.passed or o.follows_direction for o in tests.outputs.values())
-    given = structure.has_friction or structure.limits or structure.free_inputs
-    if joint is None or not joint.names or not colored or given:
+    is_excluded = structure.has_friction or structure.limits or structure.free_inputs
+    if joint is None or not joint.names or not colored or is_excluded:
         return ExtensionTests([])
     structure = replace(structure, initial=joint.initial)
     names = _inputs_of_single_equation(structure, runs)
@@ -165,14 +165,14 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
         if names:
             extensions += _extensions(structure, joint, runs, names)
             extensions += [*_friction(structure, runs), *_load_step(structure, joint, runs)]
-        fitted = [f for e in extensions if (f := _fit_extension(e, runs)) is not None]
-        best = _best_extension(fitted, own)
+        fits = [f for e in extensions if (f := _fit_extension(e, runs)) is not None]
+        best = _best_extension(fits, own)
         clear = best is not None and best.criterion <= own - MIN_CRITERION_DECREASE
         findings = _extension_findings(best, structure, joint, runs, names, about) if best and clear else []
     except FtlmError:
         # The fit to the first samples failed, with which extensions are compared.
         return ExtensionTests([])
-    return ExtensionTests(findings, any(f.extension.code == "friction_fits" for f in fitted))
+    return ExtensionTests(findings, any(f.extension.code == "friction_fits" for f in fits))
 
 
 def _extension_findings(
@@ -239,15 +239,15 @@ def _other_intersample(structure: Structure, joint: JointFit, runs: Runs) -> lis
     Samples alone do not distinguish a staircase from a smooth signal. The wrong assumption acts like a delay of half a
     sample, which biases the parameters.
     """
-    found = []
+    extensions = []
     for name in runs[0].inputs:
         steps = np.concatenate([np.diff(drop_missing(run[name])) for run in runs])
         if name in structure.signals and np.count_nonzero(steps) > MIN_CHANGING_SHARE * steps.size:
             other: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
             changed = as_runs([run.with_intersample({name: other}) for run in runs])
             starts = [joint.values_by_name]
-            found.append(Extension("other_intersample_fits", structure, 0, [name], starts, runs=changed))
-    return found
+            extensions.append(Extension("other_intersample_fits", structure, 0, [name], starts, runs=changed))
+    return extensions
 
 
 def _intersample_findings(
@@ -271,8 +271,8 @@ def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
     values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
     moves = {n: abs(others[n] - values[n]) / e for n, e in errors.items() if e > 0.0 and n in others}
     most = max(values, key=lambda n: moves.get(n, 0.0))
-    known = {"value": values[most], "error": errors[most], "other_value": others.get(most, math.nan)}
-    return {"parameter": most, "ratio": ratio, **known}
+    numbers = {"value": values[most], "error": errors[most], "other_value": others.get(most, math.nan)}
+    return {"parameter": most, "ratio": ratio, **numbers}
 
 
 def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[JointFit, Runs]:
@@ -286,31 +286,31 @@ def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[J
 
 def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list[str]:
     """Return names that are neither parameters nor signals: `base`, or with a number."""
-    taken = {*structure.order_names, *structure.coefficient_names, *structure.signals, *run.signals}
+    reserved_names = {*structure.order_names, *structure.coefficient_names, *structure.signals, *run.signals}
     numbered = (f"{base}{k}" for k in itertools.count(1))
     names = itertools.chain([base] if count == 1 else [], numbered)
-    return list(itertools.islice((n for n in names if n not in taken), count))
+    return list(itertools.islice((n for n in names if n not in reserved_names), count))
 
 
 def _fit_extension(extension: Extension, runs: Runs) -> FittedExtension | None:
     """Return the best fit of an extension; None if a fit fails."""
-    there = extension.runs or runs
+    fit_runs = extension.runs or runs
     try:
-        fits = [fit_output_error(there, extension.structure, start=s, refine=False) for s in extension.starts]
+        fits = [fit_output_error(fit_runs, extension.structure, start=s, refine=False) for s in extension.starts]
     except FtlmError:
         return None
     refit = min(fits, key=lambda f: max(f.noise.values()))
-    criterion = _prediction_criterion(refit, extension.structure, there, extension.parameter_count)
+    criterion = _prediction_criterion(refit, extension.structure, fit_runs, extension.parameter_count)
     return FittedExtension(extension, refit, criterion)
 
 
-def _best_extension(fitted: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
+def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
     """Return the extension of least criterion, or None if none is below that of the structure itself.
 
     An extension further down the list must be better by `MIN_CRITERION_GAP`.
     """
     best: FittedExtension | None = None
-    for item in fitted:
+    for item in fits:
         positive = item.extension.positive_coefficient
         if item.fit.unstable_optimum is not None or (positive and not item.fit.coefficients[positive] > 0.0):
             continue
@@ -338,15 +338,15 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     """Return the extensions of a structure of one equation, those that are preferred first."""
     (equation,) = structure.equations
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
-    given = {n: structure.delay.get(n, 0.0) for n in names}
-    late = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in given.items()})
-    begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in given.items()}}
-    found: list[Extension] = []
+    delays = {n: structure.delay.get(n, 0.0) for n in names}
+    late = structure.with_delays({n: (-step, max(longest, 2.0 * d)) for n, d in delays.items()})
+    begin = {**joint.values_by_name, **{input_name("delay", n): d for n, d in delays.items()}}
+    extensions: list[Extension] = []
 
     def add(code: str, make: Callable[[], Structure], count: int, inputs: Sequence[str], **more: Any) -> None:
         # What the structure cannot be extended by, such as orders that no input may have beside a square, is left out.
         with contextlib.suppress(FtlmError):
-            found.append(Extension(code, make(), count, inputs, **more))
+            extensions.append(Extension(code, make(), count, inputs, **more))
 
     def with_terms(terms: Sequence[Term]) -> Structure:
         return replace(structure, equations=(_with_terms(equation, terms),))
@@ -358,16 +358,16 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
 
     coefficients = _unused_names("k", len(names), structure, runs[0])
     more = [_next_derivative(equation, *pair) for pair in zip(names, coefficients, strict=True)]
-    shown = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
+    terms_text = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
     known_orders = not equation.order.weights and not any(t.order.weights for t in more)
     former = f"{lag_name} D^{equation.order} {equation.output}"
     add("lag_fits", partial(with_lag, []), 1, names, term_text=former)
     add("delay_fits", lambda: late, len(names), names, starts=[None, begin])
     if known_orders and all(t.order.constant <= equation.order.constant for t in more):
-        add("zero_fits", partial(with_terms, more), len(more), names, term_text=shown)
+        add("zero_fits", partial(with_terms, more), len(more), names, term_text=terms_text)
     if known_orders and all(t.order.constant <= equation.order.constant + 1.0 for t in more):
-        add("mode_fits", partial(with_lag, more), 1 + len(more), names, term_text=f"{former} + {shown}")
-    known, (coefficient,) = joint.values_by_name, _unused_names("k", 1, structure, runs[0])
+        add("mode_fits", partial(with_lag, more), 1 + len(more), names, term_text=f"{former} + {terms_text}")
+    values, (coefficient,) = joint.values_by_name, _unused_names("k", 1, structure, runs[0])
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
         ends = {
@@ -376,13 +376,13 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
         }
         effects: tuple[InputEffect, InputEffect] = ("saturation", "dead_zone")
         for effect in effects:
-            starts = [{**known, input_name(effect, name): share * largest} for share in LIMIT_GUESS_SHARES]
+            starts = [{**values, input_name(effect, name): share * largest} for share in LIMIT_GUESS_SHARES]
             limits = {effect: {name: ends[effect]}}
             add(f"{effect}_fits", partial(structure.with_limits, **limits), 1, [name], starts=starts)
         square = Term(name, Order(0.0), coefficient, expression=power(channel(name), 2.0))
-        text, flat = f"{coefficient} {name}^2", {**known, coefficient: 0.0}
+        text, flat = f"{coefficient} {name}^2", {**values, coefficient: 0.0}
         add("square_fits", partial(with_terms, [square]), 1, [name], starts=[flat], term_text=text)
-    return found
+    return extensions
 
 
 def _friction(structure: Structure, runs: Runs) -> list[Extension]:
@@ -394,13 +394,13 @@ def _friction(structure: Structure, runs: Runs) -> list[Extension]:
     (name,) = _unused_names("fc", 1, structure, runs[0])
     # A simulation with friction starts from a level and a velocity.
     initial = "caputo" if isinstance(structure.initial, History) else structure.initial
-    found = []
+    extensions = []
 
-    def add(shown: str, **changes: Any) -> None:
+    def add(text: str, **changes: Any) -> None:
         # Some structures with friction cannot be simulated, such as one of order 1 or one behind a sensor filter.
         with contextlib.suppress(FtlmError):
             wider = replace(structure, equations=(replace(item, **changes),), initial=initial)
-            found.append(Extension("friction_fits", wider, 1, [], term_text=shown, positive_coefficient=name))
+            extensions.append(Extension("friction_fits", wider, 1, [], term_text=text, positive_coefficient=name))
 
     add(friction_term(item.output, name), coulomb=Friction(name))
     slope = sign_tanh_slope([run[item.output] for run in runs])
@@ -408,7 +408,7 @@ def _friction(structure: Structure, runs: Runs) -> list[Extension]:
         smooth = apply("tanh", multiply(constant(slope), channel(item.output)))
         term = Term(item.output, Order(0.0), name, factor=-1.0, expression=smooth)
         add(friction_term(item.output, name, slope), terms=(*item.terms, term))
-    return found
+    return extensions
 
 
 def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
@@ -430,17 +430,17 @@ def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extens
         start = {name: 0.0, **near.values_by_name}
         return fit_output_error([loaded], wider, start=start, refine=False)
 
-    def search(fitted: JointFit, row: int) -> tuple[float, int]:
+    def search(fit: JointFit, row: int) -> tuple[float, int]:
         for _ in range(MAX_LOAD_SEARCHES):
-            response = _load_response(item, structure, fitted, run)
-            residuals = fitted.noise[item.output] * fitted.residuals[0][item.output]
+            response = _load_response(item, structure, fit, run)
+            residuals = fit.noise[item.output] * fit.residuals[0][item.output]
             if row:
-                residuals[row - 1 :] += fitted.coefficients[name] * response[: size - 1 - row]
-            found = _load_row(residuals, response)
-            if found is None or found == row:
+                residuals[row - 1 :] += fit.coefficients[name] * response[: size - 1 - row]
+            step_row = _load_row(residuals, response)
+            if step_row is None or step_row == row:
                 break
-            fitted, row = fit_at(found, fitted), found
-        return (fitted.noise[item.output] if row else math.inf), row
+            fit, row = fit_at(step_row, fit), step_row
+        return (fit.noise[item.output] if row else math.inf), row
 
     try:
         rows = np.linspace(0, size, LOAD_ROW_GUESSES + 2).astype(int)[1:-1]
@@ -460,10 +460,10 @@ def _load_response(item: Equation, structure: Structure, joint: JointFit, run: R
     """Return the response of a fitted model to a constant load from row 0 on, at rows 1 to N - 1."""
     own = (t for t in item.terms if t.signal == item.output)
     alone = replace(item, terms=(*own, Term("load", Order(0.0), 1.0)))
-    known = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
+    single = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
     values = joint.values_by_name
-    known = known.with_orders({n: values[n] for n in known.order_names})
-    model = Model(known.with_coefficients({n: values[n] for n in known.coefficient_names}))
+    single = single.with_orders({n: values[n] for n in single.order_names})
+    model = Model(single.with_coefficients({n: values[n] for n in single.coefficient_names}))
     ones, zeros = np.ones(run.length), np.zeros(run.length)
     rest = Run.from_arrays(step=run.step, inputs={"load": ones}, outputs={item.output: zeros})
     return simulate(model, rest)[item.output][1:]
@@ -472,12 +472,12 @@ def _load_response(item: Equation, structure: Structure, joint: JointFit, run: R
 def _load_row(residuals: Floats, response: Floats) -> int | None:
     """Return the row from which on a load explains most of the residuals of the rows 1 to N - 2 of a run."""
     series = np.nan_to_num(residuals)
-    here = response[: series.size]
-    power, edge = np.cumsum(here**2)[::-1], max(int(MIN_LOAD_SHARE * series.size), 1)
-    if not np.all(np.isfinite(here)) or not power[-edge] > 0.0:
+    load = response[: series.size]
+    power, edge = np.cumsum(load**2)[::-1], max(int(MIN_LOAD_SHARE * series.size), 1)
+    if not np.all(np.isfinite(load)) or not power[-edge] > 0.0:
         return None
     # The correlation by FFT, padded so that it is not circular.
-    spectra = np.fft.rfft(series, 2 * series.size) * np.conj(np.fft.rfft(here, 2 * series.size))
+    spectra = np.fft.rfft(series, 2 * series.size) * np.conj(np.fft.rfft(load, 2 * series.size))
     explained = np.fft.irfft(spectra)[: series.size] ** 2 / np.maximum(power, 1e-300)
     # A load of row k acts on row k + 1 first, which is number k of the inner rows.
     return edge + int(np.argmax(explained[edge:-edge]))
@@ -523,9 +523,13 @@ def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, add
     return total + added_parameters * math.log(samples)
 
 
-def _passes_residual_tests(fitted: FittedExtension, given: Runs) -> bool:
+def _passes_residual_tests(extension_fit: FittedExtension, default_runs: Runs) -> bool:
     """Whether the residuals of a fit depend neither on an input nor on the direction of motion."""
-    structure, joint, runs = fitted.extension.structure, fitted.fit, fitted.extension.runs or given
+    structure, joint, runs = (
+        extension_fit.extension.structure,
+        extension_fit.fit,
+        extension_fit.extension.runs or default_runs,
+    )
     model = fitted_model(joint, structure)
     try:
         tests = run_residual_tests(
@@ -553,7 +557,7 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
     if all(rest_evidence(run, structure) is not None for run in runs):
         # Another finding states the evidence of rest, or that rest is assumed.
         return []
-    taken = joint.initial if joint.initial == "rest" else "caputo", structure.offset
+    own_setting = joint.initial if joint.initial == "rest" else "caputo", structure.offset
 
     def squares_ratio(other: JointFit) -> float:
         return max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
@@ -561,21 +565,23 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
     own = _gains(joint, structure)
     worst: tuple[float, Finding] | None = None
     for initial, offset in ALTERNATIVE_INITIAL_CONDITIONS if own else ():
-        if (initial, offset) == taken:
+        if (initial, offset) == own_setting:
             continue
-        asked = replace(structure, initial=initial, offset=offset)
+        request = replace(structure, initial=initial, offset=offset)
         refit = partial(fit_output_error, near=joint, refine=False)
-        other = refit_if_accepted(joint, runs, asked, lambda found: squares_ratio(found) <= MAX_SQUARES_RATIO, refit)
+        other = refit_if_accepted(
+            joint, runs, request, lambda candidate: squares_ratio(candidate) <= MAX_SQUARES_RATIO, refit
+        )
         if other is None or other.unstable_optimum is not None:
             continue
         for pair, (gain, error) in _gains(other, structure).items():
-            known, own_error = own.get(pair, (math.nan, math.nan))
-            distance = abs(gain - known) / max(math.hypot(error, own_error), 1e-300)
-            far = abs(gain - known) > MIN_GAIN_CHANGE * max(abs(gain), abs(known))
+            own_gain, own_error = own.get(pair, (math.nan, math.nan))
+            distance = abs(gain - own_gain) / max(math.hypot(error, own_error), 1e-300)
+            far = abs(gain - own_gain) > MIN_GAIN_CHANGE * max(abs(gain), abs(own_gain))
             if far and distance > max(MIN_GAIN_CHANGE_SIGMAS, worst[0] if worst else 0.0):
                 ratio = squares_ratio(other)
-                numbers = {"gain": known, "error": own_error, "other_gain": gain, "other_error": error}
-                words = {"taken": _name_start(*taken), "other": _name_start(initial, offset), "ratio": ratio}
+                numbers = {"gain": own_gain, "error": own_error, "other_gain": gain, "other_error": error}
+                words = {"taken": _name_start(*own_setting), "other": _name_start(initial, offset), "ratio": ratio}
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
                 worst = distance, make_finding("start_not_told", **about, **numbers, **words)
     return [worst[1]] if worst else []

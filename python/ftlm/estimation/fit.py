@@ -62,9 +62,9 @@ def make_model(
     """Return the structure of the task as a model with all parameters fixed."""
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
     steps = {run.step for run in task.runs}
-    known = {"step": steps.pop()} if len(steps) == 1 else {}
-    told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **known, **about}
-    return Model(structure, orders=orders, units=units, m=m, about=told)
+    step_entry = {"step": steps.pop()} if len(steps) == 1 else {}
+    details = {"method": method, "runs": ", ".join(r.name for r in task.runs), **step_entry, **about}
+    return Model(structure, orders=orders, units=units, m=m, about=details)
 
 
 def check_no_friction(structure: Structure, method: str) -> None:

@@ -190,7 +190,7 @@ DEFAULT_START_ORDERS = (0.0, 1.0, 2.0)
 MAX_WARM_STARTS = 9
 
 
-def warm_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[str, float]]:
+def warm_starts(problem: FreeProblem, guess: Mapping[str, float]) -> list[dict[str, float]]:
     """Return warm starts from values by name.
 
     A coefficient without a value starts at 0, so its term has no effect at first. An order without a value starts at
@@ -202,10 +202,10 @@ def warm_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[s
         A name that is not free, nothing that is, or a value that is none or out of its bounds.
     """
     bounds = dict(zip(problem.names, problem.all_bounds, strict=True))
-    check_known("start value", known, problem.names)
-    if not known:
+    check_known("start value", guess, problem.names)
+    if not guess:
         raise ModelError(f"{parameter('start')} names none of the free parameters: {', '.join(problem.names)}")
-    for name, value in known.items():
+    for name, value in guess.items():
         low, high = bounds[name]
         if not low <= real_number(f"start value of {name}", value) <= high:
             raise ModelError(
@@ -213,8 +213,8 @@ def warm_starts(problem: FreeProblem, known: Mapping[str, float]) -> list[dict[s
             )
     places: dict[str, list[float]] = {}
     for name, (low, high) in bounds.items():
-        if name in known:
-            places[name] = [float(known[name])]
+        if name in guess:
+            places[name] = [float(guess[name])]
         elif name in problem.orders:
             places[name] = [v for v in DEFAULT_START_ORDERS if low <= v <= high] or [0.5 * (low + high)]
         else:
@@ -235,23 +235,23 @@ def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float
         The model has other outputs.
     """
     check_known("output of start", model.outputs, problem.structure.outputs)
-    found = {**model.orders, **model.coefficients, **more}
-    there = {e.output: e for e in model.equations}
+    values = {**model.orders, **model.coefficients, **more}
+    items = {e.output: e for e in model.equations}
 
     def set_order(order: Order, value: Order) -> None:
         if order.is_single and not value.names:
-            found.setdefault(order.names[0], value.constant)
+            values.setdefault(order.names[0], value.constant)
 
     for item in problem.structure.equations:
-        other = there.get(item.output)
+        other = items.get(item.output)
         if other is None:
             continue
         set_order(item.order, other.order)
-        named = {t.name: t for t in other.terms if t.name is not None}
+        terms_by_name = {t.name: t for t in other.terms if t.name is not None}
         for term in item.terms:
-            if term.coefficient in named:
-                set_order(term.order, named[str(term.coefficient)].order)
-    return {n: v for n, v in found.items() if n in problem.names}
+            if term.coefficient in terms_by_name:
+                set_order(term.order, terms_by_name[str(term.coefficient)].order)
+    return {n: v for n, v in values.items() if n in problem.names}
 
 
 #: Relative difference up to which two signals are multiples of each other: rounding of files.

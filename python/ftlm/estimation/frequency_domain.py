@@ -121,20 +121,24 @@ def identify_frequency(
         return _identify_circuit(
             as_frequency_data(data), structure, weights, fixed, bounds, start, progress, orders, delay
         )
-    wanted, limits = check_bounds(_structure(structure, orders, fixed, delay), bounds, start)
-    records = _match_records(as_frequency_data(data), wanted)
+    wanted_structure, limits = check_bounds(_structure(structure, orders, fixed, delay), bounds, start)
+    records = _match_records(as_frequency_data(data), wanted_structure)
     kind, weight = _weights(records, weights)
-    _user_start(ResponseProblem(wanted, records, weight), start)
+    _user_start(ResponseProblem(wanted_structure, records, weight), start)
 
-    def fit(asked: Structure, only: Mapping[str, float] | None) -> tuple[FrequencyIdentification, Mapping[str, float]]:
-        problem = ResponseProblem(asked, records, weight)
-        given = start if only is None else only
-        known = {n: v for n, v in given.items() if n in problem.names} if isinstance(given, Mapping) else given
-        found = _fit_response(problem, records, weight, kind, known, progress, alone=only is not None)
-        return found, found.values
+    def fit(form: Structure, only: Mapping[str, float] | None) -> tuple[FrequencyIdentification, Mapping[str, float]]:
+        problem = ResponseProblem(form, records, weight)
+        guess_source = start if only is None else only
+        guess = (
+            {n: v for n, v in guess_source.items() if n in problem.names}
+            if isinstance(guess_source, Mapping)
+            else guess_source
+        )
+        result = _fit_response(problem, records, weight, kind, guess, progress, alone=only is not None)
+        return result, result.values
 
-    result, found = fit_within_bounds(wanted, limits, fit)
-    result = replace(result, findings=(*result.findings, *found))
+    result, bound_findings = fit_within_bounds(wanted_structure, limits, fit)
+    result = replace(result, findings=(*result.findings, *bound_findings))
     return _log_result(result)
 
 
@@ -168,10 +172,10 @@ def _identify_circuit(
     check_intervals(bounds or {})
     if not circuit.free_names:
         raise ModelError(f"no parameter of {circuit} is free; leave {parameter('fixed')} out")
-    named = [replace(r, output=r.output or "U", input=r.input or "I", unit=r.unit or "Ω") for r in records]
-    kind, weight = _weights(named, weights)
-    problem = CircuitProblem(circuit, named, weight, bounds or {})
-    return _log_result(_fit_response(problem, named, weight, kind, start, progress, alone=False))
+    labeled = [replace(r, output=r.output or "U", input=r.input or "I", unit=r.unit or "Ω") for r in records]
+    kind, weight = _weights(labeled, weights)
+    problem = CircuitProblem(circuit, labeled, weight, bounds or {})
+    return _log_result(_fit_response(problem, labeled, weight, kind, start, progress, alone=False))
 
 
 def _fit_response(
@@ -204,14 +208,14 @@ def _fit_response(
     # Starts race on no more frequencies than tell them apart; the best goes on with all.
     few, light = zip(*(_subsample_data(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
     racing = problem if count <= 2 * MAX_MULTISTART_FREQUENCIES else problem.with_records(few, light)
-    begun = _user_start(racing, start)
-    begun += [] if alone else racing.initial_guesses()
+    guesses = _user_start(racing, start)
+    guesses += [] if alone else racing.initial_guesses()
     course.advance_to(STARTS_END_FRACTION)
     fits = []
-    for values in begun:
+    for values in guesses:
         fits.append(_fit(racing, values))
         course.advance_to(
-            STARTS_END_FRACTION + (MULTISTART_END_FRACTION - STARTS_END_FRACTION) * len(fits) / len(begun)
+            STARTS_END_FRACTION + (MULTISTART_END_FRACTION - STARTS_END_FRACTION) * len(fits) / len(guesses)
         )
     fits = [f for f in fits if math.isfinite(f.cost)]
     if not fits:
@@ -230,10 +234,10 @@ def _fit_response(
     if start is None and np.any((placed := problem.sort_groups(best.values)) != best.values):
         best = _fit(problem, placed)
     course.advance_to(1.0)
-    held = [words[k] for k in best.active_constraints]
-    at_limit = [n for n in problem.exponents if exponent_bound(n) in held]
+    active_bounds = [words[k] for k in best.active_constraints]
+    at_limit = [n for n in problem.exponents if exponent_bound(n) in active_bounds]
     if at_limit and not _is_bound_significant(problem, records, best, kind):
-        held = [text for text in held if text not in map(exponent_bound, at_limit)]
+        active_bounds = [text for text in active_bounds if text not in map(exponent_bound, at_limit)]
     ends = [f if racing is problem else _fit_again(problem, racing, f) for f in _near_optima(fits, racing, kind)]
     return _result(
         problem,
@@ -241,7 +245,7 @@ def _fit_response(
         best,
         kind,
         (reached, len(fits)),
-        held,
+        active_bounds,
         exact=best.cost <= NEGLIGIBLE_RESIDUAL_SHARE**2 * total,
         ends=ends,
     )
@@ -254,31 +258,31 @@ def _structure(
     delay: Mapping[str, float | tuple[float, float]] | None,
 ) -> Structure:
     """Return the structure to identify; raise for nonlinear terms, offsets, sensor filters and laws."""
-    wanted = equation(structure) if isinstance(structure, str) else structure
-    if not isinstance(wanted, Structure):
+    target = equation(structure) if isinstance(structure, str) else structure
+    if not isinstance(target, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; give an equation: 'D^alpha y = a0 y + b0 u'")
     if fixed:
-        check_known("fixed coefficient", fixed, wanted.coefficient_names)
-    wanted = wanted.with_delays(delay or {}).with_orders(orders or {}).with_coefficients(fixed or {})
+        check_known("fixed coefficient", fixed, target.coefficient_names)
+    target = target.with_delays(delay or {}).with_orders(orders or {}).with_coefficients(fixed or {})
     lacking = "which a frequency response does not know"
-    if wanted.has_friction:
+    if target.has_friction:
         raise ModelError(f"the equations have friction, {lacking}; identify runs over time, or leave it out")
-    check_linear(wanted.equations, "a frequency response")
-    if wanted.limits:
-        raise ModelError(f"{wanted.limits[0].signal} saturates or has a dead zone, {lacking}; identify runs over time")
-    if wanted.offset != "none":
+    check_linear(target.equations, "a frequency response")
+    if target.limits:
+        raise ModelError(f"{target.limits[0].signal} saturates or has a dead zone, {lacking}; identify runs over time")
+    if target.offset != "none":
         raise ModelError(f"the equations have an offset, {lacking}; leave '+ c' out, or {parameter('offset')}")
-    if wanted.sensor_filter is not None:
+    if target.sensor_filter is not None:
         raise ModelError("the structure has a sensor filter; divide the data by its response, and leave it out")
-    if wanted.coefficient_law:
+    if target.coefficient_law:
         raise ModelError(
             f"the structure has a law of its coefficients, which this fit does not keep; leave {parameter('laws')} out"
         )
-    if not (wanted.order_names or wanted.coefficient_names or wanted.free_inputs):
+    if not (target.order_names or target.coefficient_names or target.free_inputs):
         raise ModelError(
             "no parameter is free: every order, coefficient and delay is a number; give the unknown ones names"
         )
-    return replace(wanted, coupling="simulated", initial="auto")
+    return replace(target, coupling="simulated", initial="auto")
 
 
 def _match_records(records: Sequence[FrequencyData], structure: Structure) -> list[FrequencyData]:
@@ -287,31 +291,31 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
     inputs = tuple(s for s in structure.signals if s not in outputs)
     if not inputs:
         raise ModelError(f"the equations of {', '.join(outputs)} have no input; add an input term, as in '+ b0 u'")
-    found = []
+    matches = []
     for record in records:
         own = {"output": record.output, "input": record.input}
-        for side, known in (("output", outputs), ("input", inputs)):
+        for side, names in (("output", outputs), ("input", inputs)):
             if not own[side]:
-                if len(known) > 1:
+                if len(names) > 1:
                     raise DataError(
-                        f"{record.name} does not say its {side}, and the equations have {', '.join(known)}; say "
+                        f"{record.name} does not say its {side}, and the equations have {', '.join(names)}; say "
                         f"{parameter(side)} when loading it"
                     )
-                own[side] = known[0]
-            elif own[side] not in known:
+                own[side] = names[0]
+            elif own[side] not in names:
                 raise DataError(
                     f"{record.name} has the {side} {own[side]!r}, which is not an {side} of the equations; these have "
-                    f"{', '.join(known)}: write the equation in the names of the data, or say {parameter(side)} when "
+                    f"{', '.join(names)}: write the equation in the names of the data, or say {parameter(side)} when "
                     "loading"
                 )
-        found.append(replace(record, output=own["output"], input=own["input"]))
+        matches.append(replace(record, output=own["output"], input=own["input"]))
     for output in outputs:
-        if not any(r.output == output for r in found):
+        if not any(r.output == output for r in matches):
             raise DataError(f"no record is of {output}, which has an equation; give one, or leave the equation out")
     for name in inputs:
-        if not any(r.input == name for r in found):
+        if not any(r.input == name for r in matches):
             raise DataError(f"no record is from {name}, an input of the equations; give one, or leave it out")
-    return found
+    return matches
 
 
 def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, list[Floats]]:
@@ -328,15 +332,15 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
             f"{parameter('weights', weights)} is not known; use 'auto', 'relative', 'uniform', 'deviation' or "
             "standard deviations"
         )
-    known = [r.deviation for r in records]
-    if weights == "deviation" or (weights == "auto" and all(d is not None for d in known)):
-        without = [r.name for r, d in zip(records, known, strict=True) if d is None]
+    deviations = [r.deviation for r in records]
+    if weights == "deviation" or (weights == "auto" and all(d is not None for d in deviations)):
+        without = [r.name for r, d in zip(records, deviations, strict=True) if d is None]
         if without:
             raise DataError(
                 f"{without[0]} states no standard deviation; use {parameter('weights', 'relative')} or give "
                 f"{parameter('deviation')}"
             )
-        return "deviation", [1.0 / d for d in known if d is not None]
+        return "deviation", [1.0 / d for d in deviations if d is not None]
     if weights == "uniform":
         return "uniform", [np.ones(r.frequency.size) for r in records]
     for record in records:
@@ -352,10 +356,12 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
 
 def _given_deviations(record: FrequencyData, weights: object) -> Floats:
     """Return standard deviations given by the user in place of those of a record."""
-    given = as_floats("weights", weights)
-    if given.shape != record.frequency.shape:
-        raise DataError(f"weights has shape {given.shape}, the data {record.frequency.shape}; give one deviation each")
-    return np.asarray(replace(record, deviation=given).deviation)
+    deviations = as_floats("weights", weights)
+    if deviations.shape != record.frequency.shape:
+        raise DataError(
+            f"weights has shape {deviations.shape}, the data {record.frequency.shape}; give one deviation each"
+        )
+    return np.asarray(replace(record, deviation=deviations).deviation)
 
 
 def _subsample_data(record: FrequencyData, weight: Floats) -> tuple[FrequencyData, Floats]:
@@ -363,9 +369,9 @@ def _subsample_data(record: FrequencyData, weight: Floats) -> tuple[FrequencyDat
     if record.frequency.size <= MAX_MULTISTART_FREQUENCIES:
         return record, weight
     order = np.argsort(record.frequency, kind="stable")
-    kept = order[np.linspace(0, order.size - 1, MAX_MULTISTART_FREQUENCIES).astype(int)]
-    return replace(record, frequency=record.frequency[kept], response=record.response[kept], deviation=None), weight[
-        kept
+    rows = order[np.linspace(0, order.size - 1, MAX_MULTISTART_FREQUENCIES).astype(int)]
+    return replace(record, frequency=record.frequency[rows], response=record.response[rows], deviation=None), weight[
+        rows
     ]
 
 
@@ -378,12 +384,12 @@ def _user_start(problem: ResponseProblem, start: Mapping[str, float] | None) -> 
     check_known("start", start, problem.names)
     usual = problem.default_start()
     values = np.array([float(start.get(n, usual.get(n, 0.0))) for n in problem.names])
-    begun, (rows, limits, _) = problem.in_problem_units(values), problem.constraints()
-    if not (np.all(np.isfinite(values)) and np.all(rows @ begun <= limits + 1e-9)):
+    point, (rows, limits, _) = problem.in_problem_units(values), problem.constraints()
+    if not (np.all(np.isfinite(values)) and np.all(rows @ point <= limits + 1e-9)):
         raise ModelError(
             f"{parameter('start')} is out of the bounds of orders or delays, or not finite; choose values within them"
         )
-    return [begun]
+    return [point]
 
 
 @dataclass(frozen=True)
@@ -405,10 +411,10 @@ def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
 
     if not np.all(np.isfinite(residuals(values))):
         return ResponseFit(values, math.inf, False, ())
-    found, cost, status, _, active = _core.minimize(
+    optimum, cost, status, _, active = _core.minimize(
         residuals, lambda numbers: problem.residuals(numbers)[1], values, rows, limits, signal_norm=size
     )
-    return ResponseFit(found, cost, status == "converged", active)
+    return ResponseFit(optimum, cost, status == "converged", active)
 
 
 def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
@@ -426,17 +432,17 @@ def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) 
 def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
     """Return distinct optima of the multistart that are nearly as likely as the best."""
     ranked = sorted(fits, key=lambda f: f.cost)
-    kept, seen = [], [problem.residuals(ranked[0].values, jacobian=False)[0]]
+    optima, series = [], [problem.residuals(ranked[0].values, jacobian=False)[0]]
     for fit in ranked[1:]:
-        left = problem.residuals(fit.values, jacobian=False)[0]
-        if _log_likelihood_difference(fit.cost, ranked[0].cost, kind, left.size) > SECOND_OPTIMUM_LOG_LIKELIHOOD:
+        residuals = problem.residuals(fit.values, jacobian=False)[0]
+        if _log_likelihood_difference(fit.cost, ranked[0].cost, kind, residuals.size) > SECOND_OPTIMUM_LOG_LIKELIHOOD:
             break
         # Elements that change places are one and the same model.
-        noise = ranked[0].cost / left.size
-        if all(float(np.sum((left - other) ** 2)) > SAME_MODEL_POWER * noise for other in seen):
-            kept.append(fit)
-            seen.append(left)
-    return kept
+        noise = ranked[0].cost / residuals.size
+        if all(float(np.sum((residuals - other) ** 2)) > SAME_MODEL_POWER * noise for other in series):
+            optima.append(fit)
+            series.append(residuals)
+    return optima
 
 
 def _is_bound_significant(
@@ -444,9 +450,9 @@ def _is_bound_significant(
 ) -> bool:
     """Whether exponents above their bound explain an impedance better than chance does, at 99 %."""
     free = ResponseProblem(problem.structure, records, [r.weight for r in problem.records], bound_exponents=False)
-    beyond = _fit(free, best.values)
+    unbounded = _fit(free, best.values)
     count = 2 * sum(r.frequency.size for r in problem.records)
-    return 2.0 * _log_likelihood_difference(best.cost, beyond.cost, kind, count) > chi_squared_99(1)
+    return 2.0 * _log_likelihood_difference(best.cost, unbounded.cost, kind, count) > chi_squared_99(1)
 
 
 def _result(
@@ -455,16 +461,16 @@ def _result(
     best: ResponseFit,
     kind: str,
     reached: tuple[int, int],
-    held: list[str],
+    active_bounds: list[str],
     *,
     exact: bool,
     ends: Sequence[ResponseFit] = (),
 ) -> FrequencyIdentification:
     values = problem.in_seconds(best.values)
     rising = _frequency_order(records)
-    left = problem.residuals(best.values)[0][rising]
-    series = _series(records, left)
-    free = left.size - values.size
+    residual_values = problem.residuals(best.values)[0][rising]
+    series = _series(records, residual_values)
+    free = residual_values.size - values.size
     chi = best.cost / free
     too_large = kind == "deviation" and best.cost > chi_squared_99(free)
     findings: list[Finding] = []
@@ -490,8 +496,8 @@ def _result(
         findings.append(make_finding("response_not_white"))
     if not best.converged:
         findings.append(make_finding("response_not_converged"))
-    findings += [make_finding("response_on_bound", bound=bound) for bound in held]
-    falls = [(end, _log_likelihood_difference(end.cost, best.cost, kind, left.size)) for end in ends]
+    findings += [make_finding("response_on_bound", bound=bound) for bound in active_bounds]
+    falls = [(end, _log_likelihood_difference(end.cost, best.cost, kind, residual_values.size)) for end in ends]
     optima = [
         (problem.in_seconds(end.values), fall, errors_of(covariance_at(end)))
         for end, fall in falls
@@ -499,18 +505,18 @@ def _result(
     ]
     findings += second_optimum_findings(problem.names, values, standard, optima)
     findings += _identifiability_findings(problem, values, standard)
-    named = dict(zip(names, values.tolist(), strict=True))
+    values_by_name = dict(zip(names, values.tolist(), strict=True))
     model: Model | Circuit
     if isinstance(problem, CircuitProblem):
-        model = problem.circuit.with_values(named)
+        model = problem.circuit.with_values(values_by_name)
     else:
-        model = _model(problem, records, named, values, covariance, standard, findings)
+        model = _model(problem, records, values_by_name, values, covariance, standard, findings)
     intervals = problem.intervals(values, {n: factor * e for n, e in standard.items()})
     return FrequencyIdentification(
         model,
         tuple(records),
         kind,
-        named,
+        values_by_name,
         standard,
         intervals,
         names,
@@ -546,11 +552,11 @@ def _frequency_order(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
     return np.concatenate([every, at + every])
 
 
-def _series(records: Sequence[FrequencyData], left: Floats) -> list[Floats]:
-    """Return real and imaginary parts of the residuals of every record, in the order of `left`."""
+def _series(records: Sequence[FrequencyData], residuals: Floats) -> list[Floats]:
+    """Return real and imaginary parts of the residuals of every record, in the order of `residuals`."""
     ends = np.cumsum([r.frequency.size for r in records])
-    half = left.size // 2
-    return [*np.split(left[:half], ends[:-1]), *np.split(left[half:], ends[:-1])]
+    half = residuals.size // 2
+    return [*np.split(residuals[:half], ends[:-1]), *np.split(residuals[half:], ends[:-1])]
 
 
 def _identifiability_findings(problem: ResponseProblem, values: Floats, standard: Mapping[str, float]) -> list[Finding]:
@@ -570,17 +576,17 @@ def _identifiability_findings(problem: ResponseProblem, values: Floats, standard
 def _model(
     problem: ResponseProblem,
     records: Sequence[FrequencyData],
-    named: Mapping[str, float],
+    values_by_name: Mapping[str, float],
     values: Floats,
     covariance: Floats,
     standard: Mapping[str, float],
     findings: Sequence[Finding],
 ) -> Model:
     """Return the model with its estimate, as stored in its file."""
-    orders = {n: round(named[n], 9) for n in problem.orders}
-    late = {free.signal: named[free.name] for free in problem.structure.free_inputs}
-    found = problem.structure.with_delays(late).with_orders(orders)
-    found = found.with_coefficients({n: named[n] for n in problem.coefficients})
+    orders = {n: round(values_by_name[n], 9) for n in problem.orders}
+    late = {free.signal: values_by_name[free.name] for free in problem.structure.free_inputs}
+    structure = problem.structure.with_delays(late).with_orders(orders)
+    structure = structure.with_coefficients({n: values_by_name[n] for n in problem.coefficients})
     spread = None
     if np.all(np.isfinite(covariance)):
         rows = []
@@ -603,12 +609,12 @@ def _model(
     estimate = Estimate(
         method="frequency-response",
         runs=tuple(dict.fromkeys(r.name for r in records)),
-        values=dict(named),
+        values=dict(values_by_name),
         standard_errors={n: e if math.isfinite(e) else None for n, e in standard.items()},
         covariance=spread,
         findings=tuple(f.to_file() for f in findings) or UNSET,
     )
-    return Model(found, orders, units, None, {"identified from": "frequency response"}, estimate)
+    return Model(structure, orders, units, None, {"identified from": "frequency response"}, estimate)
 
 
 def _student(degrees: int) -> float:

@@ -47,10 +47,10 @@ def curve_frequencies(record: FrequencyData) -> Floats:
 
     One frequency lies between each two measured ones, so that every measured point is drawn as a separate dot.
     """
-    measured = np.unique(record.frequency)
-    between = np.sqrt(measured[1:] * measured[:-1])
-    smooth = np.geomspace(measured[0], measured[-1], CURVE_POINTS) if measured.size > 1 else measured
-    return np.unique(np.concatenate([measured, between, smooth]))
+    frequencies = np.unique(record.frequency)
+    between = np.sqrt(frequencies[1:] * frequencies[:-1])
+    smooth = np.geomspace(frequencies[0], frequencies[-1], CURVE_POINTS) if frequencies.size > 1 else frequencies
+    return np.unique(np.concatenate([frequencies, between, smooth]))
 
 
 def _place_of(model: Model, record: FrequencyData) -> tuple[int, int]:
@@ -108,9 +108,9 @@ def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineCh
     angles = record.phase[order] - 360.0 * np.round(np.median(record.phase[order] - phase[at]) / 360.0)
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
 
-    def chart(kind: str, label: str, values: Floats, half_width: Floats | None, measured: Floats) -> LineChart:
+    def chart(kind: str, label: str, values: Floats, half_width: Floats | None, measurements: Floats) -> LineChart:
         dots = np.full(omega.size, np.nan)
-        dots[at] = measured
+        dots[at] = measurements
         lines = [("model", values), ("measured", dots)]
         return frequency_chart(f"{title}: {kind}", label, omega, lines, half_width)
 
@@ -308,8 +308,8 @@ class FrequencyIdentification:
         top, bottom = self.system.polynomials()
         output, input = self.data[0].output, self.data[0].input
         # An inductor in series is a derivative of the current.
-        made = Ratio(top, bottom, 0.0).model(output, input, improper_order=MAX_IMPROPER_ORDER)
-        return replace(made, units={output: "V", input: "A"})
+        model = Ratio(top, bottom, 0.0).model(output, input, improper_order=MAX_IMPROPER_ORDER)
+        return replace(model, units={output: "V", input: "A"})
 
     @property
     def orders(self) -> dict[str, float]:
@@ -347,8 +347,8 @@ class FrequencyIdentification:
     @property
     def parameters(self) -> dict[str, Parameter]:
         """Orders, coefficients and delays by name, with standard errors, intervals and units."""
-        given = self.system.values if isinstance(self.system, Circuit) else self.system.coefficients
-        values = {**self.values, **given}
+        coefficients = self.system.values if isinstance(self.system, Circuit) else self.system.coefficients
+        values = {**self.values, **coefficients}
         return parameter_estimates(
             self.system, values, errors=self.standard_errors, intervals=self.intervals, free=self.names
         )
@@ -382,27 +382,29 @@ class FrequencyIdentification:
         return self._assess(None)
 
     def _assess(self, others: tuple[ResponseError, ...] | None, data: Sequence[FrequencyData] = ()) -> Verdict:
-        found: list[Finding] = []
+        findings: list[Finding] = []
         own = self.errors
         for error in (*own, *(others or ())):
             if not error.rms <= 100 * MAX_RELATIVE_ERROR:
                 subject = {"run": error.name, "output": error.output, "input": error.input}
-                found.append(make_finding("response_missed", **subject, rms=error.rms))
-        found += self._unstable_poles()
-        found += [group.first_finding for group in group_findings(self.findings)]
+                findings.append(make_finding("response_missed", **subject, rms=error.rms))
+        findings += self._unstable_poles()
+        findings += [group.first_finding for group in group_findings(self.findings)]
         if others is not None:
             most = max(e.rms for e in own)
-            lost = [e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR]
-            if lost:
-                found.append(make_finding("response_lost", run=lost[0].name, own=most, rms=lost[0].rms))
+            failures = [
+                e for e in others if e.rms > VALIDATION_ERROR_RATIO * most and e.rms > 100 * MIN_VALIDATION_ERROR
+            ]
+            if failures:
+                findings.append(make_finding("response_lost", run=failures[0].name, own=most, rms=failures[0].rms))
         same = any(np.array_equal(a.response, b.response) for a in data for b in self.data)
         if others is None or same:
-            found.append(make_finding("response_not_validated"))
-        against = verdict_from(found)
+            findings.append(make_finding("response_not_validated"))
+        against = verdict_from(findings)
         if against is not None:
             return against
-        shown = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
-        return Verdict(TRUST_LEVEL, f"it predicts validation responses (error {shown}), residuals are noise")
+        errors_text = ", ".join(f"{e.name} {e.rms:.2g} %" for e in others or ())
+        return Verdict(TRUST_LEVEL, f"it predicts validation responses (error {errors_text}), residuals are noise")
 
     def _unstable_poles(self) -> list[Finding]:
         """Return a finding on poles with a positive real part, if there are any."""
@@ -420,8 +422,8 @@ class FrequencyIdentification:
         """Return the summary: verdict, equations, parameters, modes, errors and warnings."""
         from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 
-        judged = self.verdict if validation is None else validation.verdict
-        lines = [*wrap_text(str(judged)), ""]
+        judgement = self.verdict if validation is None else validation.verdict
+        lines = [*wrap_text(str(judgement)), ""]
         lines += [str(self.system)] if isinstance(self.system, Circuit) else equation_lines(self.system)
         lines.append("")
         lines += self._numbers()
@@ -431,9 +433,9 @@ class FrequencyIdentification:
             lines += ["validation", *_errors_in_words(validation.errors)[1:]]
         if self.chi_squared is not None:
             lines.append(f"residuals over stated deviations: {math.sqrt(self.chi_squared):.3g} (1 of a right model)")
-        same, tried = self.start_counts
+        same, total = self.start_counts
         lines.append(
-            f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {tried} "
+            f"residuals white: {'yes' if self.white else 'no'}; weights: {self.weights}; {same} of {total} "
             "initial guesses ended here"
         )
         if self.information is not None:
@@ -487,7 +489,7 @@ class FrequencyIdentification:
         """
         from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
 
-        shown, more = first_findings(self.findings)
+        first, more = first_findings(self.findings)
         source = self.system
         new = () if validation is None else validation.data
         charts = Section(
@@ -498,7 +500,7 @@ class FrequencyIdentification:
         about = Section(
             "Model",
             [self._equations_html()],
-            warnings=shown,
+            warnings=first,
             more=more,
             tables=[self._parameter_table(), *([] if isinstance(source, Circuit) else behavior_tables(source))],
             figures=[] if isinstance(source, Circuit) else behavior_figures(source),
@@ -543,8 +545,8 @@ class FrequencyIdentification:
         return self.summary()
 
     def _repr_html_(self) -> str:
-        drawn = Markup("").join(Markup(f._repr_html_()) for f in self.figures())
-        return str(verdict_html(self.verdict) + self._equations_html() + self._parameter_table().to_html() + drawn)
+        charts = Markup("").join(Markup(f._repr_html_()) for f in self.figures())
+        return str(verdict_html(self.verdict) + self._equations_html() + self._parameter_table().to_html() + charts)
 
     def _equations_html(self) -> Markup:
         """Return the equations or the circuit as HTML."""
@@ -564,8 +566,8 @@ class FrequencyIdentification:
             return parameter_table(self.system)
         rows: list[list[Cell]] = []
         for p in self.parameters.values():
-            known = [v if math.isfinite(v) else None for v in (p.standard_error, *p.interval)]
-            rows.append([p.name, p.value, *known, unit_html(p.unit)])
+            numbers = [v if math.isfinite(v) else None for v in (p.standard_error, *p.interval)]
+            rows.append([p.name, p.value, *numbers, unit_html(p.unit)])
         return Table("Parameters", ("name", "value", "standard error", "95 % from", "to", "unit"), rows)
 
 
@@ -575,12 +577,12 @@ def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyDa
         return replace(record, output=record.output or "U", input=record.input or "I", unit=record.unit or "Ω")
     inputs = response_inputs(model, coupled=True)
     out = {"output": record.output, "input": record.input}
-    for side, known in (("output", model.outputs), ("input", inputs)):
-        if not out[side] and len(known) == 1:
-            out[side] = known[0]
-        if out[side] not in known:
+    for side, names in (("output", model.outputs), ("input", inputs)):
+        if not out[side] and len(names) == 1:
+            out[side] = names[0]
+        if out[side] not in names:
             raise DataError(
-                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(known)}; say "
+                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(names)}; say "
                 f"{parameter(side)} when loading it"
             )
     return replace(record, output=out["output"], input=out["input"])

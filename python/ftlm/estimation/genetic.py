@@ -199,9 +199,9 @@ def default_bounds(
     name: str, records: Sequence[Record], structure: Structure, values: Mapping[str, tuple[float, ...]]
 ) -> tuple[float, float]:
     """Return the default bounds of a coefficient; see :class:`GeneticAlgorithm`."""
-    stated = structure.reference.get(name, 0.0)
-    if stated:
-        return -STATED_RANGE * abs(stated), STATED_RANGE * abs(stated)
+    reference = structure.reference.get(name, 0.0)
+    if reference:
+        return -STATED_RANGE * abs(reference), STATED_RANGE * abs(reference)
     middle = {n: 0.5 * (v[0] + v[-1]) for n, v in values.items()}
     item, term = next((e, t) for e in structure.equations for t in e.terms if t.coefficient == name)
     eta = max(item.order.at(middle) - term.order.at(middle), 0.0)
@@ -256,45 +256,50 @@ def genetic_search(
             f"slice the runs, or give the structure {parameter('initial', 'rest')}"
         )
     problem = GeneticProblem(records, structure, settings, check_threads(threads))
-    wanted = settings.evaluations or problem.size
-    if settings.evaluations is None and wanted > MAX_DEFAULT_EVALUATIONS:
+    evaluations = settings.evaluations or problem.size
+    if settings.evaluations is None and evaluations > MAX_DEFAULT_EVALUATIONS:
         raise ModelError(
-            f"the order grid has {wanted} candidates, too many to evaluate one by one; give "
+            f"the order grid has {evaluations} candidates, too many to evaluate one by one; give "
             "GeneticAlgorithm(evaluations=…)"
         )
-    wanted = max(wanted, 2 * settings.population)
-    total = wanted * len(settings.seeds)
+    evaluations = max(evaluations, 2 * settings.population)
+    total = evaluations * len(settings.seeds)
     if isinstance(progress, Progress):
         name = "the stage" if structure.has_order_law else structure.outputs[0]
         progress.expect(f"the genetic algorithm on {name}", *_seconds(problem, settings.population, total))
     ends: dict[int, _ParentThreshold] = {}
     for number, seed in enumerate(settings.seeds):
 
-        def report_evaluations(count: int, before: int = number * wanted) -> None:
+        def report_evaluations(count: int, count_before: int = number * evaluations) -> None:
             if progress is not None:
-                progress(min(before + count, total), total)
+                progress(min(count_before + count, total), total)
 
-        ends[int(seed)] = _evolve(pygad.GA, problem, settings.population, int(seed), wanted, report_evaluations)
-    best = min(ends.values(), key=lambda kept: kept.best)
+        ends[int(seed)] = _evolve(pygad.GA, problem, settings.population, int(seed), evaluations, report_evaluations)
+    best = min(ends.values(), key=lambda end: end.best)
     if not math.isfinite(best.best):
         raise ModelError("no candidate of the genetic algorithm had a finite error; narrow its bounds")
     orders, coefficients = problem.values_by_name(best.genes)
-    errors = {seed: kept.best for seed, kept in ends.items()}
-    return GeneticRun(orders, coefficients, errors, {s: kept.count for s, kept in ends.items()}, problem.bounds)
+    errors = {seed: end.best for seed, end in ends.items()}
+    return GeneticRun(orders, coefficients, errors, {s: end.count for s, end in ends.items()}, problem.bounds)
 
 
 def _seconds(problem: GeneticProblem, population: int, evaluations: int) -> tuple[float, float]:
     """Return the shortest and longest expected time [s], extrapolated from the first generation."""
     low, high = np.array([problem.bounds[n] for n in problem.names]).T
     genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     problem.errors(genes, math.inf)
-    each = (time.perf_counter() - begun) / population
+    each = (time.perf_counter() - start_time) / population
     return DURATION_FACTOR_RANGE[0] * each * evaluations, DURATION_FACTOR_RANGE[1] * each * evaluations
 
 
 def _evolve(
-    algorithm: Any, problem: GeneticProblem, population: int, seed: int, wanted: int, told: Callable[[int], None]
+    algorithm: Any,
+    problem: GeneticProblem,
+    population: int,
+    seed: int,
+    evaluations: int,
+    listener: Callable[[int], None],
 ) -> _ParentThreshold:
     """Run the genetic algorithm from one seed until its evaluations are spent.
 
@@ -303,28 +308,28 @@ def _evolve(
     changes no generation.
     """
     parents = max(2, round(PARENT_FRACTION * population))
-    kept = _ParentThreshold(parents)
+    threshold = _ParentThreshold(parents)
     bounds = [problem.bounds[n] for n in problem.names]
     low, high = np.array(bounds).T
 
     def check_budget(_: Any) -> str | None:
-        return "stop" if kept.count >= wanted else None
+        return "stop" if threshold.count >= evaluations else None
 
-    def crossover(chosen: Any, size: tuple[int, int], running: Any) -> Floats:
-        return simulated_binary_crossover(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
+    def crossover(parents: Any, size: tuple[int, int], running: Any) -> Floats:
+        return simulated_binary_crossover(np.asarray(parents, dtype=np.float64), size, running.numpy_random_generator)
 
     def mutation(children: Any, running: Any) -> Floats:
         return polynomial_mutation(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
 
     def fitness(_: Any, genes: Any, __: Any) -> list[float]:
         candidates = np.asarray(genes, dtype=np.float64)
-        errors = problem.errors(candidates, kept.limit)
-        kept.add_generation(errors, candidates)
-        told(kept.count)
+        errors = problem.errors(candidates, threshold.limit)
+        threshold.add_generation(errors, candidates)
+        listener(threshold.count)
         return np.where(np.isfinite(errors), -errors, INFEASIBLE_FITNESS).tolist()  # type: ignore[no-any-return]
 
     algorithm(
-        num_generations=MAX_GENERATION_FACTOR * math.ceil(wanted / (population - parents)),
+        num_generations=MAX_GENERATION_FACTOR * math.ceil(evaluations / (population - parents)),
         on_generation=check_budget,
         num_parents_mating=parents,
         keep_elitism=parents,
@@ -340,7 +345,7 @@ def _evolve(
         suppress_warnings=True,
         save_best_solutions=False,
     ).run()
-    return kept
+    return threshold
 
 
 def simulated_binary_crossover(parents: Floats, size: tuple[int, int], random: Any) -> Floats:
@@ -361,8 +366,8 @@ def polynomial_mutation(children: Floats, low: Floats, high: Floats, random: Any
     u = random.random_sample(children.shape)
     power = 1.0 / (MUTATION_DISTRIBUTION_INDEX + 1.0)
     move = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
-    moved = random.random_sample(children.shape) < 1.0 / children.shape[1]
-    return np.clip(children + np.where(moved, move * (high - low), 0.0), low, high)
+    is_mutated = random.random_sample(children.shape) < 1.0 / children.shape[1]
+    return np.clip(children + np.where(is_mutated, move * (high - low), 0.0), low, high)
 
 
 class _ParentThreshold:
@@ -418,18 +423,18 @@ def differential_evolution_search(
             "differential evolution estimates no initial terms and no offset; cut the runs so that they start at rest"
         )
     problem = GeneticProblem(records, structure, settings, check_threads(threads))
-    wanted = settings.evaluations or problem.size
+    evaluation_count = settings.evaluations or problem.size
     bounds = [problem.bounds[n] for n in problem.names]
     generation = CANDIDATES_PER_GENE * sum(low < high for low, high in bounds)
-    generations = max(0, math.ceil(wanted / generation) - 1)
-    total, done = (generations + 1) * generation * len(settings.seeds), 0
+    generations = max(0, math.ceil(evaluation_count / generation) - 1)
+    total, count = (generations + 1) * generation * len(settings.seeds), 0
 
     def errors(columns: Floats) -> Floats:
-        nonlocal done
+        nonlocal count
         rows = np.ascontiguousarray(columns.T if columns.ndim == 2 else columns[None, :])
-        done += rows.shape[0]
+        count += rows.shape[0]
         if progress is not None:
-            progress(min(done, total), total)
+            progress(min(count, total), total)
         # Only comparisons count, and the spread of errors over hundreds of decades is not a number.
         with np.errstate(divide="ignore"):
             return np.clip(np.log(problem.errors(rows, math.inf)), -MAX_LOG_ERROR, MAX_LOG_ERROR)
@@ -507,8 +512,8 @@ class GeneticAlgorithm:
                 f"{setting('evaluations')} {self.evaluations!r} is less than two generations of {self.population}; "
                 "give more"
             )
-        given = self.seeds if isinstance(self.seeds, Iterable) and not isinstance(self.seeds, str) else [None]
-        seeds = [whole_number(s) for s in itertools.islice(given, MAX_SEEDS + 1)]
+        seed_values = self.seeds if isinstance(self.seeds, Iterable) and not isinstance(self.seeds, str) else [None]
+        seeds = [whole_number(s) for s in itertools.islice(seed_values, MAX_SEEDS + 1)]
         if not 0 < len(seeds) <= MAX_SEEDS or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
             raise ModelError(
                 f"{setting('seeds')} {short_repr(self.seeds)}: give 1 to {MAX_SEEDS} whole numbers from 0 to 4294967295"
@@ -558,7 +563,7 @@ class GeneticAlgorithm:
             low, high = min(end.errors.values()), max(end.errors.values())
             if high > MAX_SEED_ERROR_RATIO * low:
                 findings.append(make_finding("seeds_disagree", output=name, low=low, high=high))
-        used = {
+        options = {
             "method": self.name,
             "norm": self.norm,
             "m": record.m,
@@ -569,4 +574,4 @@ class GeneticAlgorithm:
             "errors": {name: {str(seed): e for seed, e in end.errors.items()} for name, end in ends.items()},
             "evaluations": {name: sum(end.evaluations.values()) for name, end in ends.items()},
         }
-        return Fit(task, self.name, model, len(orders) + len(coefficients), used, findings, at_optimum=False)
+        return Fit(task, self.name, model, len(orders) + len(coefficients), options, findings, at_optimum=False)

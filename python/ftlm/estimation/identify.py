@@ -109,7 +109,7 @@ def fit_with_offset_decision(
             return fit
         return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit)])
     try:
-        asked = replace(structure, offset="constant")
+        request = replace(structure, offset="constant")
     except ModelError as error:
         # One of the initial terms that were given is what an offset integrates to.
         return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
@@ -117,7 +117,7 @@ def fit_with_offset_decision(
     if twin is not None:
         words = f"none: {twin} is constant on every run, from which an offset is not separately identifiable"
         return _with_offset_decision(estimate(replace(structure, offset="none")), words)
-    fit = estimate(asked)
+    fit = estimate(request)
     if fit.task.structure.offset == "level":
         return _with_offset_decision(fit, "level: the runs rest at their own level before an input moves")
     test = fit_offset_test(fit)
@@ -152,35 +152,39 @@ class Hypotheses:
         if joint is None or self.complete is None:
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
-        asked = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
+        request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
         loss: Loss = "squares" if joint.robust is None else "huber"
         # The refinement of a fit is that of the finer of its two last grids.
         coarser = replace(joint, refinement=max(joint.refinement // 2, 1))
-        near = refit_if_accepted(joint, runs, asked, accepts, partial(fit_output_error, near=coarser, loss=loss))
+        near = refit_if_accepted(joint, runs, request, accepts, partial(fit_output_error, near=coarser, loss=loss))
         return None if near is None else replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
 
 
 def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
     """Fit a structure, with a level of the outputs if the runs prefer one, and with findings on offsets."""
     fit = hypotheses.fit(structure)
-    moved = _fit_in_motion(fit, structure, hypotheses)
-    if moved is not None:
-        return moved
+    restart = _fit_in_motion(fit, structure, hypotheses)
+    if restart is not None:
+        return restart
     # In a nonlinear model a constant has no constant sensitivity: it determines where a body rests.
     if fit.task.structure.offset != "none" or not structure.is_linear:
         return hypotheses.take(structure, fit)
-    shown = _shows_level(fit)
-    level = _fit_with_level(fit, structure, hypotheses, shown=True) if shown else None
+    shows_level = _shows_level(fit)
+    level = _fit_with_level(fit, structure, hypotheses, has_level=True) if shows_level else None
     if level is not None:
         return level
     test = fit_offset_test(fit) if _is_testable(fit.task.runs) else None
-    said = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
+    offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
     started = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
-    level = _fit_with_level(fit, structure, hypotheses, shown=False) if said and started and not shown else None
+    level = (
+        _fit_with_level(fit, structure, hypotheses, has_level=False)
+        if offset_findings and started and not shows_level
+        else None
+    )
     if level is not None:
         return level
     fit = hypotheses.take(structure, fit)
-    return replace(fit, findings=[*fit.findings, *said])
+    return replace(fit, findings=[*fit.findings, *offset_findings])
 
 
 def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
@@ -197,33 +201,33 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
     if not slow and has_white_residuals(joint):
         return None
     evidence = [rest_evidence(run, structure) for run in runs]
-    if any(known is not None and known.rows == 0 for known in evidence):
+    if any(evidence_item is not None and evidence_item.rows == 0 for evidence_item in evidence):
         # A constant input never tells.
         return None
-    least, chosen = fit_score(joint, joint) - START_SETTINGS.history_margin, None
+    least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
     for offset in MOTION_OFFSETS:
-        asked = replace(structure, initial="caputo", offset=offset)
+        request = replace(structure, initial="caputo", offset=offset)
         levels = len(runs) * len(fit.model.outputs) * (offset == "level")
 
-        def is_better(found: JointFit, *, most: float = least, levels: int = levels) -> bool:
-            return fit_score(found, joint, levels) < most
+        def is_better(candidate: JointFit, *, most: float = least, levels: int = levels) -> bool:
+            return fit_score(candidate, joint, levels) < most
 
         try:
-            other = hypotheses.refit(asked, fit, is_better)
+            other = hypotheses.refit(request, fit, is_better)
         except FtlmError:
             continue
         if other is None or other.joint is None or other.joint.unstable_optimum is not None:
             continue
         if slow or has_white_residuals(other.joint):
-            least, chosen = fit_score(other.joint, joint, levels), (asked, other)
-    if chosen is None:
+            least, candidate = fit_score(other.joint, joint, levels), (request, other)
+    if candidate is None:
         return None
-    whole = hypotheses.take(*chosen)
-    said = make_finding("looked_like_rest", run=", ".join(r.name for r in runs))
-    return replace(whole, findings=[*whole.findings, said])
+    whole = hypotheses.take(*candidate)
+    start_finding = make_finding("looked_like_rest", run=", ".join(r.name for r in runs))
+    return replace(whole, findings=[*whole.findings, start_finding])
 
 
-def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, shown: bool) -> Fit | None:
+def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, has_level: bool) -> Fit | None:
     """Return the best fit with a level of the outputs, from rest or in motion, if the runs prefer it; else None.
 
     Two fits are compared with the noise color of the fit with the larger residuals. If the means of the outputs show a
@@ -232,27 +236,27 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, s
     if fit.joint is None:
         return None
     best, numbers = fit.joint, 0
-    chosen: tuple[Structure, Fit] | None = None
+    candidate: tuple[Structure, Fit] | None = None
     margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
     more = len(fit.task.runs) * len(fit.model.outputs)
 
     def is_preferred(joint: JointFit) -> bool:
-        worse = max((best, joint), key=lambda found: math.prod(found.noise.values()))
+        worse = max((best, joint), key=lambda candidate: math.prod(candidate.noise.values()))
         return fit_score(joint, worse, more) < fit_score(best, worse, numbers) + margin
 
     for initial in LEVEL_STARTS:
-        asked = replace(structure, initial=initial, offset="level")
+        request = replace(structure, initial=initial, offset="level")
         try:
-            fresh = shown and chosen is None
-            near = fit if chosen is None else chosen[1]
-            level = hypotheses.fit(asked) if fresh else hypotheses.refit(asked, near, is_preferred)
+            fresh = has_level and candidate is None
+            near = fit if candidate is None else candidate[1]
+            level = hypotheses.fit(request) if fresh else hypotheses.refit(request, near, is_preferred)
         except FtlmError:
             continue
         if level is not None and level.joint is not None and is_preferred(level.joint):
-            best, chosen, numbers, margin = level.joint, (asked, level), more, 0.0
-    if chosen is None:
+            best, candidate, numbers, margin = level.joint, (request, level), more, 0.0
+    if candidate is None:
         return None
-    whole = hypotheses.take(*chosen)
+    whole = hypotheses.take(*candidate)
     was = "rested" if best.initial == "rest" else "moved"
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
     # Another run may start otherwise.
@@ -311,8 +315,8 @@ def fit_offset_test(fit: Fit) -> OffsetTest | None:
     structure = replace(fit.task.structure, offset="none")
     if fit.joint is not None:
         values = fit.joint.values_by_name
-        asked = replace(structure, initial=fit.joint.initial)
-        return offset_test(fit.task.runs, asked, values, every=fit.joint.refinement)
+        request = replace(structure, initial=fit.joint.initial)
+        return offset_test(fit.task.runs, request, values, every=fit.joint.refinement)
     if not fit.at_optimum:
         return None
     values = {**fit.model.orders, **fit.model.coefficients}
@@ -395,9 +399,9 @@ def identify(
         Linearly dependent regressors at the given orders, or an executor that has lost its workers.
     """
     several = as_runs(runs)
-    chosen = resolve_method(method)
+    estimator = resolve_method(method)
     if bounds is not None:
-        chosen = method_with_options(chosen.name, {**vars(chosen), "bounds": bounds})
+        estimator = method_with_options(estimator.name, {**vars(estimator), "bounds": bounds})
     if isinstance(structure, str) and structure == "auto":
         raise ModelError("structure = 'auto'; use ftlm.select(runs, 'auto').best, which chooses and identifies one")
     if not isinstance(structure, Structure):
@@ -408,16 +412,18 @@ def identify(
     if offset is not None:
         structure = replace(structure, offset=check_offset(offset))
     if structure.offset == "auto":
-        _check_offset_test(structure, chosen)
+        _check_offset_test(structure, estimator)
 
-    PACKAGE_LOGGER.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), chosen.name)
-    result = assess_fit(_fit_runs(several, structure, chosen, m=m, threads=threads, progress=progress))
+    PACKAGE_LOGGER.info(
+        "identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), estimator.name
+    )
+    result = assess_fit(_fit_runs(several, structure, estimator, m=m, threads=threads, progress=progress))
     duration = next((f.numbers["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
-    without_reference = isinstance(chosen, OutputError) and chosen.reference is None
+    without_reference = isinstance(estimator, OutputError) and estimator.reference is None
     if duration is not None and structure.initial == "auto" and without_reference:
         # Where the pieces cannot be fitted, the result of whole runs says so.
         with contextlib.suppress(FtlmError):
-            split = identify_pieces(several, structure, float(duration), method=chosen, m=m, threads=threads)
+            split = identify_pieces(several, structure, float(duration), method=estimator, m=m, threads=threads)
             result = split if any(f.code == "plant_unstable" for f in split.findings) else result
     PACKAGE_LOGGER.info("identified: %s", result.verdict)
     for item in result.findings:
@@ -428,7 +434,7 @@ def identify(
 def _fit_runs(
     runs: Runs,
     structure: Structure,
-    chosen: EstimationMethod,
+    estimator: EstimationMethod,
     *,
     m: int | None,
     threads: int | None,
@@ -437,22 +443,22 @@ def _fit_runs(
     """Fit a structure by a method, with decisions about the start of the runs and about offsets."""
 
     def estimate(
-        asked: Structure,
-        method: EstimationMethod = chosen,
+        request: Structure,
+        method: EstimationMethod = estimator,
         report: Callable[[int, int], None] | None = progress,
         **more: JointFit | None,
     ) -> Fit:
-        fit = method.fit(runs, asked, m=m, threads=threads, progress=report, **more)
+        fit = method.fit(runs, request, m=m, threads=threads, progress=report, **more)
         if not isinstance(fit, Fit):
-            raise ModelError(f"the method {chosen.name!r} fitted a {type(fit).__name__}, not a Fit")
+            raise ModelError(f"the method {estimator.name!r} fitted a {type(fit).__name__}, not a Fit")
         return fit
 
-    light, hypotheses = getattr(chosen, "hypothesis", None), Hypotheses(estimate)
+    light, hypotheses = getattr(estimator, "hypothesis", None), Hypotheses(estimate)
     if light is not None:
         course = ShareTracker(progress)
         hypotheses = Hypotheses(
             partial(estimate, method=light, report=course.subtask(HYPOTHESES_SHARE, 0.9)),
-            lambda asked, joint: estimate(asked, report=course.subtask(1.0, 1.0), fitted=joint),
+            lambda request, joint: estimate(request, report=course.subtask(1.0, 1.0), fitted=joint),
         )
     return fit_with_offset_decision(runs, structure, estimate, hypotheses)
 
@@ -490,13 +496,13 @@ def identify_pieces(
         Later comparisons of its model split other runs in the same way.
     """
     pieces = as_runs([piece for run in runs for piece in run.split(duration)])
-    asked = replace(structure, initial="caputo")
-    result = assess_fit(_fit_runs(pieces, asked, method or OutputError(), m=m, threads=threads, progress=None))
+    request = replace(structure, initial="caputo")
+    result = assess_fit(_fit_runs(pieces, request, method or OutputError(), m=m, threads=threads, progress=None))
     notes = [note for run in runs for note in data_notes(run)]
     findings = (*result.findings, *notes, make_finding("runs_split", pieces=len(pieces), seconds=duration))
-    known = result.model.estimate
-    assert known is not None
-    about = msgspec.structs.replace(known, findings=tuple(f.to_file() for f in findings), piece_duration=duration)
+    estimate = result.model.estimate
+    assert estimate is not None
+    about = msgspec.structs.replace(estimate, findings=tuple(f.to_file() for f in findings), piece_duration=duration)
     return replace(result, model=replace(result.model, estimate=about), findings=findings)
 
 
@@ -579,9 +585,9 @@ def assess_fit(fit: Fit) -> Identification:
         findings = [_coupling_finding(f, fit.task.structure) for f in findings]
         findings += arm_findings(fit.task.structure, findings)
     every = unique(msgspec.structs.replace(f, method=fit.method) for f in findings)
-    known = _estimate(fit, comparison, criteria, every)
+    estimate = _estimate(fit, comparison, criteria, every)
     result = Identification(
-        replace(model, estimate=known),
+        replace(model, estimate=estimate),
         fit.method,
         comparison,
         fit.searches,
@@ -596,7 +602,7 @@ def assess_fit(fit: Fit) -> Identification:
     against = tuple(f.to_file() for f in unique(result_findings(result)))
     if not against:
         return result
-    return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
+    return replace(result, model=replace(model, estimate=msgspec.structs.replace(estimate, against=against)))
 
 
 def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
@@ -604,8 +610,8 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
     joint, structure = fit.joint, fit.task.structure
     if joint is None or not joint.names or structure.has_friction:
         return None
-    asked = replace(structure, initial=joint.initial)
-    return lambda: output_sensitivities(joint, asked, fit.task.runs)
+    request = replace(structure, initial=joint.initial)
+    return lambda: output_sensitivities(joint, request, fit.task.runs)
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
@@ -673,8 +679,8 @@ def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return residual_findings(tests)
-    known = ("output_not_white", "noise_coloured")
-    return [f for f in residual_findings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if f.code not in known]
+    codes = ("output_not_white", "noise_coloured")
+    return [f for f in residual_findings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if f.code not in codes]
 
 
 def _estimate(
@@ -787,12 +793,12 @@ def identify_many(
     if not items:
         raise ModelError("there are no runs; give at least one")
     check_executor(executor)
-    chosen = resolve_method(method)
-    if getattr(chosen, "store", None) is not None:
+    estimator = resolve_method(method)
+    if getattr(estimator, "store", None) is not None:
         raise ModelError("a store keeps one identification; call identify for each run with a store of its own")
-    if executor is not None and getattr(chosen, "executor", None) is not None:
+    if executor is not None and getattr(estimator, "executor", None) is not None:
         raise ModelError(f"the method has an executor besides {parameter('executor')}; leave one of the two out")
-    options = {"method": chosen, "offset": offset, "m": m, "threads": threads}
+    options = {"method": estimator, "offset": offset, "m": m, "threads": threads}
     if executor is None:
         every = []
         for name, item in zip(names, items, strict=True):
@@ -807,12 +813,12 @@ def identify_many(
             try:
                 pending.append(executor.submit(run_in_worker, identify_one, item, structure, options))
             except (BrokenExecutor, RuntimeError) as error:
-                lost: Future[Any] = Future()
-                lost.set_exception(error)
-                pending.append(lost)
+                failure: Future[Any] = Future()
+                failure.set_exception(error)
+                pending.append(failure)
         if progress is not None:
-            for done, _ in enumerate(as_completed(pending), 1):
-                progress(done, len(items))
+            for count, _ in enumerate(as_completed(pending), 1):
+                progress(count, len(items))
         return [BatchResult(name, *_future_result(future)) for name, future in zip(names, pending, strict=True)]
     finally:
         for future in pending:

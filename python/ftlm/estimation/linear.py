@@ -68,14 +68,14 @@ def estimate_coefficients(
         check_linear(structure.equations, "an instrument")
     if not has_derivative_channels(structure):
         return _estimate_coefficients(runs, structure, settings, m, smooth=True)[0]
-    found = [_estimate_coefficients(runs, structure, settings, m, smooth=smooth) for smooth in (True, False)]
-    tracks = [record_run(rec, structure) for rec in found[0][1]]
+    fits = [_estimate_coefficients(runs, structure, settings, m, smooth=smooth) for smooth in (True, False)]
+    tracks = [record_run(rec, structure) for rec in fits[0][1]]
 
     def score(pair: tuple[CoefficientFit, list[Record]]) -> float:
         model = Model(structure.with_coefficients(pair[0].values))
         return free_run_score(model, pair[1], tracks, "l2", [1.0] * len(model.outputs))
 
-    return min(found, key=score)[0]
+    return min(fits, key=score)[0]
 
 
 def _estimate_coefficients(
@@ -128,7 +128,7 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
     groups = [structure.equations] if structure.coupling == "simulated" else [(e,) for e in structure.equations]
     for group in groups:
         outputs = ", ".join(e.output for e in group)
-        found = _core.instrumental_variables(
+        answer = _core.instrumental_variables(
             [r.core() for r in records],
             [structure_tuple(e, records[0].signals) for e in group],
             inputs,
@@ -137,13 +137,13 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
             MAX_IV_ITERATIONS,
             IV_RELATIVE_TOLERANCE,
         )
-        if not found["converged"]:
+        if not answer["converged"]:
             fit.findings.append(
-                make_finding("instruments_not_converged", output=outputs, iterations=found["iterations"])
+                make_finding("instruments_not_converged", output=outputs, iterations=answer["iterations"])
             )
-        if found["damped"]:
+        if answer["damped"]:
             fit.findings.append(make_finding("instruments_unstable", output=outputs))
-        for item, (raw, _, _, _), covariance in zip(group, found["estimates"], found["covariances"], strict=True):
+        for item, (raw, _, _, _), covariance in zip(group, answer["estimates"], answer["covariances"], strict=True):
             fit.values.update(named_coefficients(item, raw))
             free = [t for t in item.terms if t.fixed is None]
             spread = np.sqrt(np.diag(np.reshape(covariance, (len(free), len(free)))))
@@ -165,14 +165,14 @@ def step_bias_findings(
     except FtlmError:
         # A step that leaves no estimate tells nothing about half of it.
         return []
-    moved = {n: abs(coarser[n] - fit.values[n]) / 3 / e for n, e in fit.errors.items() if e > 0}
-    worst = max(moved, key=lambda n: moved[n], default="")
-    if not worst or moved[worst] <= MAX_STEP_BIAS_ERRORS:
+    changes = {n: abs(coarser[n] - fit.values[n]) / 3 / e for n, e in fit.errors.items() if e > 0}
+    worst = max(changes, key=lambda n: changes[n], default="")
+    if not worst or changes[worst] <= MAX_STEP_BIAS_ERRORS:
         return []
     carried = min(run.length - 1 for run in runs)
     finer = f"raise m, up to {carried}, or " if fit.m < carried else ""
     # Far from the limit a third of the move says no more than that it is large.
-    amount = f"about {moved[worst]:.2g}" if moved[worst] <= 10 else "more than 10"
+    amount = f"about {changes[worst]:.2g}" if changes[worst] <= 10 else "more than 10"
     return [make_finding("step_bias", parameter=worst, m=fit.m, amount=amount, finer=finer)]
 
 
@@ -276,9 +276,11 @@ def multi_innovation_trace(
     if trace is None:
         raise InternalError("the recursion gave no trace; please report it")
     step = np.unique(np.append(np.arange(stride, trace.shape[0] + 1, stride), trace.shape[0]))
-    kept = np.ascontiguousarray(trace[step - 1])
-    error = _core.trace_errors(rec.core(), core_structure, inputs, kept)
-    names = {t.coefficient: kept[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)}
+    history = np.ascontiguousarray(trace[step - 1])
+    error = _core.trace_errors(rec.core(), core_structure, inputs, history)
+    names = {
+        t.coefficient: history[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)
+    }
     return MultiInnovationTrace(step, names, error, settings.innovation_length)
 
 
@@ -418,10 +420,10 @@ class Streaming:
     @property
     def coefficients(self) -> dict[str, float]:
         """Coefficients by name, after the newest sample."""
-        found = zip(self.structure.equations, self._recursions, strict=True)
+        pairs = zip(self.structure.equations, self._recursions, strict=True)
         return {
             name: c
-            for item, recursion in found
+            for item, recursion in pairs
             for name, c in named_coefficients(item, recursion.coefficients.tolist()).items()
         }
 

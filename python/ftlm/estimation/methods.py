@@ -53,15 +53,15 @@ LAG_RANK_TOLERANCE = 1e-10
 
 def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
     """Raise ModelError for runs and structures to which a noise model does not apply."""
-    asked = parameter("noise", "ar")
+    label = parameter("noise", "ar")
     if len(structure.outputs) > 1:
-        raise ModelError(f"{asked} is of one output, not of {', '.join(structure.outputs)}; fit each one")
+        raise ModelError(f"{label} is of one output, not of {', '.join(structure.outputs)}; fit each one")
     if not structure.is_linear or structure.limits:
         raise ModelError(
-            f"{asked} filters inputs and output alike, and friction, non-linear terms and limits do not commute with it"
+            f"{label} filters inputs and output alike, and friction, non-linear terms and limits do not commute with it"
         )
     if any(run.sample_times is not None for run in runs):
-        raise ModelError(f"{asked} needs samples on a regular grid; resample the runs, or leave it out")
+        raise ModelError(f"{label} needs samples on a regular grid; resample the runs, or leave it out")
 
 
 def fit_noise_model(fit: Fit, refit: Callable[[Task, JointFit], Fit]) -> Fit:
@@ -81,9 +81,9 @@ def fit_noise_model(fit: Fit, refit: Callable[[Task, JointFit], Fit]) -> Fit:
         colour = _noise_model(residuals)
         white = tuple(whiten(run, colour) for run in runs)
         fit = refit(Task(white, replace(first.task.structure, initial=joint.initial)), joint)
-        before, joint = joint, fit.joint or joint
+        joint_before, joint = joint, fit.joint or joint
         errors = np.sqrt(np.diag(joint.covariance))
-        if np.all(np.abs(joint.values - before.values) <= ALTERNATION_TOLERANCE * errors):
+        if np.all(np.abs(joint.values - joint_before.values) <= ALTERNATION_TOLERANCE * errors):
             findings = fit.findings
             break
     else:
@@ -107,8 +107,8 @@ def _noise_model(residuals: Sequence[Floats]) -> Floats:
     if order == 0:
         return np.ones(1)
     past, now = _lag_columns(residuals, order), np.concatenate(residuals)
-    known = np.isfinite(now) & np.isfinite(past).all(axis=1)
-    return np.concatenate([[1.0], -minimum_norm_solution(past[known], now[known], LAG_RANK_TOLERANCE)])
+    is_complete = np.isfinite(now) & np.isfinite(past).all(axis=1)
+    return np.concatenate([[1.0], -minimum_norm_solution(past[is_complete], now[is_complete], LAG_RANK_TOLERANCE)])
 
 
 def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
@@ -164,8 +164,8 @@ def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floa
     basis = orthonormal(
         np.nan_to_num(_lag_columns(residuals, order)) * np.any(rows != 0.0, axis=0)[:, None], LAG_RANK_TOLERANCE
     )
-    left = rows - (rows @ basis) @ basis.T
-    added = np.linalg.pinv(left @ left.T) - np.linalg.pinv(rows @ rows.T)
+    residual_rows = rows - (rows @ basis) @ basis.T
+    added = np.linalg.pinv(residual_rows @ residual_rows.T) - np.linalg.pinv(rows @ rows.T)
     covariance: Floats = joint.covariance + scale[:, None] * added * scale
     return covariance
 
@@ -287,12 +287,12 @@ class OutputError:
         if self.noise == "ar":
             check_noise_model(runs, structure)
 
-        def estimate(asked: Structure, only: Mapping[str, float] | None) -> tuple[Fit, Mapping[str, float]]:
-            fixed = set(structure.coefficient_names) - set(asked.coefficient_names)
-            given = begin
+        def estimate(variant: Structure, only: Mapping[str, float] | None) -> tuple[Fit, Mapping[str, float]]:
+            fixed = set(structure.coefficient_names) - set(variant.coefficient_names)
+            guess = begin
             if fixed and isinstance(begin, Mapping):
-                given = {n: v for n, v in begin.items() if n not in fixed} or None
-            task, first, alone = Task(tuple(runs), asked), given if only is None else only, only is not None
+                guess = {n: v for n, v in begin.items() if n not in fixed} or None
+            task, first, alone = Task(tuple(runs), variant), guess if only is None else only, only is not None
             if self.noise == "ar":
                 fit = fit_noise_model(
                     estimate_output_error(
@@ -308,8 +308,8 @@ class OutputError:
                 )
             return fit, {} if fit.joint is None else fit.joint.values_by_name
 
-        fit, found = fit_within_bounds(structure, bounds, estimate)
-        fit = replace(fit, findings=[*fit.findings, *found])
+        fit, bound_findings = fit_within_bounds(structure, bounds, estimate)
+        fit = replace(fit, findings=[*fit.findings, *bound_findings])
         return fit if self.reference is None else mark_reference_fit(fit, self.reference, weak)
 
     @property
@@ -453,13 +453,13 @@ def resolve_method(method: str | EstimationMethod) -> EstimationMethod:
     """Return a method of estimation from its name, or itself; raise ModelError for anything else."""
     if isinstance(method, str):
         check_choice("method", method, METHODS_BY_NAME)
-        made: EstimationMethod = METHODS_BY_NAME[method]()
-        return made
+        estimator: EstimationMethod = METHODS_BY_NAME[method]()
+        return estimator
     if isinstance(method, type):
         raise ModelError(f"method is the class {method.__name__}; pass an object, method={method.__name__}()")
     if not (isinstance(getattr(method, "name", None), str) and callable(getattr(method, "fit", None))):
-        known = " or ".join(map(repr, METHODS_BY_NAME))
-        raise ModelError(f"method is {type(method).__name__}; use {known}, or an object such as ftlm.OutputError()")
+        names = " or ".join(map(repr, METHODS_BY_NAME))
+        raise ModelError(f"method is {type(method).__name__}; use {names}, or an object such as ftlm.OutputError()")
     return method
 
 
@@ -469,11 +469,15 @@ def method_with_options(name: str, options: Mapping[str, Any]) -> EstimationMeth
     names = {method: [f.name for f in fields(kind)] for method, kind in METHODS_BY_NAME.items()}
     foreign = [option for option in options if option not in names[name]]
     if foreign:
-        users = " or ".join(parameter("method", method) for method, known in names.items() if foreign[0] in known)
+        users = " or ".join(
+            parameter("method", method)
+            for method, options_of_method in names.items()
+            if foreign[0] in options_of_method
+        )
         count = len(foreign) - 1
         others = f", nor {count} other{'s' if count > 1 else ''} given here" if count else ""
         raise ModelError(
             f"{parameter(foreign[0])} is not used by {parameter('method', name)}{others}; leave it out, or use {users}"
         )
-    made: EstimationMethod = METHODS_BY_NAME[name](**options)
-    return made
+    estimator: EstimationMethod = METHODS_BY_NAME[name](**options)
+    return estimator

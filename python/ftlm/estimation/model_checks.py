@@ -113,8 +113,8 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
             )
     for name, value in joint.coefficients.items():
         # Where the cost is no parabola, its profile knows better.
-        told = name in joint.profiles and 0.0 not in joint.profiles[name]
-        if name not in unidentifiable and not errors[name] <= abs(value) and not told:
+        is_bounded = name in joint.profiles and 0.0 not in joint.profiles[name]
+        if name not in unidentifiable and not errors[name] <= abs(value) and not is_bounded:
             findings.append(make_finding("not_different_from_0", parameter=name, value=value, error=errors[name]))
     findings += correlation_findings(joint) + unbounded_interval_findings(joint, unidentifiable)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
@@ -135,14 +135,21 @@ def second_optimum_findings(
     for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
         if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:
             break
-        apart = [
-            f"{n} = {there:.4g} for {here:.4g}"
-            for n, here, there in zip(names, values.tolist(), other.tolist(), strict=True)
-            if math.isfinite(errors[n]) and abs(there - here) > SECOND_OPTIMUM_ERRORS * max(errors[n], own[n])
+        differences_text = [
+            f"{n} = {other_value:.4g} for {value:.4g}"
+            for n, value, other_value in zip(names, values.tolist(), other.tolist(), strict=True)
+            if math.isfinite(errors[n]) and abs(other_value - value) > SECOND_OPTIMUM_ERRORS * max(errors[n], own[n])
         ]
-        if apart:
-            moved = ", ".join(text.partition(" = ")[0] for text in apart)
-            return [make_finding("second_optimum", parameter=moved, shown=", ".join(apart), difference=max(fall, 0.0))]
+        if differences_text:
+            differences = ", ".join(text.partition(" = ")[0] for text in differences_text)
+            return [
+                make_finding(
+                    "second_optimum",
+                    parameter=differences,
+                    shown=", ".join(differences_text),
+                    difference=max(fall, 0.0),
+                )
+            ]
     return []
 
 
@@ -189,10 +196,10 @@ def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> li
     try:
         _, cost, residuals = fit(best)
         for start in starts:
-            values, there, left = fit(start)
-            is_other = float(np.sum((left - residuals) ** 2)) > SAME_MODEL_POWER
-            if is_other and there - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
-                optima.append((values, there - cost))
+            values, cost_there, series = fit(start)
+            is_other = float(np.sum((series - residuals) ** 2)) > SAME_MODEL_POWER
+            if is_other and cost_there - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
+                optima.append((values, cost_there - cost))
     except FtlmError:
         # No finite simulation on the way.
         return []
@@ -244,11 +251,11 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
             continue
         findings += _outlier_findings(runs, problem.structure, joint, output)
         findings += _quantization_findings(runs, problem.structure, output, noise)
-    kept = [
+    run_names = [
         run.name for run in runs if run.sample_times is not None and not has_nonuniform_samples(run, problem.structure)
     ]
-    if kept:
-        findings.append(make_finding("times_not_honoured", run=", ".join(kept)))
+    if run_names:
+        findings.append(make_finding("times_not_honoured", run=", ".join(run_names)))
     return findings
 
 
@@ -261,18 +268,18 @@ def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
         evidence = rest_evidence(run, structure)
         if evidence is None:
             continue
-        known = [o for o in structure.outputs if o in evidence.levels]
-        levels = enumerate_names([f"{o} = {evidence.levels[o]:.4g}" for o in known])
+        outputs = [o for o in structure.outputs if o in evidence.levels]
+        levels = enumerate_names([f"{o} = {evidence.levels[o]:.4g}" for o in outputs])
         if evidence.rows == 0 and structure.initial == "auto":
-            moved = {n: int(run[n][0] != run[n][1]) for n in structure.signals if n in run.inputs}
-            row = max(moved.values())
-            inputs = enumerate_names([n for n in moved if np.any(run[n])])
+            first_changes = {n: int(run[n][0] != run[n][1]) for n in structure.signals if n in run.inputs}
+            row = max(first_changes.values())
+            inputs = enumerate_names([n for n in first_changes if np.any(run[n])])
             findings.append(make_finding("rest_assumed", run=run.name, input=inputs, row=row, shown=levels))
         elif evidence.rows and resolved.offset == "level":
             driven = [f"{n} = {v:.4g}" for n, v in evidence.inputs.items() if v]
             beside = f" with {enumerate_names(driven)}" if driven else ""
-            shown = f"the run rests at {levels}{beside}"
-            findings.append(make_finding("rests_at_level", run=run.name, rows=evidence.rows, shown=shown))
+            level_text = f"the run rests at {levels}{beside}"
+            findings.append(make_finding("rests_at_level", run=run.name, rows=evidence.rows, shown=level_text))
         findings += _early_output_findings(run, structure, evidence)
     return findings
 
@@ -285,10 +292,10 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
     row = evidence.rows
     if not 0 < row < run.length - 1 or run.sample_times is not None:
         return []
-    moved = [n for n in evidence.inputs if run[n][row] != run[n][row - 1]]
+    changes = [n for n in evidence.inputs if run[n][row] != run[n][row - 1]]
     findings = []
     for item in structure.equations:
-        driven = [t for t in item.terms if t.signal in moved]
+        driven = [t for t in item.terms if t.signal in changes]
         direct = any(t.order == item.order for t in driven)
         if not driven or direct or any(run.intersample[t.signal] != ZERO_ORDER_HOLD for t in driven):
             continue
@@ -311,8 +318,8 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
     # In the unit of the output.
     series = [joint.noise[output] * part[output] for part in joint.residuals]
     every = drop_missing(np.concatenate(series))
-    measured = [compared_values(run, structure, output) for run in runs]
-    speeds = [_simulated_speeds(y, part) for y, part in zip(measured, series, strict=True)]
+    outputs = [compared_values(run, structure, output) for run in runs]
+    speeds = [_simulated_speeds(y, part) for y, part in zip(outputs, series, strict=True)]
     usual = _usual_deviations(np.concatenate(series), np.concatenate(speeds))
     power, far, first = 0.0, 0, ""
     limits = np.split(OUTLIER_DEVIATIONS * usual, np.cumsum([part.size for part in series])[:-1])
@@ -346,9 +353,9 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
     ]
 
 
-def _simulated_speeds(measured: Floats, residuals: Floats) -> Floats:
+def _simulated_speeds(samples: Floats, residuals: Floats) -> Floats:
     """Absolute change of the simulated output around each inner sample; measured outliers do not affect it."""
-    simulated = interpolate_gaps(measured[1 : 1 + residuals.size] - residuals)
+    simulated = interpolate_gaps(samples[1 : 1 + residuals.size] - residuals)
     steps = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
     return np.maximum(steps[:-1], steps[1:])
 
@@ -360,9 +367,9 @@ def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
     machine stands still for a part of the run.
     """
     usual = np.full(residuals.size, robust_deviation(drop_missing(residuals)))
-    known = np.flatnonzero(~np.isnan(residuals))
+    finite_rows = np.flatnonzero(~np.isnan(residuals))
     for rows in np.array_split(
-        known[np.argsort(speeds[known], kind="stable")], max(known.size // ROWS_OF_ONE_SPEED, 1)
+        finite_rows[np.argsort(speeds[finite_rows], kind="stable")], max(finite_rows.size // ROWS_OF_ONE_SPEED, 1)
     ):
         usual[rows] = np.maximum(usual[rows], robust_deviation(residuals[rows]))
     return usual
@@ -405,14 +412,14 @@ def correlation_findings(joint: JointFit) -> list[Finding]:
     for i in vague:
         tied = [g for g in groups if any(_are_inseparable(joint, correlation, i, j) for j in g)]
         groups = [g for g in groups if g not in tied] + [sorted([*(j for g in tied for j in g), i])]
-    said = []
+    findings = []
     for group in (g for g in groups if len(g) > 1):
         *most, last = (joint.names[i] for i in group)
-        known = [c for i in group for j in group if i < j and math.isfinite(c := float(correlation[i, j]))]
+        finite_values = [c for i in group for j in group if i < j and math.isfinite(c := float(correlation[i, j]))]
         of = "correlation" if len(group) == 2 else "correlations up to"
-        why = f"{of} {max(known):.4f}" if known else "their standard errors are not finite"
-        said.append(make_finding("numbers_correlated", parameter=f"{', '.join(most)} and {last}", why=why))
-    return said
+        why = f"{of} {max(finite_values):.4f}" if finite_values else "their standard errors are not finite"
+        findings.append(make_finding("numbers_correlated", parameter=f"{', '.join(most)} and {last}", why=why))
+    return findings
 
 
 def _are_inseparable(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
@@ -440,21 +447,21 @@ def coefficient_law_findings(model: Model) -> list[Finding]:
     law, values = model.structure.coefficient_law, model.coefficients
     findings = []
     for name, sign, factors in law:
-        known = [values[f] for f in factors if f in values]
-        if name not in values or len(known) != len(factors):
+        factor_values = [values[f] for f in factors if f in values]
+        if name not in values or len(factor_values) != len(factors):
             continue
-        wanted = sign * math.prod(known)
-        if abs(values[name] - wanted) > MAX_LAW_DEVIATION * max(abs(wanted), abs(values[name])):
-            findings.append(make_finding("coefficient_law_broken", parameter=name, value=values[name], wanted=wanted))
+        expected = sign * math.prod(factor_values)
+        if abs(values[name] - expected) > MAX_LAW_DEVIATION * max(abs(expected), abs(values[name])):
+            findings.append(make_finding("coefficient_law_broken", parameter=name, value=values[name], wanted=expected))
     ratios: dict[str, list[tuple[str, float]]] = {}
     for name, sign, factors in law:
         free = [f for f in factors if f not in values]
-        known = [values[f] for f in factors if f in values]
-        rest = math.prod(known)
-        if name in values and len(free) == 1 and known and rest:
+        factor_values = [values[f] for f in factors if f in values]
+        rest = math.prod(factor_values)
+        if name in values and len(free) == 1 and factor_values and rest:
             ratios.setdefault(free[0], []).append((name, sign * values[name] / rest))
-    for ratio, said in ratios.items():
-        wrong = [(n, v) for n, v in said if not v > 1]
+    for ratio, entries in ratios.items():
+        wrong = [(n, v) for n, v in entries if not v > 1]
         if wrong:
             listed = ", ".join(f"{v:.4g} by {n}" for n, v in wrong)
             findings.append(make_finding("inertia_ratio_broken", parameter=ratio, listed=listed))
@@ -486,8 +493,8 @@ def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> 
         return []
 
     def turns(samples: Floats) -> bool:
-        moved, least = np.diff(samples), MIN_MOTION_RANGE_FRACTION * float(np.ptp(samples))
-        return bool(np.any(moved > least) and np.any(moved < -least))
+        steps, least = np.diff(samples), MIN_MOTION_RANGE_FRACTION * float(np.ptp(samples))
+        return bool(np.any(steps > least) and np.any(steps < -least))
 
     return [
         make_finding("friction_unsigned", output=model.outputs[i])
@@ -498,21 +505,23 @@ def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> 
 
 def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
     """Return findings if no run distinguishes the friction near rest from that at speed."""
-    said = []
+    findings = []
     for item in model.equations:
         near = None if item.friction is None else item.friction.stribeck
         if near is None or (near.name is None and near.speed_name is None):
             continue
         vs, column = float(near.speed), model.outputs.index(item.output)
-        paces = [np.abs(np.diff(there.outputs[column])) / run.step for run, there in zip(runs, free, strict=True)]
+        paces = [
+            np.abs(np.diff(simulated.outputs[column])) / run.step for run, simulated in zip(runs, free, strict=True)
+        ]
         pace = np.concatenate([p[p > MIN_MOTION_RANGE_FRACTION * p.max(initial=0.0)] for p in paces])
         slow = int(np.sum(pace < SLOW_SPEED_RATIO * vs))
         if slow < MIN_SLOW_INTERVALS:
             numbers = {"ratio": SLOW_SPEED_RATIO, "speed": SLOW_SPEED_RATIO * vs, "slow": slow, "total": pace.size}
-            said.append(make_finding("stribeck_slow_untold", output=item.output, **numbers))
+            findings.append(make_finding("stribeck_slow_untold", output=item.output, **numbers))
         elif pace.max(initial=0.0) < vs:
-            said.append(make_finding("stribeck_fast_untold", output=item.output, speed=vs))
-    return said
+            findings.append(make_finding("stribeck_fast_untold", output=item.output, speed=vs))
+    return findings
 
 
 def stability_findings(model: Model) -> list[Finding]:
@@ -615,16 +624,16 @@ def unstable_poles_text(count: float) -> str:
 
 def enumerate_names(names: Sequence[str]) -> str:
     """Return up to three names in a row, and the number of the others."""
-    shown = names if len(names) <= 3 else [*names[:3], f"{len(names) - 3} more"]
-    return " and ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
+    items = names if len(names) <= 3 else [*names[:3], f"{len(names) - 3} more"]
+    return " and ".join([", ".join(items[:-1]), items[-1]]) if len(items) > 1 else items[0]
 
 
 def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
     """Compare simulated and measured outputs of other runs; see :meth:`ftlm.Identification.validate`."""
-    there = compare(result.model, runs)
+    comparison = compare(result.model, runs)
     findings = [
-        *there.findings,
-        *validation_findings(result.comparison, there),
-        *discretization_findings(result.model, there),
+        *comparison.findings,
+        *validation_findings(result.comparison, comparison),
+        *discretization_findings(result.model, comparison),
     ]
-    return replace(there, findings=unique(findings))
+    return replace(comparison, findings=unique(findings))

@@ -34,8 +34,8 @@ def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputS
     if not model.structure.has_nonlinear_terms or not finite or any(run.sample_times is not None for run in runs):
         return []
     values = [_signal_values(model, run, samples) for run, samples in zip(runs, free, strict=True)]
-    found = [f for item in model.equations for f in _term_findings(item, runs, values)]
-    return [*found, *_forgetting_findings(model, runs, free)]
+    findings = [f for item in model.equations for f in _term_findings(item, runs, values)]
+    return [*findings, *_forgetting_findings(model, runs, free)]
 
 
 def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
@@ -81,8 +81,8 @@ def _term_findings(item: Equation, runs: Sequence[Run], values: Sequence[dict[st
             continue
         ranges = []
         for one in shape.channels:
-            seen = np.concatenate([_channel_values(v, one, h) for v, h in pairs])
-            ranges.append(f"{channel(*one)} from {seen.min():.3g} to {seen.max():.3g}")
+            ranges_seen = np.concatenate([_channel_values(v, one, h) for v, h in pairs])
+            ranges.append(f"{channel(*one)} from {ranges_seen.min():.3g} to {ranges_seen.max():.3g}")
         yield make_finding(
             "nonlinear_range",
             output=item.output,
@@ -109,19 +109,19 @@ def _forgetting_findings(model: Model, runs: Sequence[Run], free: Sequence[Outpu
     for run, samples in zip(runs, free, strict=True):
         half = run.length // 2
         for k in np.flatnonzero(numbers):
-            moved = numbers.copy()
-            moved[k] *= 1.0 + RELATIVE_CHANGE
+            perturbed = numbers.copy()
+            perturbed[k] *= 1.0 + RELATIVE_CHANGE
             try:
-                found = [
+                simulations = [
                     simulate_samples(m, run, 1, samples.initial)[0]
-                    for m in (model, with_parameter_vector(model, moved))
+                    for m in (model, with_parameter_vector(model, perturbed))
                 ]
             except FtlmError:
                 continue
-            y, change = found[0], np.abs(found[1] - found[0])
+            y, change = simulations[0], np.abs(simulations[1] - simulations[0])
             early, late = change[:, :half].max(), change[:, half:].max()
-            grown = np.abs(y[:, half:]).max() > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max()
-            if grown or not early > 0 or not late > EXPONENTIAL_GROWTH * early or not math.isfinite(late):
+            is_growing = np.abs(y[:, half:]).max() > MAX_OUTPUT_GROWTH * np.abs(y[:, :half]).max()
+            if is_growing or not early > 0 or not late > EXPONENTIAL_GROWTH * early or not math.isfinite(late):
                 continue
             if worst is None or late / early > worst[0]:
                 first = float(change[:, : max(half // 4, 1)].max())

@@ -111,8 +111,8 @@ def evaluate_at_point(
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     start = Iterate(orders, coefficients, "given", {}, inputs)
     grid = Objective(problem, runs, [1.0] * len(structure.outputs), every=every)
-    here = grid.minimize(start, 1, plain=True)
-    levels = grid.rms_residuals(here)
+    point = grid.minimize(start, 1, plain=True)
+    levels = grid.rms_residuals(point)
     exact = [output for output, level in levels.items() if not level * MAX_SAMPLE_VALUE > 1.0]
     if exact:
         raise ConvergenceError(
@@ -122,10 +122,10 @@ def evaluate_at_point(
     grid = replace(grid, weights=weights)
     if len(weights) > 1:
         # Initial terms bring all outputs closest together, so that they follow the weights.
-        return grid, grid.minimize(here, 1, plain=True)
-    scaled = {n: weights[0] * np.asarray(here.outcome[n]) for n in ("residuals", "jacobian")}
-    cost = weights[0] ** 2 * float(here.outcome["cost"])
-    return grid, replace(here, outcome={**here.outcome, **scaled, "cost": cost})
+        return grid, grid.minimize(point, 1, plain=True)
+    scaled = {n: weights[0] * np.asarray(point.outcome[n]) for n in ("residuals", "jacobian")}
+    cost = weights[0] ** 2 * float(point.outcome["cost"])
+    return grid, replace(point, outcome={**point.outcome, **scaled, "cost": cost})
 
 
 def offset_test(
@@ -137,8 +137,8 @@ def offset_test(
     with coefficient 0. This is a score test that is insensitive to errors of the other parameters (Neyman's C(alpha)),
     so any consistent estimate will do. Its variance uses an autoregressive model of the residuals.
     """
-    taken = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
-    one = next(n for n in ("one", *(f"one{k}" for k in range(len(taken) + 1))) if n not in taken)
+    reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
+    one = next(n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names)
     names = [f"{one}_{k}" for k in range(len(structure.equations))]
     equations = tuple(
         replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
@@ -147,14 +147,14 @@ def offset_test(
     extended = replace(structure, equations=equations, offset="none", initial=initial)
     try:
         whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
-        grid, here = evaluate_at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
+        grid, point = evaluate_at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
     except FtlmError:
         # No finite simulation on this grid: the result says so elsewhere.
         return None
     first = len(grid.problem.orders) + grid.problem.coefficients.index(names[0])
-    rows = np.asarray(here.outcome["jacobian"])
+    rows = np.asarray(point.outcome["jacobian"])
     others = np.delete(rows, range(first, first + len(names)), axis=0)
-    residuals = np.asarray(here.outcome["residuals"])
+    residuals = np.asarray(point.outcome["residuals"])
     blocks = _residual_blocks(grid)
     columns = []
     for row in rows[first : first + len(names)]:
@@ -162,24 +162,24 @@ def offset_test(
             column = np.zeros(residuals.size)
             column[start:stop] = row[start:stop]
             columns.append(column)
-    before = np.stack(columns, axis=1)
-    norms = column_norms(before)
-    left = before / np.where(norms > 0, norms, 1.0)
+    columns_before = np.stack(columns, axis=1)
+    norms = column_norms(columns_before)
+    scaled = columns_before / np.where(norms > 0, norms, 1.0)
     basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
     for _ in range(2):
-        left = left - basis @ (basis.T @ left)
-    directions, spread, _ = thin_svd(left)
-    told = directions[:, spread > OFFSET_COLLINEARITY_TOLERANCE]
-    count = told.shape[1]
+        scaled = scaled - basis @ (basis.T @ scaled)
+    directions, spread, _ = thin_svd(scaled)
+    basis_part = directions[:, spread > OFFSET_COLLINEARITY_TOLERANCE]
+    count = basis_part.shape[1]
     total = dot(residuals, residuals)
     if count == 0 or not total > 0:
         return OffsetTest(0.0, 0, 0.0, 0.0)
-    along = projections(told, residuals)
+    along = projections(basis_part, residuals)
     # Where the numbers come from a fit with an offset, part of what it does lies along their sensitivities.
-    noise = residuals - told @ along - basis @ projections(basis, residuals)
-    spread = _colored_covariance(told, noise, blocks, residuals.size - basis.shape[1] - count)
+    noise = residuals - basis_part @ along - basis @ projections(basis, residuals)
+    spread = _colored_covariance(basis_part, noise, blocks, residuals.size - basis.shape[1] - count)
     statistic = float(along @ np.linalg.pinv(spread) @ along)
-    explained = told @ along
+    explained = basis_part @ along
     sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
     weights = [w for _ in runs for w in grid.weights]
     places = [place for own in blocks for place in own]
@@ -196,10 +196,10 @@ def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[R
     Their projection on the initial terms is subtracted.
     """
     try:
-        grid, here = evaluate_at_point(runs, structure, joint.values_by_name, max(joint.refinement, 1))
+        grid, point = evaluate_at_point(runs, structure, joint.values_by_name, max(joint.refinement, 1))
     except FtlmError:
         return {}
-    rows, blocks = np.asarray(here.outcome["jacobian"]), _residual_blocks(grid)
+    rows, blocks = np.asarray(point.outcome["jacobian"]), _residual_blocks(grid)
     return {name: [rows[:, slice(*own[k])] for own in blocks] for k, name in enumerate(grid.problem.structure.outputs)}
 
 
@@ -207,11 +207,11 @@ def without_offset_equivalents(initial: Initial, structure: Structure, values: M
     """Return Caputo's initial terms without powers of t that act like an offset; others unchanged."""
     if initial != "caputo":
         return initial
-    kept: set[float] = set()
+    exponents: set[float] = set()
     for item in (e.with_orders({n: values[n] for n in e.order_names}) for e in structure.equations):
         own = offset_exponents(item.order.constant, "constant").values()
-        kept |= set(initial_exponents(item, "caputo", "constant")) - {round(e, 9) for e in own}
-    return History(sorted(kept))
+        exponents |= set(initial_exponents(item, "caputo", "constant")) - {round(e, 9) for e in own}
+    return History(sorted(exponents))
 
 
 def _residual_blocks(grid: Objective) -> list[list[tuple[int, int]]]:
@@ -265,14 +265,14 @@ def errors_with_orders(
     is added as an error.
     """
     try:
-        grid, here = evaluate_at_point(runs, replace(structure, coefficient_law=()), values, DEFAULT_PULSES_PER_SAMPLE)
-        there = grid.minimize(here, MAX_REFINEMENT_EVALUATIONS, plain=True)
-        spread = np.diag(covariance(there, grid))
+        grid, point = evaluate_at_point(runs, replace(structure, coefficient_law=()), values, DEFAULT_PULSES_PER_SAMPLE)
+        refit = grid.minimize(point, MAX_REFINEMENT_EVALUATIONS, plain=True)
+        spread = np.diag(covariance(refit, grid))
     except FtlmError:
         return None
-    given = np.array([values[n] for n in grid.problem.names])
+    at_grid = np.array([values[n] for n in grid.problem.names])
     with np.errstate(invalid="ignore"):
-        errors = np.sqrt(spread + (there.values - given) ** 2)
+        errors = np.sqrt(spread + (refit.values - at_grid) ** 2)
     return {n: e if math.isfinite(e) else math.inf for n, e in zip(grid.problem.names, errors.tolist(), strict=True)}
 
 
@@ -284,7 +284,7 @@ def fit_with_initial_conditions(
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
     loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (),
+    guesses: Sequence[Mapping[str, float]] = (),
     alone: bool = False,
 ) -> JointFit:
     """Fit a structure to runs with unknown initial conditions, and select the initial terms.
@@ -297,23 +297,23 @@ def fit_with_initial_conditions(
     def fit_initial_terms(
         initial: Initial, *, refine: bool = True, multistart: _core.JointMultistart | None = None
     ) -> JointFit:
-        asked = replace(structure, initial=initial)
-        begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
-        return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, multistart=multistart)
+        request = replace(structure, initial=initial)
+        fit = partial(fit_output_error, start=guesses[0]) if alone else partial(fit_output_error, guesses=guesses)
+        return fit(runs, request, threads=threads, refine=refine, progress=progress, loss=loss, multistart=multistart)
 
     decided = structure.initial != "auto" or not has_memory(structure) or not structure.is_linear
     if not decided and isinstance(start, History):
         # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
         # for more terms, not for fewer.
-        asked = replace(structure, initial=start)
-        multistart = None if alone else run_multistart(runs, asked, threads, progress)
+        request = replace(structure, initial=start)
+        multistart = None if alone else run_multistart(runs, request, threads, progress)
         many = fit_initial_terms(start, refine=False, multistart=multistart)
-        kept = _simplify_initial_terms(many, runs, structure, loss, refine=False)
-        asked = replace(structure, initial=kept.initial)
-        fine = fit_output_error(runs, asked, near=kept, loss=loss, multistart=multistart)
-        unstable = fine.unstable_optimum or kept.unstable_optimum or many.unstable_optimum
+        simplified = _simplify_initial_terms(many, runs, structure, loss, refine=False)
+        request = replace(structure, initial=simplified.initial)
+        fine = fit_output_error(runs, request, near=simplified, loss=loss, multistart=multistart)
+        unstable = fine.unstable_optimum or simplified.unstable_optimum or many.unstable_optimum
         fine = replace(fine, starts=many.starts, origin=many.origin, unstable_optimum=unstable)
-        return fine if kept is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
+        return fine if simplified is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
     joint = fit_initial_terms(start)
     if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
         return joint
@@ -352,11 +352,11 @@ def _simplify_initial_terms(
     joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool
 ) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
-    asked, begin = replace(structure, initial="caputo"), joint.values_by_name
+    request, begin = replace(structure, initial="caputo"), joint.values_by_name
     few = refit_if_accepted(
         joint,
         runs,
-        asked,
+        request,
         lambda few: not _fit_needs_history(few, joint, runs, structure),
         partial(fit_output_error, start=begin, loss=loss, refine=refine),
     )
@@ -381,20 +381,22 @@ def refit_if_accepted(
     grid = Objective(problem, runs, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
     begin = start_from_values(problem, joint.values_by_name)
     try:
-        there = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True)
-        deviation = grid.rms_residuals(there)
+        screening = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True)
+        deviation = grid.rms_residuals(screening)
         if joint.robust is not None:
-            deviation = {o: robust_deviation(e) for o, e in grid.pooled_residuals(there).items()}
+            deviation = {o: robust_deviation(e) for o, e in grid.pooled_residuals(screening).items()}
         screened = replace(
             joint,
             noise={o: SCREENING_RESIDUAL_SHARE * v * joint.noise[o] for o, v in deviation.items()},
-            residuals=[{o: e / max(deviation[o], 1e-300) for o, e in part.items()} for part in grid.residuals(there)],
-            initial_terms=sum(len(terms) for run in there.outcome["initial"] for terms in run),
+            residuals=[
+                {o: e / max(deviation[o], 1e-300) for o, e in part.items()} for part in grid.residuals(screening)
+            ],
+            initial_terms=sum(len(terms) for run in screening.outcome["initial"] for terms in run),
         )
-        found = refit(runs, structure) if accepts(screened) else None
+        fit = refit(runs, structure) if accepts(screened) else None
     except FtlmError:
         return None
-    return found if found is not None and accepts(found) else None
+    return fit if fit is not None and accepts(fit) else None
 
 
 def refit_from(
@@ -407,16 +409,16 @@ def refit_from(
 
 def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
     """Return a fit with Caputo terms and a constant if it replaces a history, otherwise None."""
-    asked = replace(structure, offset="constant")
+    request = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
-        few = refit_from(joint, runs, replace(asked, initial="caputo"), loss)
+        few = refit_from(joint, runs, replace(request, initial="caputo"), loss)
         # On the same kind of grid: what a coarse one leaves is not a history.
         many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
         return None
     fewer = few.initial_terms < many.initial_terms
-    return few if fewer and not _fit_needs_history(few, many, runs, asked) else None
+    return few if fewer and not _fit_needs_history(few, many, runs, request) else None
 
 
 def _fit_needs_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:

@@ -212,6 +212,6 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
 def propagated_errors(slopes: Floats, spread: Floats) -> Floats:
     """Return standard errors by first-order propagation, infinite if a variance involved is infinite."""
     unidentifiable = np.isinf(np.diag(spread))
-    known = slopes[:, ~unidentifiable]
-    variance = np.einsum("ij,jk,ik->i", known, spread[np.ix_(~unidentifiable, ~unidentifiable)], known)
+    columns = slopes[:, ~unidentifiable]
+    variance = np.einsum("ij,jk,ik->i", columns, spread[np.ix_(~unidentifiable, ~unidentifiable)], columns)
     return np.where((slopes[:, unidentifiable] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))

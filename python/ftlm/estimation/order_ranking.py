@@ -131,7 +131,7 @@ def search_orders(
         "pruning": pruning,
     }
     several = as_runs(runs)
-    found = rank_orders(
+    result = rank_orders(
         several,
         equation,
         order_grid,
@@ -142,7 +142,7 @@ def search_orders(
         executor=executor,
         **settings,
     )
-    return with_verdict(found, several, equation, SearchSettings(**settings), order_grid, m=m)
+    return with_verdict(result, several, equation, SearchSettings(**settings), order_grid, m=m)
 
 
 def with_verdict(
@@ -180,21 +180,21 @@ def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]
         return []
     values = {n: [row.orders[n] for row in alike] for n in best.orders}
     spans = {n: (min(own), max(own)) for n, own in values.items()}
-    moved = {n: ends for n, ends in spans.items() if ends[1] > ends[0]}
+    spans_of_change = {n: ends for n, ends in spans.items() if ends[1] > ends[0]}
     decided = all(
         max(high - best.orders[n], best.orders[n] - low) <= MAX_ORDER_ERROR for n, (low, high) in spans.items()
     )
-    shown = ", ".join(f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in moved.items())
+    spans_text = ", ".join(f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in spans_of_change.items())
     last = max(row.rank for row in alike)
     every = ", all that are kept," if alike[-1] is distinct[-1][0] and len(distinct) > 1 else ""
     code = "ranks_alike" if decided else "noise_decides"
-    return [make_finding(code, parameter=", ".join(moved), last=last, every=every, shown=shown)]
+    return [make_finding(code, parameter=", ".join(spans_of_change), last=last, every=every, shown=spans_text)]
 
 
 def _independent_samples(residuals: Floats) -> float:
     """Number of independent samples with the information of a series of correlated ones."""
-    known = drop_missing(residuals)
-    if known.size < 2 or is_constant([known]):
-        return float(known.size)
+    samples = drop_missing(residuals)
+    if samples.size < 2 or is_constant([samples]):
+        return float(samples.size)
     # Squares of the residuals of a run that grows may overflow.
-    return known.size / variance_inflation(known / np.abs(known).max())
+    return samples.size / variance_inflation(samples / np.abs(samples).max())

@@ -214,8 +214,8 @@ class JointFit:
     @property
     def derived_errors(self) -> dict[str, float]:
         """Standard errors of the coefficients that the coefficient law gives, to first order."""
-        kept = slice(len(self.orders), len(self.orders) + len(self.coefficients))
-        out, spread = {}, self.covariance[kept, kept]
+        block = slice(len(self.orders), len(self.orders) + len(self.coefficients))
+        out, spread = {}, self.covariance[block, block]
         for name, (sign, factors) in self.products.items():
             value = sign * math.prod(self.coefficients[f] for f in factors)
             slope = np.array([factors.count(n) * value / v if v else 0.0 for n, v in self.coefficients.items()])
@@ -268,7 +268,7 @@ def _check_sample_count(runs: Sequence[Run], structure: Structure) -> FreeProble
     """Return the problem of a structure; raise DataError if the runs have too few samples for it."""
     problem = FreeProblem.of(structure)
     values = [compared_values(run, structure, output) for run in runs for output in structure.outputs]
-    samples = sum(max(drop_missing(known).size - 2, 0) for known in values)
+    samples = sum(max(drop_missing(samples_of_output).size - 2, 0) for samples_of_output in values)
     if samples <= len(problem.names):
         raise DataError(
             f"{samples} samples between the first and the last do not determine {len(problem.names)} free "
@@ -292,14 +292,14 @@ def fit_output_error(
     refine: bool = True,
     progress: Callable[[int, int], None] | None = None,
     loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (),
+    guesses: Sequence[Mapping[str, float]] = (),
     near: JointFit | None = None,
     multistart: _core.JointMultistart | None = None,
 ) -> JointFit:
     """Fit all equations of a structure to all runs by output error, with automatic initialization.
 
     A coefficient law of the structure is imposed, and its initial terms must be decided. `start` gives values of all
-    free parameters by name and replaces the automatic initial guesses; `known` adds to them. `near` is a fit of the
+    free parameters by name and replaces the automatic initial guesses; `guesses` adds to them. `near` is a fit of the
     same structure to nearly the same runs, whose grid and weights are reused. `multistart` is the result of an earlier
     multistart. Without `refine` the grid is not refined below the samples. Progress is called with (parts done, total
     parts). The loss ranks optima on all samples, but not the initial guesses.
@@ -315,16 +315,16 @@ def fit_output_error(
     given_near = None
     if near is not None:
         given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
-    automatic = start is None and near is None and not known
+    automatic = start is None and near is None and not guesses
     if automatic and problem.orders and structure.is_linear:
         # A fit would leave the coefficients undetermined, after a search of all orders.
         why = describe_collinear_inputs(runs, structure)
         if why is not None:
             raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
-    found = _core.joint_fit(
+    answer = _core.joint_fit(
         problem.core,
         [recording(run, structure) for run in runs],
-        [[v[n] for n in problem.names] for v in known],
+        [[v[n] for n in problem.names] for v in guesses],
         None if start is None else [start[n] for n in problem.names],
         given_near,
         multistart,
@@ -334,32 +334,32 @@ def fit_output_error(
         progress,
         stop_flag(),
     )
-    if found is None:
+    if answer is None:
         why = describe_collinear_inputs(runs, structure) or "check the signs of the data and the bounds"
         raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {why}")
-    orders, coefficients, inputs = problem.split(found["estimate"])
-    residuals = [dict(zip(outputs, part, strict=True)) for part in found["left"]]
+    orders, coefficients, inputs = problem.split(answer["estimate"])
+    residuals = [dict(zip(outputs, part, strict=True)) for part in answer["left"]]
     return JointFit(
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)),
         products=dict(problem.products),
-        covariance=found["covariance"],
+        covariance=answer["covariance"],
         residuals=residuals,
-        noise=dict(zip(outputs, found["noise"], strict=True)),
-        robust=None if found["robust"] is None else RobustLossSummary(*found["robust"]),
-        robust_weights=found["shares"],
-        finest_grid_values=found["on_grid"],
-        cost=found["cost"],
+        noise=dict(zip(outputs, answer["noise"], strict=True)),
+        robust=None if answer["robust"] is None else RobustLossSummary(*answer["robust"]),
+        robust_weights=answer["shares"],
+        finest_grid_values=answer["on_grid"],
+        cost=answer["cost"],
         samples=sum(drop_missing(e).size for part in residuals for e in part.values()),
-        refinement=found["every"],
-        step_converged=found["settled"],
-        converged=found["status"] == "converged",
-        starts=found["starts"],
-        survivors=found["survivors"],
+        refinement=answer["every"],
+        step_converged=answer["settled"],
+        converged=answer["status"] == "converged",
+        starts=answer["starts"],
+        survivors=answer["survivors"],
         initial=structure.initial,
-        initial_terms=found["initial_terms"],
-        unstable_optimum=None if found["growth"] is None else UnstableOptimum(*found["growth"]),
+        initial_terms=answer["initial_terms"],
+        unstable_optimum=None if answer["growth"] is None else UnstableOptimum(*answer["growth"]),
     )
 
 
@@ -410,14 +410,14 @@ def parameter_set_of(model: Model) -> FitParameters:
     ModelError
         The model was not estimated, comes from another method, or its file does not list the free parameters.
     """
-    known = None if model.estimate is None else model.estimate.free
-    if known is None or isinstance(known, UnsetType):
+    free = None if model.estimate is None else model.estimate.free
+    if free is None or isinstance(free, UnsetType):
         how = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
         raise ModelError(
             f"this model {how}, or its file does not list the free parameters, whose covariance an input design needs; "
             f"identify it with {parameter('method', 'output-error')}"
         )
-    return known
+    return free
 
 
 def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
@@ -428,39 +428,41 @@ def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
     ModelError
         The model does not list its free parameters, or its orders do not fit its equations.
     """
-    known, estimate = parameter_set_of(model), model.estimate
+    parameter_set, estimate = parameter_set_of(model), model.estimate
     values = {} if estimate is None else estimate.values
-    lacking = [n for n in known.names if n not in values]
+    lacking = [n for n in parameter_set.names if n not in values]
     count = sum(1 + len(e.terms) for e in model.equations)
-    if lacking or len(known.orders) != count:
+    if lacking or len(parameter_set.orders) != count:
         what = (
-            f"no value of {lacking[0]}" if lacking else f"{len(known.orders)} orders where its equations have {count}"
+            f"no value of {lacking[0]}"
+            if lacking
+            else f"{len(parameter_set.orders)} orders where its equations have {count}"
         )
         raise ModelError(f"the record of the fit in the model has {what}; identify it again")
-    laws = iter(known.orders)
+    laws = iter(parameter_set.orders)
     equations = []
     for item in model.equations:
         order = Order.parse(next(laws))
         terms = []
         for term in item.terms:
-            free = term.name in known.names or term.name in known.products
+            free = term.name in parameter_set.names or term.name in parameter_set.products
             coefficient = str(term.name) if free else term.coefficient
             terms.append(replace(term, order=Order.parse(next(laws)), coefficient=coefficient, name=None))
         equations.append(replace(item, order=order, terms=tuple(terms)))
     names = {n for e in equations for n in e.order_names}
     late = {s: input_name("delay", s) for s in model.structure.signals if s not in model.outputs}
-    delays = {s: values[n] for s, n in late.items() if n in known.names}
+    delays = {s: values[n] for s, n in late.items() if n in parameter_set.names}
     structure = replace(
         model.structure,
         equations=tuple(equations),
         order_values={n: (values[n] - ORDER_BOUND_MARGIN, values[n] + ORDER_BOUND_MARGIN) for n in names},
-        coefficient_law=tuple((n, sign, factors) for n, (sign, factors) in known.products.items()),
+        coefficient_law=tuple((n, sign, factors) for n, (sign, factors) in parameter_set.products.items()),
         delay={s: d for s, d in model.structure.delay.items() if s not in delays},
         free_delays={s: (min(d, 0.0), 2.0 * abs(d) + 1.0) for s, d in delays.items()},
         initial="rest",
     )
     problem = FreeProblem.of(structure)
-    if set(problem.names) != set(known.names):
-        odd = sorted(set(problem.names) ^ set(known.names))
+    if set(problem.names) != set(parameter_set.names):
+        odd = sorted(set(problem.names) ^ set(parameter_set.names))
         raise ModelError(f"the record of the fit in the model contradicts its equations: {odd[0]}; identify it again")
     return problem, [values[n] for n in problem.names]

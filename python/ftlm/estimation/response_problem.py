@@ -188,32 +188,32 @@ class ResponseProblem:
             whole = np.linalg.solve(matrix, (right * late[:, None])[..., None])[..., 0]
             unit = np.zeros((s.size, len(items), 1), dtype=np.complex128)
             unit[:, record.output] = 1.0
-            ahead = np.linalg.solve(matrix.transpose(0, 2, 1), unit)[..., 0] if jacobian else None
+            solutions = np.linalg.solve(matrix.transpose(0, 2, 1), unit)[..., 0] if jacobian else None
         except np.linalg.LinAlgError:
             nothing = np.full(s.size, np.nan, dtype=np.complex128)
             return nothing, np.full((s.size, len(self.names)), np.nan, dtype=np.complex128) if jacobian else None
         response = np.asarray(whole[:, record.output], dtype=np.complex128)
-        if ahead is None:
+        if solutions is None:
             return response, None
         out = np.zeros((s.size, len(self.names)), dtype=np.complex128)
         for i, item in enumerate(items):
             for n, w in item.order.weights:
-                out[:, self._place[n]] -= w * log * ahead[:, i] * powers[i, -1] * whole[:, i]
+                out[:, self._place[n]] -= w * log * solutions[:, i] * powers[i, -1] * whole[:, i]
             for k, term in enumerate(item.terms):
                 if (i, k) not in powers:
                     continue
                 signal = whole[:, names.index(term.signal)] if term.signal in names else late
                 size = self.coefficient(term, item, values)
-                moved = ahead[:, i] * powers[i, k] * signal
+                derivative = solutions[:, i] * powers[i, k] * signal
                 for n, w in term.order.weights:
-                    out[:, self._place[n]] += w * size * log * moved
+                    out[:, self._place[n]] += w * size * log * derivative
                 if not isinstance(term.coefficient, str):
                     # A known coefficient is one in seconds: in this unit it follows the orders.
                     for its, sign in ((item.order, -1.0), (term.order, 1.0)):
                         for n, w in its.weights:
-                            out[:, self._place[n]] += sign * w * np.log(self.unit) * size * moved
+                            out[:, self._place[n]] += sign * w * np.log(self.unit) * size * derivative
                 else:
-                    out[:, self._coefficient[term.coefficient]] += term.factor * moved
+                    out[:, self._coefficient[term.coefficient]] += term.factor * derivative
         if record.input in self._delay:
             out[:, self._delay[record.input]] = -s * response
         return response, out
@@ -223,13 +223,15 @@ class ResponseProblem:
 
         Without `jacobian` the Jacobian has no columns.
         """
-        left, rows = [], []
+        residual_parts, rows = [], []
         with np.errstate(all="ignore"):
-            for record, (response, moved) in zip(self.records, self.responses(values, jacobian=jacobian), strict=True):
-                left.append((response - record.response) * record.weight)
-                if moved is not None:
-                    rows.append(moved * record.weight[:, None])
-        flat = np.concatenate(left)
+            for record, (response, derivatives) in zip(
+                self.records, self.responses(values, jacobian=jacobian), strict=True
+            ):
+                residual_parts.append((response - record.response) * record.weight)
+                if derivatives is not None:
+                    rows.append(derivatives * record.weight[:, None])
+        flat = np.concatenate(residual_parts)
         matrix = np.concatenate(rows) if rows else np.zeros((flat.size, 0), dtype=np.complex128)
         return np.concatenate([flat.real, flat.imag]), np.concatenate([matrix.real, matrix.imag])
 
@@ -305,48 +307,51 @@ MAX_EVALUATED_POINTS, CORNERS_PER_POINT, MAX_CORNER_POINTS = 60, 14, 120
 def initial_guesses(problem: ResponseProblem) -> list[Floats]:
     """Return feasible initial guesses, most promising first."""
     points = _points(problem)
-    found = _linear_coefficients(problem, points) if problem.coefficients else list(points)
-    judged = []
-    for values in found:
-        left, _ = problem.residuals(values, jacobian=False)
-        cost = float(left @ left)
+    guesses = _linear_coefficients(problem, points) if problem.coefficients else list(points)
+    candidates = []
+    for values in guesses:
+        residuals, _ = problem.residuals(values, jacobian=False)
+        cost = float(residuals @ residuals)
         if np.isfinite(cost):
-            judged.append((cost, values))
-    judged.sort(key=lambda pair: pair[0])
-    kept: list[Floats] = []
+            candidates.append((cost, values))
+    candidates.sort(key=lambda pair: pair[0])
+    distinct_guesses: list[Floats] = []
     first, last = len(problem.orders), len(problem.orders) + len(problem.coefficients)
     free = [k for k in range(len(problem.names)) if not first <= k < last]
-    for _, values in judged:
-        if all(np.max(np.abs(values[free] - other[free]), initial=0.0) > 0.1 for other in kept) or not kept:
-            kept.append(values)
-        if len(kept) == MAX_STARTS:
+    for _, values in candidates:
+        if (
+            all(np.max(np.abs(values[free] - other[free]), initial=0.0) > 0.1 for other in distinct_guesses)
+            or not distinct_guesses
+        ):
+            distinct_guesses.append(values)
+        if len(distinct_guesses) == MAX_STARTS:
             break
-    return kept
+    return distinct_guesses
 
 
 def _points(problem: ResponseProblem) -> Floats:
     """Return the grid points of orders and delays, one row each, with coefficients 0."""
     axes = list(problem.search_ranges().values())
-    given = [n in problem.structure.order_values for n in problem.orders]
+    has_values = [n in problem.structure.order_values for n in problem.orders]
     delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
     # A delay that is off by a third of a period at the highest frequency still leads downhill.
     fastest = max(float(r.frequency.max()) for r in problem.records)
     fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
     room = max(MAX_GRID_POINTS // int(np.prod(fine, initial=1)), 60)
     count = len(axes)
-    lattice = int(np.prod([len(a) if g else 1 for a, g in zip(axes, given, strict=True)], initial=1))
-    free = count - sum(given)
+    lattice = int(np.prod([len(a) if g else 1 for a, g in zip(axes, has_values, strict=True)], initial=1))
+    free = count - sum(has_values)
     each = int(np.floor((room / max(lattice, 1)) ** (1.0 / free))) if free and lattice <= room else 0
     if (free and each < 4) or (not free and lattice > room):
         # Too many axes for a lattice: points that fill the box evenly, the same every time.
         spread = halton(room, count)
         columns = [
             np.asarray(a)[(spread[:, k] * len(a)).astype(int)] if g else a[0] + spread[:, k] * (a[1] - a[0])
-            for k, (a, g) in enumerate(zip(axes, given, strict=True))
+            for k, (a, g) in enumerate(zip(axes, has_values, strict=True))
         ]
         orders = np.stack(columns, axis=1)
     else:
-        sides = [a if g else np.linspace(a[0], a[1], min(each, 31)) for a, g in zip(axes, given, strict=True)]
+        sides = [a if g else np.linspace(a[0], a[1], min(each, 31)) for a, g in zip(axes, has_values, strict=True)]
         orders = _product(sides)
     late = _product([np.linspace(a, b, n) for (a, b), n in zip(delays, fine, strict=True)])
     table = np.zeros((len(orders) * len(late), len(problem.names)))
@@ -354,8 +359,8 @@ def _points(problem: ResponseProblem) -> Floats:
     table[:, len(problem.names) - len(delays) :] = np.tile(late, (len(orders), 1))
     rows, limits, _ = problem.constraints()
     inside = np.all(table @ rows.T <= limits + 1e-12, axis=1)
-    kept: Floats = table[inside]
-    return kept
+    points: Floats = table[inside]
+    return points
 
 
 def _product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
@@ -406,8 +411,8 @@ def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> F
     the slowest own term fixed, the remaining bias is small.
     """
     every = np.concatenate([r.frequency for r in problem.records])
-    tried = np.geomspace(every.min(), every.max(), CORNERS_PER_POINT)
-    return np.concatenate([np.full(first, np.nan), np.tile(tried, len(slow))])
+    frequencies = np.geomspace(every.min(), every.max(), CORNERS_PER_POINT)
+    return np.concatenate([np.full(first, np.nan), np.tile(frequencies, len(slow))])
 
 
 def _subsample_record(record: ResponseRecord) -> ResponseRecord:
@@ -433,13 +438,13 @@ def _equation(
     alpha = _orders(problem, item.order.constant, item.order.weights, points)
     columns: dict[str, list[Complex]] = {n: [] for n in names}
     own: dict[str, list[Complex]] = {}
-    wanted, below = [], []
+    targets, below = [], []
     for record in records:
         log = np.log(1j * record.frequency)
         late = np.exp(-1j * record.frequency * _shifts(problem, record.input, points)[:, None])
-        known = np.exp(alpha[:, None] * log)
-        below.append(known)
-        goal = known * record.response
+        powers = np.exp(alpha[:, None] * log)
+        below.append(powers)
+        goal = powers * record.response
         for term in item.terms:
             signal = _signal(problem, record, term.signal, late)
             power = np.exp(_orders(problem, term.order.constant, term.order.weights, points)[:, None] * log)
@@ -453,30 +458,30 @@ def _equation(
                 goal = goal - size * power * signal
                 if term.signal == item.output:
                     below[-1] = below[-1] - size * power
-        wanted.append(goal)
+        targets.append(goal)
     weight = np.concatenate([r.weight for r in records])
-    goal, known = np.concatenate(wanted, axis=1), np.concatenate(below, axis=1)
-    left = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
+    goal, powers = np.concatenate(targets, axis=1), np.concatenate(below, axis=1)
+    matrix = np.stack([np.concatenate(columns[n], axis=1) for n in names], axis=2) if names else None
     ours = {n: np.concatenate(parts, axis=1) for n, parts in own.items()}
     slowest = _slowest(problem, item, points)
-    bottom = 1.0 + np.abs(known) + 0j
+    bottom = 1.0 + np.abs(powers) + 0j
     answers = np.zeros((len(points), len(names)))
     cost = np.full(len(points), np.inf)
     with np.errstate(all="ignore"):
         for _ in range(REWEIGHTING_ITERATIONS):
             scaled = weight / np.abs(bottom)
-            if left is not None:
-                answers = _least_squares(left * scaled[..., None], goal * scaled)
+            if matrix is not None:
+                answers = _least_squares(matrix * scaled[..., None], goal * scaled)
                 if slowest is not None:
                     k, power = names.index(slowest[0]), slowest[1]
-                    given = np.isfinite(corners)
-                    held = -(corners[given] ** power[given])
-                    rest = goal[given] - left[given][:, :, k] * held[:, None]
-                    others = np.delete(left[given], k, axis=2)
-                    solved = _least_squares(others * scaled[given][..., None], rest * scaled[given])
-                    answers[given] = np.insert(solved, k, held, axis=1)
-            bottom = known - sum((answers[:, [names.index(n)]] * part for n, part in ours.items()), 0.0 * known)
-            missed = goal if left is None else goal - np.einsum("bnp,bp->bn", left, answers)
+                    is_finite = np.isfinite(corners)
+                    high_terms = -(corners[is_finite] ** power[is_finite])
+                    rest = goal[is_finite] - matrix[is_finite][:, :, k] * high_terms[:, None]
+                    others = np.delete(matrix[is_finite], k, axis=2)
+                    solved = _least_squares(others * scaled[is_finite][..., None], rest * scaled[is_finite])
+                    answers[is_finite] = np.insert(solved, k, high_terms, axis=1)
+            bottom = powers - sum((answers[:, [names.index(n)]] * part for n, part in ours.items()), 0.0 * powers)
+            missed = goal if matrix is None else goal - np.einsum("bnp,bp->bn", matrix, answers)
             cost = np.sum(np.abs(missed / bottom * weight) ** 2, axis=1)
     return answers, cost
 
@@ -492,11 +497,11 @@ def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[
     return str(own[at].coefficient), gaps[at]
 
 
-def _least_squares(left: Complex, right: Complex) -> Floats:
+def _least_squares(matrix: Complex, right: Complex) -> Floats:
     """Return real least-squares solutions of complex equations; undetermined directions are 0."""
-    lengths = np.sqrt(np.sum(np.abs(left) ** 2, axis=1))
+    lengths = np.sqrt(np.sum(np.abs(matrix) ** 2, axis=1))
     unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
-    scaled = np.nan_to_num(left / unit[:, None, :])
+    scaled = np.nan_to_num(matrix / unit[:, None, :])
     normal = np.einsum("bnp,bnq->bpq", scaled.conj(), scaled).real
     moment = np.einsum("bnp,bn->bp", scaled.conj(), np.nan_to_num(right)).real
     inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)

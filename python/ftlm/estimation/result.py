@@ -73,7 +73,7 @@ class PhysicalParameter:
 
 
 @check_arguments
-def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str, PhysicalParameter]:
+def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> dict[str, PhysicalParameter]:
     """Compute the physical parameters of a link from its coefficients, given one parameter per stage.
 
     a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (paper (16)-(21)), or j = J_1/J_2, fix
@@ -84,7 +84,7 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
     ----------
     joint
         Joint output-error fit of a :func:`flexible_link` with its coefficient law.
-    known
+    known_values
         One parameter per stage by name: K_s1, J_11, J_12, B_11, B_12 or K_tau1 (2 for the second stage).
 
     Returns
@@ -99,10 +99,10 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
     """
     out: dict[str, PhysicalParameter] = {}
     names = {name.format(j=j): (j, unit) for j in (1, 2) for name, unit in PHYSICAL_UNITS.items()}
-    if not known:
+    if not known_values:
         raise ModelError(f"no physical parameter is given; one per stage must be known: {', '.join(names)}")
     stages = []
-    for name, value in known.items():
+    for name, value in known_values.items():
         if name not in names:
             raise ModelError(f"{name!r} is not a physical parameter of the arm; use one of {', '.join(names)}")
         stage = names[name][0]
@@ -145,8 +145,8 @@ def _physical(coefficients: NDArray[np.float64], name: str, value: float, stage:
     a, b, d, g, r = coefficients
     # Every parameter in units of J_1.
     shares = np.array([a, 1.0, 1.0 / (r - 1.0), -b, d, g])
-    known = [pattern.format(j=stage) for pattern in PHYSICAL_UNITS].index(name)
-    out: NDArray[np.float64] = value / shares[known] * shares
+    index = [pattern.format(j=stage) for pattern in PHYSICAL_UNITS].index(name)
+    out: NDArray[np.float64] = value / shares[index] * shares
     return out
 
 
@@ -261,8 +261,8 @@ class Identification:
     @property
     def limits(self) -> dict[str, float]:
         """Saturations (``sat_u``) and dead zones (``dead_u``) of inputs in their units, estimated or fixed."""
-        known = [(limit.name, limit.value) for limit in self.model.structure.limits]
-        return {n: float(v) for n, v in known if not isinstance(v, tuple)}
+        limits = [(limit.name, limit.value) for limit in self.model.structure.limits]
+        return {n: float(v) for n, v in limits if not isinstance(v, tuple)}
 
     @property
     def parameters(self) -> dict[str, Parameter]:
@@ -270,8 +270,8 @@ class Identification:
         model = self.model
         coefficients = model.coefficients if self.task is None else self.task.structure.coefficient_names
         free = {*model.orders, *coefficients, *self.standard_errors}
-        given = {f"delay_{n}": v for n, v in self.delays.items()} | self.limits
-        values = self._values | {n: v for n, v in given.items() if n not in self._values}
+        values_by_name = {f"delay_{n}": v for n, v in self.delays.items()} | self.limits
+        values = self._values | {n: v for n, v in values_by_name.items() if n not in self._values}
         return parameter_estimates(model, values, errors=self.standard_errors, intervals=self.intervals, free=free)
 
     @property
@@ -316,7 +316,7 @@ class Identification:
     #: The same, by the name that has the unit.
     fit_percent = fit
 
-    def physical(self, **known: float) -> dict[str, PhysicalParameter]:
+    def physical(self, **values: float) -> dict[str, PhysicalParameter]:
         """Return the physical parameters of a flexible link; see :func:`ftlm.physical_parameters`.
 
         Parameters
@@ -338,7 +338,7 @@ class Identification:
             raise ModelError(
                 f"method {self.method!r} gives no joint covariance; identify by {parameter('method', 'output-error')}"
             )
-        return physical_parameters(self.joint, known)
+        return physical_parameters(self.joint, values)
 
     @check_arguments
     def profile(
@@ -528,8 +528,8 @@ class Identification:
             spread = f" ± {format_bound(errors[name]):<10}" if name in errors else ""
             if name in self.profiles:
                 spread += f"   {self.profiles[name]}"
-            stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
-            lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
+            reference_text = f"   (stated {reference[name]:.6g})" if name in reference else ""
+            lines.append(f"  {name:<12}{value:>14.6g}{spread}{reference_text}")
         if self.joint is not None:
             lines.append(f"  {self.joint.origin_text}")
         if errors:

@@ -87,19 +87,19 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
     ]
     if len(pieces) < MIN_PIECES or any(run.sample_times is not None for run in runs):
         return None
-    kept = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, MAX_PIECES).astype(int))]
+    sample_pieces = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, MAX_PIECES).astype(int))]
     started = replace(model, structure=replace(model.structure, initial="caputo"))
     try:
-        free = simulate_runs(started, kept)
+        free = simulate_runs(started, sample_pieces)
     except FtlmError:
         return None
     ratios = []
     for k in range(len(model.outputs)):
-        measured = [measured_samples(started, run, f.refinement)[k] for run, f in zip(kept, free, strict=True)]
-        left = [y - there.outputs[k] for y, there in zip(measured, free, strict=True)]
-        power = sum(float(np.nansum((y - np.nanmean(y)) ** 2)) for y in measured)
+        outputs = [measured_samples(started, run, f.refinement)[k] for run, f in zip(sample_pieces, free, strict=True)]
+        residuals = [y - simulated.outputs[k] for y, simulated in zip(outputs, free, strict=True)]
+        power = sum(float(np.nansum((y - np.nanmean(y)) ** 2)) for y in outputs)
         with np.errstate(over="ignore", invalid="ignore"):
-            missed = sum(float(np.nansum(e**2)) for e in left)
+            missed = sum(float(np.nansum(e**2)) for e in residuals)
         ratios.append(math.sqrt(missed / power) if power > 0 and math.isfinite(missed) else math.inf)
     return PieceTest(seconds, max(ratios))
 

@@ -120,9 +120,9 @@ class Validation(Comparison):
         return str(verdict_html(self.verdict)) + super()._repr_html_()
 
 
-def verdict_html(judged: Verdict) -> Markup:
+def verdict_html(judgement: Verdict) -> Markup:
     """Return a verdict as an HTML paragraph."""
-    return Markup("<p><strong>{}</strong>: {}.</p>").format(judged.level.capitalize(), judged.sentence)
+    return Markup("<p><strong>{}</strong>: {}.</p>").format(judgement.level.capitalize(), judgement.sentence)
 
 
 def validation_with_verdict(result: Identification, comparison: Comparison) -> Validation:
@@ -140,13 +140,15 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
     runs = () if validation is None or unstable else (validation,)
     repeated = validation is not None and any(f.code in REPEATED_RUN_CODES for f in validation.findings)
-    tried = bool(runs) and not repeated
-    against = _combined_verdict([*result_findings(result)], result.fit, runs, tried)
+    has_validation = bool(runs) and not repeated
+    against = _combined_verdict([*result_findings(result)], result.fit, runs, has_validation)
     if against is not None:
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
-    left = _describe_residuals(result)
-    return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), {left}, all parameters are well determined")
+    residual_text = _describe_residuals(result)
+    return Verdict(
+        TRUST_LEVEL, f"it predicts validation runs ({fits}), {residual_text}, all parameters are well determined"
+    )
 
 
 def _describe_residuals(result: Identification) -> str:
@@ -159,14 +161,14 @@ def _describe_residuals(result: Identification) -> str:
 
 
 def _combined_verdict(
-    own: Sequence[Finding], before: Mapping[str, float], runs: Sequence[Comparison], tried: bool
+    own: Sequence[Finding], estimation_fits: Mapping[str, float], runs: Sequence[Comparison], has_validation: bool
 ) -> Verdict | None:
     """Return the verdict from all findings, by itself and on other runs; None without findings."""
     buried = [f.output for f in own if f.code in POOR_FIT_CODES]
-    found = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
-    found += [f for comparison in runs for f in _validation_losses(before, comparison)]
+    findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
+    findings += [f for comparison in runs for f in _validation_losses(estimation_fits, comparison)]
     own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
-    return verdict_from([*own_first, *found, *own, *([] if tried else [make_finding("not_validated")])])
+    return verdict_from([*own_first, *findings, *own, *([] if has_validation else [make_finding("not_validated")])])
 
 
 def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
@@ -180,36 +182,36 @@ def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Return the verdict on a saved model, from its file and from comparisons with runs."""
-    known = model.estimate
-    plant = known is not None and any(f.code in UNSTABLE_PLANT_CODES for f in known.findings or ())
-    unstable = plant and known is not None and known.piece_duration is UNSET
+    estimate = model.estimate
+    plant = estimate is not None and any(f.code in UNSTABLE_PLANT_CODES for f in estimate.findings or ())
+    unstable = plant and estimate is not None and estimate.piece_duration is UNSET
     own = [] if unstable else [*_unstable_poles(model)]
     validation = () if unstable else validation
-    if known is None:
+    if estimate is None:
         own.append(make_finding("origin_unknown"))
-        judged = _combined_verdict(own, {}, validation, True)
+        judgement = _combined_verdict(own, {}, validation, True)
     else:
-        own += saved_findings(known)
-        before = {n: f for n, f in known.fit.items() if f is not None}
-        seen = any(name in known.runs for c in validation for name, _, _ in c.per_run)
-        judged = _combined_verdict(own, before, validation, bool(validation) and not seen)
-    if judged is not None:
-        return judged
+        own += saved_findings(estimate)
+        estimation_fits = {n: f for n, f in estimate.fit.items() if f is not None}
+        is_repeated = any(name in estimate.runs for c in validation for name, _, _ in c.per_run)
+        judgement = _combined_verdict(own, estimation_fits, validation, bool(validation) and not is_repeated)
+    if judgement is not None:
+        return judgement
     fits = ", ".join(f"{o} {f.fit:.3g} %" for c in validation for o, f in c.output_error.items())
     return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), and no finding speaks against its fit")
 
 
-def saved_findings(known: Estimate) -> list[Finding]:
+def saved_findings(estimate: Estimate) -> list[Finding]:
     """Return all findings that speak against using a saved model, those recorded at the fit first."""
-    found = [] if known.against is UNSET else list(known.against)
-    unidentifiable = [n for n, e in known.standard_errors.items() if e is None]
-    if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in found):
-        found.append(
+    findings = [] if estimate.against is UNSET else list(estimate.against)
+    unidentifiable = [n for n, e in estimate.standard_errors.items() if e is None]
+    if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in findings):
+        findings.append(
             make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
         )
-    if known.warnings:
-        found.append(make_finding("sentences_alone"))
-    return found
+    if estimate.warnings:
+        findings.append(make_finding("sentences_alone"))
+    return findings
 
 
 def result_findings(result: Identification) -> Iterator[Finding]:
@@ -233,15 +235,15 @@ def _against_result(result: Identification) -> Iterator[Finding]:
         yield make_finding("not_converged")
     vague = [n for n in errors if n not in unidentifiable and _is_uncertain(result, n)]
     if vague:
-        shown = enumerate_names([_format_uncertain(result, n) for n in vague])
-        yield make_finding("number_vague", parameter=", ".join(vague), shown=shown)
+        text = enumerate_names([_format_uncertain(result, n) for n in vague])
+        yield make_finding("number_vague", parameter=", ".join(vague), shown=text)
     endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
     if endless:
         yield make_finding("interval_open", parameter=enumerate_names(endless), sides=", ".join(endless))
     runs = zip(result.comparison.offsets, result.comparison.initial, strict=False)
-    hidden = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
-    if hidden:
-        yield make_finding("offset_hidden", output=", ".join(hidden), shown=enumerate_names(list(hidden)))
+    outputs = dict.fromkeys(o for offsets, initial in runs for o in offsets if not offsets[o] and initial[o])
+    if outputs:
+        yield make_finding("offset_hidden", output=", ".join(outputs), shown=enumerate_names(list(outputs)))
     for group in group_findings(result.findings):
         if not group.first_finding.topic.has_rule and group.first_finding.level in (
             LEVEL_DO_NOT_USE,
@@ -258,9 +260,9 @@ def _free_runs(result: Identification) -> Iterator[Finding]:
     yield from plant
     if plant and plant[0].code != "plant_needs_pieces":
         return
-    lost = [o for o, f in result.output_error.items() if not math.isfinite(f.nr)]
-    if lost:
-        yield make_finding("out_of_range", output=", ".join(lost))
+    outputs = [o for o, f in result.output_error.items() if not math.isfinite(f.nr)]
+    if outputs:
+        yield make_finding("out_of_range", output=", ".join(outputs))
     yield from _unstable_poles(result.model)
     buried = [f for f in result.findings if f.code in POOR_FIT_CODES]
     yield from _poor_fits("", result.comparison, [f.output for f in buried])
@@ -313,16 +315,16 @@ def improves_prediction(
     gain is not significant. Otherwise None.
     """
     runs = list(next(iter(intervals.values()), {}))
-    told = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
+    is_outside = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
     counts = median(gains) >= MIN_FIT_GAIN
     if (
-        all(told)
+        all(is_outside)
         and counts
         and min(gains) > -MIN_FIT_GAIN
         and all(have_common_value(e.values()) for e in intervals.values())
     ):
         return True
-    if max(gains) < MIN_FIT_GAIN or (not any(told) and not counts):
+    if max(gains) < MIN_FIT_GAIN or (not any(is_outside) and not counts):
         return False
     return None
 
@@ -345,8 +347,8 @@ def _poor_fits(where: str, comparison: Comparison, buried: Sequence[str] = ()) -
     for run, errors in _each(comparison):
         useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in buried]
         if useless:
-            shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in useless)
-            yield make_finding("poor_fit", run=run, output=", ".join(useless), where=where, shown=shown)
+            text = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{_on(run)})" for o in useless)
+            yield make_finding("poor_fit", run=run, output=", ".join(useless), where=where, shown=text)
             return
 
 
@@ -362,18 +364,18 @@ def _on(run: str) -> str:
     return f" on {run}" if run else ""
 
 
-def _validation_losses(before: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
+def _validation_losses(estimation_fits: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
     """Yield outputs whose validation fit is far below the estimation fit."""
     for run, errors in _each(validation):
         for output, figures in errors.items():
-            if output not in before:
+            if output not in estimation_fits:
                 continue
-            left, own = 100.0 - figures.fit, 100.0 - before[output]
+            misfit, own = 100.0 - figures.fit, 100.0 - estimation_fits[output]
             if not (
-                left <= own + MAX_FIT_DROP_POINTS
-                and all(left <= times * own or left <= little for times, little in VALIDATION_LOSS_LIMITS)
+                misfit <= own + MAX_FIT_DROP_POINTS
+                and all(misfit <= times * own or misfit <= little for times, little in VALIDATION_LOSS_LIMITS)
             ):
-                numbers = {"before": before[output], "after": figures.fit, "where": _on(run)}
+                numbers = {"before": estimation_fits[output], "after": figures.fit, "where": _on(run)}
                 yield make_finding("fit_falls", run=run, output=output, **numbers)
                 return
 
@@ -385,23 +387,23 @@ def _residuals(result: Identification) -> Iterator[Finding]:
             yield make_finding("too_short_for_tests")
         return
     looped = has_loop_noise_model(result.settings)
-    judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
+    outputs = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
     # A model that is wrong leaves what a periodic input repeats, which looks like a loop: first what it lacks.
-    coupled = [f for f in result.findings if f.code == "coupling_missing" and f.output in judged]
+    coupled = [f for f in result.findings if f.code == "coupling_missing" and f.output in outputs]
     unread = {(f.output, f.input) for f in coupled}
     following = {
-        o: [s for s, t in r.informative_tests.items() if t.failed and (o, s) not in unread] for o, r in judged.items()
+        o: [s for s, t in r.informative_tests.items() if t.failed and (o, s) not in unread] for o, r in outputs.items()
     }
     following = {o: signals for o, signals in following.items() if signals}
     if following:
-        shown = ", ".join(f"{o} with {enumerate_names(signals)}" for o, signals in following.items())
+        text = ", ".join(f"{o} with {enumerate_names(signals)}" for o, signals in following.items())
         signals = ", ".join(dict.fromkeys(s for every in following.values() for s in every))
-        yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=shown)
+        yield make_finding("residuals_follow_input", output=", ".join(following), input=signals, shown=text)
     yield from coupled
-    yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in judged)
-    yield from (f for f in result.findings if f.code == "loop_found" and f.output in judged)
+    yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in outputs)
+    yield from (f for f in result.findings if f.code == "loop_found" and f.output in outputs)
     # With a reference the loop is known: its noise is not part of what the model was estimated from, nor what it lacks.
-    coloured = [] if looped else [o for o, r in judged.items() if not (r.whiteness.passed or r.is_noise)]
+    coloured = [] if looped else [o for o, r in outputs.items() if not (r.whiteness.passed or r.is_noise)]
     yield from (make_finding("residuals_not_white", output=o) for o in coloured)
 
 
@@ -420,8 +422,8 @@ def _is_uncertain(result: Identification, name: str) -> bool:
         # A delay or a limit may well be 0.
         return False
     if name in result.profiles:
-        known = result.profiles[name]
-        return known.is_open or 0.0 in known
+        interval = result.profiles[name]
+        return interval.is_open or 0.0 in interval
     return error > MAX_COEFFICIENT_ERROR_RATIO * abs(numbers[name])
 
 

@@ -62,8 +62,8 @@ def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed
     for f in np.unique([math.sqrt(low * middle), middle, math.sqrt(middle * high)]):
         clock = max(1, round(0.4 / f / step))
         every = -(-rows // clock)
-        drawn = rng.choice([-1.0, 1.0], (inputs, every))
-        yield f"random binary, clock {clock * step:.3g} s", np.repeat(drawn, clock, axis=1)[:, :rows]
+        levels = rng.choice([-1.0, 1.0], (inputs, every))
+        yield f"random binary, clock {clock * step:.3g} s", np.repeat(levels, clock, axis=1)[:, :rows]
 
 
 def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
@@ -230,17 +230,19 @@ def design_input(
         size = len(fit.names) * len(fit.outputs) * task.rows
         progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
     course = ShareTracker(progress)
-    known = Sensitivities.of(fit, task.step, task.rows - 1, bounds.ramp_samples(task.step))
+    sensitivities = Sensitivities.of(fit, task.step, task.rows - 1, bounds.ramp_samples(task.step))
     course.advance_to(0.05)
     spectrum = best_spectrum(spectral_lines(fit, bounds, task.step, task.rows - 1), goal)
     course.advance_to(0.15)
-    tried = _design_candidates(task, known, spectrum, course)
+    designs = _design_candidates(task, sensitivities, spectrum, course)
     plain = np.stack([p * square_wave(task.rows - 1, task.period) for p in bounds.peaks.values()])
-    reference = fit.run(known.rig_commands(plain), task.step, f"square of period {task.period * task.step:.4g} s")
-    base = float(goal.score(known.information(known.derivatives(plain))))
-    best = tried[0]
-    commands = best.commands * _robust_scale(task, known, best.commands)
-    run = fit.run(known.rig_commands(commands), task.step, "designed")
+    reference = fit.run(
+        sensitivities.rig_commands(plain), task.step, f"square of period {task.period * task.step:.4g} s"
+    )
+    base = float(goal.score(sensitivities.information(sensitivities.derivatives(plain))))
+    best = designs[0]
+    commands = best.commands * _robust_scale(task, sensitivities, best.commands)
+    run = fit.run(sensitivities.rig_commands(commands), task.step, "designed")
     errors = _errors(fit, reference, run)
     at = list(goal.indices)
     ratios = np.log(errors["square"][at]) - np.log(errors["designed"][at])
@@ -254,7 +256,7 @@ def design_input(
         values=dict(zip(fit.names, fit.values, strict=True)),
         errors={k: dict(zip(fit.names, v.tolist(), strict=True)) for k, v in errors.items()},
         gain=float(np.exp(np.sum(ratios))),
-        gains=tuple((d.name, math.exp(min(goal.count * (d.score - base), 700.0))) for d in tried),
+        gains=tuple((d.name, math.exp(min(goal.count * (d.score - base), 700.0))) for d in designs),
         predicted_extremes=_predicted_extremes(run, bounds),
         spectrum=spectrum,
         efficiency=math.exp(best.score - spectrum.bound),
@@ -263,7 +265,7 @@ def design_input(
 
 
 def _design_candidates(
-    task: DesignTask, known: Sensitivities, spectrum: Spectrum, course: ShareTracker
+    task: DesignTask, sensitivities: Sensitivities, spectrum: Spectrum, course: ShareTracker
 ) -> list[Design]:
     """Return all candidate inputs, best first: initial signals, and the exchange results of the best of them."""
     fit, bounds, goal, rows = task.fit, task.bounds, task.criterion, task.rows - 1
@@ -274,12 +276,12 @@ def _design_candidates(
             raise KeyboardInterrupt
 
     peaks = np.array(list(bounds.peaks.values()))[:, None]
-    begun = [
-        scaled_design(name, peaks * c, known, goal, bounds)
+    initial_designs = [
+        scaled_design(name, peaks * c, sensitivities, goal, bounds)
         for name, c in initial_inputs(spectrum, len(fit.inputs), rows, task.step, task.seed)
     ]
-    found = [d for d in begun if d.score > -math.inf]
-    if not found:
+    feasible = [d for d in initial_designs if d.score > -math.inf]
+    if not feasible:
         raise ModelError(
             f"no input of this length makes {', '.join(fit.names[i] for i in goal.indices)} separately "
             f"identifiable from "
@@ -287,24 +289,24 @@ def _design_candidates(
         )
     # Of each kind the best one: what they lead to differs more than what they are.
     kinds: dict[str, Design] = {}
-    for design in sorted(found, key=lambda d: -d.score):
+    for design in sorted(feasible, key=lambda d: -d.score):
         kinds.setdefault(design.name.split(",")[0].split(" by")[0], design)
     starts = sorted(kinds.values(), key=lambda d: -d.score)[:MAX_EXCHANGE_STARTS]
-    coarse = max(known.ramp, 1, -(-rows // COARSE_HOLDS))
+    coarse = max(sensitivities.ramp, 1, -(-rows // COARSE_HOLDS))
     ends = []
     for place, design in enumerate(starts):
-        ends.append(exchange_holds(design, coarse, known, goal, bounds, raise_if_cancelled))
+        ends.append(exchange_holds(design, coarse, sensitivities, goal, bounds, raise_if_cancelled))
         course.advance_to(0.15 + 0.55 * (place + 1) / len(starts))
     best = max(ends, key=lambda d: d.score)
     for place, finer in enumerate(HOLD_DIVISORS[1:]):
-        hold = max(known.ramp, 1, coarse // finer)
+        hold = max(sensitivities.ramp, 1, coarse // finer)
         if coarse % hold:
             continue
-        further = exchange_holds(best, hold, known, goal, bounds, raise_if_cancelled)
+        further = exchange_holds(best, hold, sensitivities, goal, bounds, raise_if_cancelled)
         best = further if further.score > best.score else best
         course.advance_to(0.7 + 0.25 * (place + 1) / len(HOLD_DIVISORS[1:]))
     ends = [replace(d, name=f"{d.name}, exchanged") for d in (*(e for e in ends if e.name != best.name), best)]
-    return sorted([*found, *ends], key=lambda d: -d.score)
+    return sorted([*feasible, *ends], key=lambda d: -d.score)
 
 
 def _check_arguments(
@@ -336,8 +338,8 @@ def _check_arguments(
     _check_signals(fit, reference_run)
     if free.covariance is None:
         _raise_too_uncertain(fit, "some of its numbers have infinite intervals", None)
-    known = solved.about.get("step") if reference_run is None else reference_run.step
-    time = _positive("step", known if step is None else step, "a step [s]")
+    stated_step = solved.about.get("step") if reference_run is None else reference_run.step
+    time = _positive("step", stated_step if step is None else step, "a step [s]")
     length = _positive(
         "duration",
         duration if duration is not None else None if reference_run is None else reference_run.duration,
@@ -350,14 +352,14 @@ def _check_arguments(
             f"{MIN_RUN_SAMPLES} to {MAX_RUN_SAMPLES} rows"
         )
     swings = dict.fromkeys(outputs, math.inf) | (
-        {} if reference_run is None else _largest_values(reference_run, outputs, moved=True)
+        {} if reference_run is None else _largest_values(reference_run, outputs, from_start=True)
     )
     bounds = Bounds(
         per_signal_values(
             "peak",
             peak,
             fit.inputs,
-            None if reference_run is None else _largest_values(reference_run, fit.inputs, moved=False),
+            None if reference_run is None else _largest_values(reference_run, fit.inputs, from_start=False),
         ),
         per_signal_values("slew", slew, fit.inputs, dict.fromkeys(fit.inputs, math.inf)),
         per_signal_values("limits", limits, outputs, swings),
@@ -382,7 +384,7 @@ def _check_arguments(
         )
     # An order is of size 1 by itself; what else is known, is known as a share of itself.
     units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in at]
-    begun = check_seed(seed)
+    seed_value = check_seed(seed)
     every = round(
         _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]") / time
     )
@@ -390,17 +392,17 @@ def _check_arguments(
         raise ModelError(
             f"{setting('period')} {period:g} s is not between two steps and twice the run; give another one"
         )
-    said = () if solved.estimate is None or solved.estimate.findings is UNSET else solved.estimate.findings
-    missing = [f for f in said if f.code in LEFT_OUT_CODES]
+    findings = () if solved.estimate is None or solved.estimate.findings is UNSET else solved.estimate.findings
+    missing = [f for f in findings if f.code in LEFT_OUT_CODES]
     doubt = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
-    colour = next((f for f in said if f.code in NOT_WHITE_CODES), None)
+    colour = next((f for f in findings if f.code in NOT_WHITE_CODES), None)
     words: tuple[Finding, ...] = ()
     if doubt is not None:
         words = (make_finding("prediction_in_doubt", output=doubt.output, text=doubt.text),)
     elif colour is not None and noise is None:
         words = (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
     return DesignTask(
-        fit, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words
+        fit, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, seed_value, words
     )
 
 
@@ -432,17 +434,19 @@ def _positive(name: str, value: object, what: str) -> float:
     return number
 
 
-def _largest_values(run: Run, names: Sequence[str], *, moved: bool) -> dict[str, float]:
+def _largest_values(run: Run, names: Sequence[str], *, from_start: bool) -> dict[str, float]:
     """Return the largest absolute values of signals of a run; missing and constant signals are omitted.
 
-    With ``moved`` they are measured from the first value of each signal.
+    With ``from_start`` they are measured from the first value of each signal.
     """
     out = {}
     for name in names:
         if name in run:
             values = np.asarray(run[name])
             values = values[np.isfinite(values)]
-            size = float(np.max(np.abs(values - (values[0] if moved else 0.0)), initial=0.0)) if values.size else 0.0
+            size = (
+                float(np.max(np.abs(values - (values[0] if from_start else 0.0)), initial=0.0)) if values.size else 0.0
+            )
             if size > 0:
                 out[name] = size
     return out
@@ -456,33 +460,33 @@ def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int,
         names = fit.problem.orders or fit.names
     if not isinstance(names, Iterable):
         raise ModelError(f"names is a {type(names).__name__}; give a list of names of {', '.join(fit.names)}")
-    given = list(names)
-    for k, name in enumerate(given):
+    name_list = list(names)
+    for k, name in enumerate(name_list):
         if not isinstance(name, str) or name not in fit.names:
             near = nearest(name, fit.names) if isinstance(name, str) else ""
             raise ModelError(
                 f"names[{k}] = {short_repr(name)} is not a free parameter of the model{near}; it has "
                 f"{', '.join(fit.names)}"
             )
-        if name in given[:k]:
+        if name in name_list[:k]:
             raise ModelError(f"names has {name!r} twice; give each once")
-    if not given:
+    if not name_list:
         raise ModelError("names is empty; give the parameters of interest, or leave it out for all orders")
-    return tuple(fit.names.index(n) for n in given)
+    return tuple(fit.names.index(n) for n in name_list)
 
 
 def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
     """Raise if a model is unstable, or integrates without a limit of its output."""
-    found = stability(fit.model)
-    if found.unstable_poles != 0 or found.on_axis:
+    poles = stability(fit.model)
+    if poles.unstable_poles != 0 or poles.on_axis:
         raise ModelError(
-            f"the model is {found}, and inputs are designed for stable models; identify the machine with a stabilizing "
+            f"the model is {poles}, and inputs are designed for stable models; identify the machine with a stabilizing "
             "controller, or check the model"
         )
     drifting = [o for o, limit in bounds.output_limits.items() if math.isinf(limit)]
-    if found.origin_order > 0 and drifting:
+    if poles.origin_order > 0 and drifting:
         raise ModelError(
-            f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift "
+            f"the model integrates its input (order {poles.origin_order:g}), so that {drifting[0]} may drift "
             f"without limit; "
             f"say how far it may go by {parameter('limits')}, or give {parameter('reference_run')} a run"
         )
@@ -504,8 +508,8 @@ def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
     probe = np.stack([np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(fit.inputs))])
     run = fit.run(np.cumsum(probe, axis=1) / math.sqrt(rows) + probe, coarse, "probe")
     rows_of = fit.jacobian(run)
-    moved = np.einsum("pt,pq,qt->t", rows_of, spread, rows_of)
-    for output, part in zip(fit.outputs, np.split(moved, len(fit.outputs)), strict=True):
+    variances = np.einsum("pt,pq,qt->t", rows_of, spread, rows_of)
+    for output, part in zip(fit.outputs, np.split(variances, len(fit.outputs)), strict=True):
         size = float(np.sqrt(np.mean((run[output] / fit.noise[output]) ** 2)))
         share = float(np.sqrt(np.mean(np.maximum(part, 0.0)))) / max(size, 1e-300)
         if not share <= MAX_RELATIVE_UNCERTAINTY:
@@ -532,12 +536,12 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
     )
 
 
-def _robust_scale(task: DesignTask, known: Sensitivities, commands: Floats) -> float:
+def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floats) -> float:
     """Factor that keeps outputs within their limits over the confidence intervals of the model."""
-    moved, slopes = known.outputs(commands), known.derivatives(commands)
+    outputs, slopes = sensitivities.outputs(commands), sensitivities.derivatives(commands)
     spread = np.einsum("pot,pq,qot->ot", slopes, task.fit.covariance, slopes)
     noise = np.array([task.fit.noise[o] for o in task.fit.outputs])[:, None]
-    reach = np.abs(moved) + NORMAL_95 * noise * np.sqrt(np.maximum(spread, 0.0))
+    reach = np.abs(outputs) + NORMAL_95 * noise * np.sqrt(np.maximum(spread, 0.0))
     return task.bounds.scale(commands, reach)
 
 
@@ -545,8 +549,8 @@ def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
     """Return standard errors of the model, and those predicted for fits to the reference and to the designed run."""
     now, new = fit.covariance, fit.predicted_covariance(run)
     size = np.sqrt(np.diag(now))
-    told = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
-    both = np.linalg.inv(told) * np.outer(size, size)
+    covariance = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
+    both = np.linalg.inv(covariance) * np.outer(size, size)
     every = {"now": now, "square": fit.predicted_covariance(reference), "designed": new, "both": both}
     return {k: np.sqrt(np.diag(v)) for k, v in every.items()}
 
@@ -570,5 +574,5 @@ def _shape_text(best: Design, run: Run, task: DesignTask) -> str:
         return best.name
     first = next(iter(task.fit.inputs))
     switches = int(np.sum(np.diff(run[first][:-1]) != 0)) if task.bounds.ramp_samples(task.step) == 1 else 0
-    begun = best.name.removesuffix(", exchanged")
-    return f"levels exchanged from {begun}" + (f", {switches} switches" if switches else "")
+    origin = best.name.removesuffix(", exchanged")
+    return f"levels exchanged from {origin}" + (f", {switches} switches" if switches else "")

@@ -44,17 +44,19 @@ class Design:
     exchanges: int = 0
 
 
-def scaled_design(name: str, commands: Floats, known: Sensitivities, criterion: Criterion, bounds: Bounds) -> Design:
+def scaled_design(
+    name: str, commands: Floats, sensitivities: Sensitivities, criterion: Criterion, bounds: Bounds
+) -> Design:
     """Return commands scaled down until all limits hold, with their score."""
-    scale = bounds.scale(commands, known.outputs(commands))
-    score = float(criterion.score(known.information(known.derivatives(commands)))) + math.log(scale)
+    scale = bounds.scale(commands, sensitivities.outputs(commands))
+    score = float(criterion.score(sensitivities.information(sensitivities.derivatives(commands)))) + math.log(scale)
     return Design(name, scale * commands, score)
 
 
 def exchange_holds(
     begin: Design,
     hold: int,
-    known: Sensitivities,
+    sensitivities: Sensitivities,
     criterion: Criterion,
     bounds: Bounds,
     stopped: Callable[[], None] = lambda: None,
@@ -71,70 +73,70 @@ def exchange_holds(
     limits = np.array(list(bounds.output_limits.values()))[:, None]
     means = np.add.reduceat(begin.commands, starts, axis=1) / np.diff(np.append(starts, rows))
     level = _nearest_level(means / np.maximum(np.max(np.abs(means), axis=1, keepdims=True), 1e-300))
-    holds = [Hold.of(known, k, hold, starts, float(peaks[k, 0])) for k in range(inputs)]
+    holds = [Hold.of(sensitivities, k, hold, starts, float(peaks[k, 0])) for k in range(inputs)]
 
     def commands() -> Floats:
         return np.asarray(np.repeat(level, hold, axis=1)[:, :rows] * peaks)
 
-    derivatives, moved = known.derivatives(commands()), known.outputs(commands())
-    information = known.information(derivatives)
-    score = float(criterion.score(information)) - _log_limit_excess(moved, limits)
-    made = 0
-    while made < MAX_EXCHANGES:
+    derivatives, outputs = sensitivities.derivatives(commands()), sensitivities.outputs(commands())
+    information = sensitivities.information(derivatives)
+    score = float(criterion.score(information)) - _log_limit_excess(outputs, limits)
+    count = 0
+    while count < MAX_EXCHANGES:
         stopped()
         slope = None if score == -math.inf else criterion.gradient(information) / 2
         moves: list[tuple[float, int, int, int, float, Floats]] = []
         for k, one in enumerate(holds):
-            for gap, shared, own in one.information_changes(known, derivatives):
+            for gap, shared, own in one.information_changes(sensitivities, derivatives):
                 for step in LEVEL_CHANGES:
-                    there = _feasible_starts(level[k], step, gap)
+                    is_feasible = _feasible_starts(level[k], step, gap)
                     gain = np.zeros(len(shared))
                     if slope is not None:
                         gain = np.einsum("spq,pq->s", step * shared + step**2 * own, slope)
-                    for at in np.argsort(np.where(there, -gain, np.inf))[
-                        : min(MAX_EVALUATED_EXCHANGES, int(np.sum(there)))
+                    for at in np.argsort(np.where(is_feasible, -gain, np.inf))[
+                        : min(MAX_EVALUATED_EXCHANGES, int(np.sum(is_feasible)))
                     ]:
                         moves.append((float(gain[at]), k, int(at), gap, step, step * shared[at] + step**2 * own[at]))
         moves = sorted(moves, key=lambda m: -m[0])[:MAX_EVALUATED_EXCHANGES]
         if not moves:
             break
-        told = criterion.score(information + np.stack([m[5] for m in moves]))
-        best, then = score + MIN_SCORE_GAIN, moved
-        chosen: tuple[int, int, int, float] | None = None
-        for place in np.argsort(-told):
-            if not told[place] > best:
+        scores = criterion.score(information + np.stack([m[5] for m in moves]))
+        best, then = score + MIN_SCORE_GAIN, outputs
+        exchange: tuple[int, int, int, float] | None = None
+        for place in np.argsort(-scores):
+            if not scores[place] > best:
                 break
             _, k, at, gap, step, _ = moves[place]
-            after = holds[k].apply_exchange(moved, at, gap, step, shown=True)
-            reached = float(told[place]) - _log_limit_excess(after, limits)
+            outputs_after = holds[k].apply_exchange(outputs, at, gap, step, of_response=True)
+            reached = float(scores[place]) - _log_limit_excess(outputs_after, limits)
             if reached > best:
-                best, then, chosen = reached, after, (k, at, gap, step)
-        if chosen is None:
+                best, then, exchange = reached, outputs_after, (k, at, gap, step)
+        if exchange is None:
             break
-        k, at, gap, step = chosen
-        score, moved = best, then
+        k, at, gap, step = exchange
+        score, outputs = best, then
         level[k, at] += step
         if gap:
             level[k, at + gap] -= step
-        derivatives = holds[k].apply_exchange(derivatives, at, gap, step, shown=False)
-        information = known.information(derivatives)
-        made += 1
-    ended = scaled_design(begin.name, commands(), known, criterion, bounds)
-    return Design(begin.name, ended.commands, ended.score, made)
+        derivatives = holds[k].apply_exchange(derivatives, at, gap, step, of_response=False)
+        information = sensitivities.information(derivatives)
+        count += 1
+    ended = scaled_design(begin.name, commands(), sensitivities, criterion, bounds)
+    return Design(begin.name, ended.commands, ended.score, count)
 
 
-def _log_limit_excess(moved: Floats, limits: Floats) -> float:
+def _log_limit_excess(outputs: Floats, limits: Floats) -> float:
     """Logarithm of the largest ratio of outputs to their limits; 0 if all limits hold."""
-    return math.log(max(1.0, float(np.max(np.abs(moved) / limits))))
+    return math.log(max(1.0, float(np.max(np.abs(outputs) / limits))))
 
 
 def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
     """Mask of the holds that may change by a step, with the hold one gap later changed by the opposite amount."""
-    there: NDArray[np.bool_] = np.abs(level + step) < COMMAND_LEVELS[-1] + 0.5
+    is_feasible: NDArray[np.bool_] = np.abs(level + step) < COMMAND_LEVELS[-1] + 0.5
     if gap:
-        there[:-gap] &= np.abs(level[gap:] - step) < COMMAND_LEVELS[-1] + 0.5
-        there[-gap:] = False
-    return there
+        is_feasible[:-gap] &= np.abs(level[gap:] - step) < COMMAND_LEVELS[-1] + 0.5
+        is_feasible[-gap:] = False
+    return is_feasible
 
 
 @dataclass(frozen=True)
@@ -163,33 +165,37 @@ class Hold:
     own: Mapping[int, Floats]
 
     @classmethod
-    def of(cls, known: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
+    def of(cls, sensitivities: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
         """Compute the response of one input."""
-        block, shown = (
-            _hold_response(known.kernels[place], hold) * peak,
-            _hold_response(known.responses[place], hold) * peak,
+        block, response = (
+            _hold_response(sensitivities.kernels[place], hold) * peak,
+            _hold_response(sensitivities.responses[place], hold) * peak,
         )
-        spectrum = np.fft.rfft(block, known.length)
-        offsets = _correlate_at_starts(known, known.nuisance.reshape(-1, *block.shape[1:]), spectrum, starts)
-        alone = _inner_products(known, block, block, starts) - np.einsum("spr,sqr->spq", offsets, offsets)
+        spectrum = np.fft.rfft(block, sensitivities.length)
+        offsets = _correlate_at_starts(
+            sensitivities, sensitivities.nuisance.reshape(-1, *block.shape[1:]), spectrum, starts
+        )
+        alone = _inner_products(sensitivities, block, block, starts) - np.einsum("spr,sqr->spq", offsets, offsets)
         own = {0: alone}
         for gap in PAIR_GAPS_HOLDS:
             if gap >= len(starts):
                 break
             late = np.zeros_like(block)
-            late[..., gap * hold :] = block[..., : known.rows - gap * hold]
-            mixed = _inner_products(known, block, late, starts)[:-gap]
+            late[..., gap * hold :] = block[..., : sensitivities.rows - gap * hold]
+            mixed = _inner_products(sensitivities, block, late, starts)[:-gap]
             mixed = mixed - np.einsum("spr,sqr->spq", offsets[:-gap], offsets[gap:])
             pair = np.zeros_like(alone)
             pair[:-gap] = alone[:-gap] + alone[gap:] - mixed - np.swapaxes(mixed, -1, -2)
             own[gap] = pair
-        return cls(starts, block, shown, spectrum, offsets, own)
+        return cls(starts, block, response, spectrum, offsets, own)
 
-    def information_changes(self, known: Sensitivities, derivatives: Floats) -> Iterator[tuple[int, Floats, Floats]]:
+    def information_changes(
+        self, sensitivities: Sensitivities, derivatives: Floats
+    ) -> Iterator[tuple[int, Floats, Floats]]:
         """Yield for each gap the first- and second-order change of the information by an exchange, by its start."""
-        shared = _correlate_at_starts(known, derivatives, self.spectrum, self.starts)
-        if len(known.nuisance):
-            flat = derivatives.reshape(len(derivatives), -1) @ known.nuisance.T
+        shared = _correlate_at_starts(sensitivities, derivatives, self.spectrum, self.starts)
+        if len(sensitivities.nuisance):
+            flat = derivatives.reshape(len(derivatives), -1) @ sensitivities.nuisance.T
             shared = shared - np.einsum("spr,qr->spq", self.offsets, flat)
         shared = shared + np.swapaxes(shared, -1, -2)
         for gap, own in self.own.items():
@@ -199,9 +205,9 @@ class Hold:
                 pair[:-gap] = shared[:-gap] - shared[gap:]
             yield gap, pair, own
 
-    def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, shown: bool) -> Floats:
+    def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, of_response: bool) -> Floats:
         """Return derivatives, or outputs, after an exchange."""
-        block, out = self.response if shown else self.block, series.copy()
+        block, out = self.response if of_response else self.block, series.copy()
         for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
             out[..., begins:] += size * block[..., : block.shape[-1] - begins]
         return out
@@ -220,19 +226,21 @@ def _hold_response(kernel: Floats, hold: int) -> Floats:
     return total
 
 
-def _inner_products(known: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
+def _inner_products(sensitivities: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
     """Inner products of two responses from their common start to the end of the run, by that start."""
-    grown = np.zeros((len(starts), len(one), len(other)))
+    products = np.zeros((len(starts), len(one), len(other)))
     for p, row in enumerate(one):
         total = np.cumsum(np.einsum("ot,qot->qt", row, other), axis=-1)
-        grown[:, p] = total[:, known.rows - 1 - starts].T
-    return grown
+        products[:, p] = total[:, sensitivities.rows - 1 - starts].T
+    return products
 
 
-def _correlate_at_starts(known: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]) -> Floats:
+def _correlate_at_starts(
+    sensitivities: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]
+) -> Floats:
     """Inner products of series with holds that start at given samples, shape (starts, parameters, series)."""
     out = np.zeros((len(starts), spectrum.shape[0], len(series)))
-    for place, one in enumerate(np.fft.rfft(series, known.length)):
+    for place, one in enumerate(np.fft.rfft(series, sensitivities.length)):
         product = np.einsum("of,pof->pf", one, np.conj(spectrum))
-        out[..., place] = np.fft.irfft(product, known.length)[:, starts].T
+        out[..., place] = np.fft.irfft(product, sensitivities.length)[:, starts].T
     return out

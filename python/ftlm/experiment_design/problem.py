@@ -59,11 +59,11 @@ class Criterion:
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == "D":
                 sign, size = np.linalg.slogdet(spread)
-                found = np.where(sign > 0, -0.5 * size / self.count, -np.inf)
+                scores = np.where(sign > 0, -0.5 * size / self.count, -np.inf)
             else:
                 axes = np.linalg.eigvalsh(np.where(np.isfinite(spread), spread, 0.0))
-                found = np.where(axes[..., 0] > 0, -0.5 * np.log(axes[..., -1]), -np.inf)
-        return np.where(np.isfinite(spread[..., 0, 0]), found, -np.inf)
+                scores = np.where(axes[..., 0] > 0, -0.5 * np.log(axes[..., -1]), -np.inf)
+        return np.where(np.isfinite(spread[..., 0, 0]), scores, -np.inf)
 
     def smooth_score(self, information: Floats) -> float:
         """Differentiable score: for E, Kiefer's mean in place of the widest axis; never below :meth:`score`."""
@@ -95,12 +95,12 @@ class Criterion:
     def _inverse(self, information: Floats) -> Floats:
         """Covariance of the parameters of interest in their units; infinite if the information is singular."""
         diagonal = np.diagonal(information, axis1=-2, axis2=-1)
-        seen = np.all(diagonal > 0, axis=-1)
-        size = np.sqrt(np.where(seen[..., None], diagonal, 1.0))
+        is_positive = np.all(diagonal > 0, axis=-1)
+        size = np.sqrt(np.where(is_positive[..., None], diagonal, 1.0))
         scaled = information / (size[..., :, None] * size[..., None, :])
-        scaled = np.where(seen[..., None, None], scaled, np.eye(scaled.shape[-1]))
+        scaled = np.where(is_positive[..., None, None], scaled, np.eye(scaled.shape[-1]))
         sign, determinant = np.linalg.slogdet(scaled)
-        good = seen & (sign > 0) & (determinant > math.log(MIN_SCALED_DETERMINANT) * 2)
+        good = is_positive & (sign > 0) & (determinant > math.log(MIN_SCALED_DETERMINANT) * 2)
         scaled = np.where(good[..., None, None], scaled, np.eye(scaled.shape[-1]))
         at = list(self.indices)
         unit = size[..., at] * np.asarray(self.units)
@@ -134,16 +134,16 @@ class Bounds:
         """Number of samples that a change from one peak to the other takes under the slew rates."""
         return max(1, *(math.ceil(min(2 * p / self.slews[n] / step, 1e18) - 1e-9) for n, p in self.peaks.items()))
 
-    def scale(self, commands: Floats, moved: Floats) -> float:
+    def scale(self, commands: Floats, outputs: Floats) -> float:
         """Return the factor, at most 1, that keeps commands and outputs within their limits.
 
-        ``commands`` and ``moved`` have one row per input and per output, in the order of the limits.
+        ``commands`` and ``outputs`` have one row per input and per output, in the order of the limits.
         """
         return min(
             1.0,
             *(
                 limit / float(np.max(np.abs(row), initial=0.0)) if np.any(row) else 1.0
-                for limit, row in zip(self.output_limits.values(), moved, strict=True)
+                for limit, row in zip(self.output_limits.values(), outputs, strict=True)
             ),
             *(
                 limit / float(np.max(np.abs(row), initial=0.0)) if np.any(row) else 1.0
@@ -153,7 +153,7 @@ class Bounds:
 
 
 def per_signal_values(
-    what: str, given: object, names: Sequence[str], default: Mapping[str, float] | None
+    what: str, values: object, names: Sequence[str], default: Mapping[str, float] | None
 ) -> dict[str, float]:
     """Return one positive number for each name, from a number, a mapping, or the default.
 
@@ -162,20 +162,20 @@ def per_signal_values(
     ModelError
         An unknown name, a value that is not positive, or a missing value without a default.
     """
-    if isinstance(given, Mapping):
-        for name in given:
+    if isinstance(values, Mapping):
+        for name in values:
             if name not in names:
                 near = nearest(name, names) if isinstance(name, str) else ""
                 raise ModelError(
                     f"{what} names {short_repr(name)}{near}, which is none of {', '.join(names) or 'nothing'}; "
                     "name one of them"
                 )
-    elif given is not None:
-        given = dict.fromkeys(names, given)
+    elif values is not None:
+        values = dict.fromkeys(names, values)
     out = {}
     for name in names:
-        said = None if given is None else given.get(name)
-        if said is None:
+        stated_value = None if values is None else values.get(name)
+        if stated_value is None:
             if default is None or name not in default:
                 raise ModelError(
                     f"{what} of {name} is not given; give {parameter(what)} a number, or one by name, or "
@@ -183,7 +183,7 @@ def per_signal_values(
                 )
             out[name] = default[name]
             continue
-        value = real_number(f"{what} of {name}", said)
+        value = real_number(f"{what} of {name}", stated_value)
         if not value > 0:
             raise ModelError(f"{what} of {name} = {value:g} is not above 0; give its largest absolute value")
         if not LIMIT_RANGE[0] <= value <= LIMIT_RANGE[1] and not math.isinf(value):
@@ -248,9 +248,9 @@ class ModelFit:
     @property
     def covariance(self) -> Floats:
         """Covariance of the free parameters, as estimated from the runs of the model."""
-        known = parameter_set_of(self.model)
-        at = [known.names.index(n) for n in self.names]
-        return np.asarray(known.covariance)[np.ix_(at, at)]
+        parameters = parameter_set_of(self.model)
+        at = [parameters.names.index(n) for n in self.names]
+        return np.asarray(parameters.covariance)[np.ix_(at, at)]
 
     def run(self, commands: Floats, step: float, name: str) -> Run:
         """Simulate the model for commands of shape (inputs, rows)."""
@@ -285,8 +285,8 @@ def _covariance_of(rows: Floats) -> Floats:
     size = np.linalg.norm(rows, axis=1)
     scaled = rows / np.where(size > 0, size, 1.0)[:, None]
     _, sizes, right = thin_svd(scaled.T)
-    lost = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
-    if np.any(size == 0) or sizes[-1] <= lost * sizes[0]:
+    tolerance = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
+    if np.any(size == 0) or sizes[-1] <= tolerance * sizes[0]:
         return np.diag(np.full(len(rows), np.inf))
     half = right.T / sizes / size[:, None]
     return np.asarray(half @ half.T)
@@ -295,8 +295,8 @@ def _covariance_of(rows: Floats) -> Floats:
 def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], every: int) -> Floats:
     orders, coefficients, inputs = problem.split(values)
     grid = Objective(problem, [run], weights, every=every)
-    here = grid.minimize(Iterate(orders, coefficients, "the model", {}, inputs), 1, plain=True)
-    return np.asarray(here.outcome["jacobian"])
+    point = grid.minimize(Iterate(orders, coefficients, "the model", {}, inputs), 1, plain=True)
+    return np.asarray(point.outcome["jacobian"])
 
 
 @dataclass(frozen=True)
@@ -339,8 +339,8 @@ class Sensitivities:
             commands = np.zeros((inputs, rows + 2))
             commands[k, 1 : 1 + ramp] = 1.0 / ramp
             run = fit.run(commands, step, "pulse")
-            found = fit.jacobian(run, offset=False)
-            kernels.append(found.reshape(len(fit.names), len(fit.outputs), rows))
+            jacobian = fit.jacobian(run, offset=False)
+            kernels.append(jacobian.reshape(len(fit.names), len(fit.outputs), rows))
             answers.append(np.stack([run[o][1:-1] for o in fit.outputs]))
         nuisance = _offset_responses(fit, step, rows)
         return cls(fit, step, rows, ramp, np.stack(kernels), np.stack(answers), nuisance)
@@ -372,17 +372,17 @@ class Sensitivities:
     def information(self, derivatives: Floats) -> Floats:
         """Fisher information of the free parameters, with offsets of the run projected out."""
         flat = derivatives.reshape(len(derivatives), -1)
-        told = flat @ flat.T
+        information = flat @ flat.T
         if len(self.nuisance):
             shared = flat @ self.nuisance.T
-            told = told - shared @ shared.T
-        return np.asarray(told)
+            information = information - shared @ shared.T
+        return np.asarray(information)
 
     def rig_commands(self, commands: Floats) -> Floats:
         """Commands for a rig, shape (inputs, rows + 1): changes as ramps, and a last row of zeros."""
         total = np.cumsum(commands, axis=1)
-        before = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
-        smooth = commands if self.ramp == 1 else (total - before) / self.ramp
+        delayed = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
+        smooth = commands if self.ramp == 1 else (total - delayed) / self.ramp
         return np.pad(smooth, ((0, 0), (0, 1)))
 
 
@@ -394,8 +394,8 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
         raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not decided; identify it again")
     if not drives:
         return np.zeros((0, len(fit.outputs) * rows))
-    taken = {*structure.signals, *structure.coefficient_names, *structure.order_names}
-    one = next(n for n in (f"one{k}" for k in range(len(taken) + 1)) if not any(t.startswith(n) for t in taken))
+    names = {*structure.signals, *structure.coefficient_names, *structure.order_names}
+    one = next(n for n in (f"one{k}" for k in range(len(names) + 1)) if not any(t.startswith(n) for t in names))
     time = step * np.arange(rows + 2)
     shapes = {f"{one}_{k}": np.asarray(time**k, dtype=np.float64) for k in range(drives)}
     equations = tuple(
@@ -406,7 +406,7 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
     values = dict(zip(fit.names, fit.values, strict=True))
     still = fit.run(np.zeros((len(fit.inputs), rows + 2)), step, "still")
     run = still.with_outputs(shapes)
-    found = _derivatives(
+    derivatives = _derivatives(
         problem,
         tuple(values.get(n, 0.0) for n in problem.names),
         run,
@@ -415,9 +415,9 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
     )
     own = [i for i, n in enumerate(problem.names) if n not in values]
     # They are told from the second sample on; at the first, a run from rest shows nothing of them.
-    told = found[own].reshape(len(own), len(fit.outputs), rows)
-    told = np.pad(told, ((0, 0), (0, 0), (1, 0)))[..., :rows]
-    return orthonormal(told.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T
+    responses = derivatives[own].reshape(len(own), len(fit.outputs), rows)
+    responses = np.pad(responses, ((0, 0), (0, 0), (1, 0)))[..., :rows]
+    return orthonormal(responses.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T
 
 
 def fast_length(least: int) -> int:

@@ -87,7 +87,7 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
     peaks = np.array(list(bounds.peaks.values()))
     swings = np.array(list(bounds.output_limits.values()))
     weights = 1.0 / np.array([fit.noise[o] for o in fit.outputs])
-    told = (
+    information = (
         np.einsum("oilp,oilq,o->ilpq", slopes, slopes.conj(), weights**2).real * rows * peaks[:, None, None, None] ** 2
     )
     count = len(inputs)
@@ -95,17 +95,17 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
     for k in range(count):
         costs[k, k] = 1.0
     costs[count:] = (np.abs(gains) * peaks[:, None] / swings[:, None, None]) ** 2
-    kept = [(k, np.arange(k, len(numbers), count)) for k in range(count)]
+    groups = [(k, np.arange(k, len(numbers), count)) for k in range(count)]
     return SpectralLines(
-        np.concatenate([frequencies[at] for _, at in kept]),
-        np.concatenate([told[k, at] for k, at in kept]),
-        np.concatenate([costs[:, k, at] for k, at in kept], axis=1),
+        np.concatenate([frequencies[at] for _, at in groups]),
+        np.concatenate([information[k, at] for k, at in groups]),
+        np.concatenate([costs[:, k, at] for k, at in groups], axis=1),
     )
 
 
 def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Complex, Complex]:
     """Derivatives (outputs, inputs, W, parameters) of frequency responses to zero-order-hold inputs, and these."""
-    held = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
+    hold_response = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
     gains = frequency_response(fit.model, w)
     coupling = fit.problem.structure.coupling
     own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
@@ -126,14 +126,14 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
         small = DERIVATIVE_STEP_RATIO * max(abs(value), 1e-3)
         ends = []
         for at in (value + small, value - small):
-            moved = values.copy()
-            moved[k] = at
-            ends.append(_output_responses(with_parameter_vector(own, moved), w, coupling, drives, signals))
+            shifted = values.copy()
+            shifted[k] = at
+            ends.append(_output_responses(with_parameter_vector(own, shifted), w, coupling, drives, signals))
         slopes += ((ends[0] - ends[1]) / (2 * small))[..., None] * chain[k]
     for place, item in enumerate(fit.problem.inputs, start=len(fit.names) - len(fit.problem.inputs)):
         at = fit.inputs.index(item.signal)
         slopes[:, at, :, place] = -1j * w * gains[:, at]
-    return slopes * held[:, None], gains * held
+    return slopes * hold_response[:, None], gains * hold_response
 
 
 def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
@@ -165,36 +165,36 @@ def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
     damp = 1.0 if criterion.kind == "D" else 0.2
     for turn in range(MAX_PRICE_ITERATIONS):
         cost = price @ lines.costs
-        told = lines.information / cost[:, None, None]
+        information = lines.information / cost[:, None, None]
         for _ in range(MAX_WEIGHT_ITERATIONS):
-            gain = _gain_per_point(weights, told, criterion)
+            gain = _gain_per_point(weights, information, criterion)
             if gain is None:
                 return Spectrum(lines, np.zeros(points), -math.inf, math.inf)
             weights = weights * np.maximum(gain, 0.0) ** damp
             weights = weights / np.sum(weights)
             if np.max(gain) < 1 + OPTIMALITY_TOLERANCE:
                 break
-        gain = _gain_per_point(weights, told, criterion)
+        gain = _gain_per_point(weights, information, criterion)
         if gain is None:
             return Spectrum(lines, np.zeros(points), -math.inf, math.inf)
-        total = np.tensordot(weights, told, 1)
+        total = np.tensordot(weights, information, 1)
         bound = min(bound, criterion.smooth_score(total) + 0.5 * math.log(max(float(np.max(gain)), 1.0)))
-        spent = weights / cost
-        used = lines.costs @ spent
-        feasible = spent / np.max(used)
+        normalized = weights / cost
+        usage = lines.costs @ normalized
+        feasible = normalized / np.max(usage)
         score = float(criterion.score(np.tensordot(feasible, lines.information, 1)))
         if score > best:
             best, power = score, feasible
         if bound - best < OPTIMALITY_TOLERANCE:
             break
-        price = price * used ** (0.7 if turn < MAX_PRICE_ITERATIONS // 2 else 0.4)
+        price = price * usage ** (0.7 if turn < MAX_PRICE_ITERATIONS // 2 else 0.4)
         price = np.maximum(price / np.sum(price), 1e-9)
     return Spectrum(lines, power, best, bound)
 
 
-def _gain_per_point(weights: Floats, told: Floats, criterion: Criterion) -> Floats | None:
+def _gain_per_point(weights: Floats, information: Floats, criterion: Criterion) -> Floats | None:
     """Derivative of the criterion with respect to the power of each point, 1 on average; None if not identifiable."""
-    total = np.tensordot(weights, told, 1)
+    total = np.tensordot(weights, information, 1)
     if not np.isfinite(criterion.score(total)):
         return None
-    return np.asarray(np.einsum("kpq,pq->k", told, criterion.gradient(total)))
+    return np.asarray(np.einsum("kpq,pq->k", information, criterion.gradient(total)))

@@ -90,13 +90,13 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     warnings.simplefilter("error", RuntimeWarning)
     check_version(path)
     skipped: dict[str, str] = {}
-    wanted: dict[str, str] = {}
+    kinds: dict[str, str] = {}
     size = 0
-    seen: set[str] = set()
+    names: set[str] = set()
     for name, shape, kind in list_variables(matlab, path):
-        if name in seen:
+        if name in names:
             raise UnreadableError(f"the variable {name!r} is in it twice")
-        seen.add(name)
+        names.add(name)
         count = math.prod(map(int, shape))
         if kind not in NUMERIC_MATLAB_CLASSES:
             skipped[name] = str(kind)
@@ -105,19 +105,19 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
         elif count <= 0:
             skipped[name] = "empty"
         else:
-            wanted[name] = kind
+            kinds[name] = kind
             size += 8 * count
     if size > budget:
         raise UnreadableError(
             f"with it the arrays take more than {SIZE_LIMIT} bytes (it declares {size})", "save a part of it"
         )
-    if len(seen) > MAX_ARRAYS:
-        raise UnreadableError(f"it holds {len(seen)} variables, more than {MAX_ARRAYS}", "save a part of it")
+    if len(names) > MAX_ARRAYS:
+        raise UnreadableError(f"it holds {len(names)} variables, more than {MAX_ARRAYS}", "save a part of it")
     # With mat_dtype=True SciPy drops imaginary parts; the stored type loses nothing.
-    loaded = matlab.loadmat(path, mat_dtype=False, variable_names=list(wanted)) if wanted else {}
+    loaded = matlab.loadmat(path, mat_dtype=False, variable_names=list(kinds)) if kinds else {}
     header: dict[str, Any] = {"arrays": [], "skipped": skipped}
     arrays = []
-    for name, kind in wanted.items():
+    for name, kind in kinds.items():
         values = loaded.get(name)
         if not isinstance(values, numpy.ndarray) or values.ndim != 2 or values.dtype.kind not in "biufc":
             raise UnreadableError(f"the variable {name!r} is not what the file's own list says")
@@ -160,13 +160,13 @@ def check_size(rows: int, columns: int) -> None:
         )
 
 
-def timestamp_array(nanoseconds: Any, gone: Any) -> tuple[dict[str, Any], Any]:
+def timestamp_array(nanoseconds: Any, is_missing: Any) -> tuple[dict[str, Any], Any]:
     """Encode a column of timestamps: header entry, and nanoseconds since the first valid one."""
     numpy: Any = importlib.import_module("numpy")
-    there = numpy.flatnonzero(~gone)
-    since = int(nanoseconds[there[0]]) if there.size else 0
+    rows = numpy.flatnonzero(~is_missing)
+    since = int(nanoseconds[rows[0]]) if rows.size else 0
     values = (nanoseconds - since).astype(numpy.float64)
-    values[gone] = numpy.nan
+    values[is_missing] = numpy.nan
     return {"type": "moments", "since": since}, values
 
 
@@ -202,19 +202,19 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
     types: Any = importlib.import_module("pyarrow.types")
     compute: Any = importlib.import_module("pyarrow.compute")
     header: dict[str, Any] = {"arrays": [], "skipped": {}, "text": True}
-    told = (table.schema.metadata or {}).get(b"ftlm-run")
-    if told is not None:
-        header["ftlm-run"] = told.decode("utf-8", errors="replace")
+    metadata = (table.schema.metadata or {}).get(b"ftlm-run")
+    if metadata is not None:
+        header["ftlm-run"] = metadata.decode("utf-8", errors="replace")
     units = _arrow_units(table.schema)
     arrays = []
-    made = hashlib.sha256(told or b"")
+    digest = hashlib.sha256(metadata or b"")
     for name, column in zip(table.column_names, table.columns, strict=True):
         kind = column.type
         if types.is_timestamp(kind) or types.is_date(kind):
             whole = compute.cast(compute.cast(column, "timestamp[ns]"), "int64").combine_chunks()
-            gone = numpy.asarray(whole.is_null())
-            said, values = timestamp_array(whole.fill_null(0).to_numpy(zero_copy_only=False), gone)
-            header["arrays"].append({"name": name, "rows": len(values), "columns": 1, **said})
+            is_missing = numpy.asarray(whole.is_null())
+            entry, values = timestamp_array(whole.fill_null(0).to_numpy(zero_copy_only=False), is_missing)
+            header["arrays"].append({"name": name, "rows": len(values), "columns": 1, **entry})
             arrays.append(values)
             continue
         if not (types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)):
@@ -226,14 +226,14 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
             {"name": name, "rows": len(values), "columns": 1, "type": single, **units.get(name, {})}
         )
         arrays.append(numpy.asarray(values, dtype=numpy.float64))
-        made.update(f"\0{name}\0{len(values)}\0".encode())
-        made.update(numpy.ascontiguousarray(arrays[-1], dtype="<f8").tobytes())
+        digest.update(f"\0{name}\0{len(values)}\0".encode())
+        digest.update(numpy.ascontiguousarray(arrays[-1], dtype="<f8").tobytes())
     # Runs written by ftlm store row count and digest.
     check = (table.schema.metadata or {}).get(b"ftlm-check")
-    if check is not None and check != f"{table.num_rows} {made.hexdigest()}".encode():
-        said = check.split(b" ")[0].decode("utf-8", errors="replace")[:20]
+    if check is not None and check != f"{table.num_rows} {digest.hexdigest()}".encode():
+        entry = check.split(b" ")[0].decode("utf-8", errors="replace")[:20]
         raise UnreadableError(
-            f"the file is damaged: {table.num_rows} rows were read where it says {said}, or their checksum is another"
+            f"the file is damaged: {table.num_rows} rows were read where it says {entry}, or their checksum is another"
         )
     return header, arrays
 
@@ -242,15 +242,15 @@ def _arrow_units(schema: Any) -> dict[str, dict[str, str]]:
     """Return the units of columns, as fields or the attributes of a pandas frame state them."""
     try:
         whole = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
-        told = {str(name): str(unit) for name, unit in whole.items()}
+        units = {str(name): str(unit) for name, unit in whole.items()}
     except (ValueError, AttributeError, RecursionError):
-        told = {}
+        units = {}
     for item in schema:
         own = item.metadata or {}
         unit = own.get(b"units", own.get(b"unit"))
         if unit is not None:
-            told[item.name] = unit.decode("utf-8", errors="replace")
-    return {name: {"unit": unit[:40]} for name, unit in told.items()}
+            units[item.name] = unit.decode("utf-8", errors="replace")
+    return {name: {"unit": unit[:40]} for name, unit in units.items()}
 
 
 class Arrays:
@@ -296,47 +296,47 @@ class Arrays:
                     self.header["skipped"][whole] = "no column of numbers"
             return
         matrix = values.reshape(-1, 1) if values.ndim == 1 else values
-        said: dict[str, Any] = {"type": "single" if values.dtype == numpy.float32 else "double"}
+        fields: dict[str, Any] = {"type": "single" if values.dtype == numpy.float32 else "double"}
         if values.dtype.kind == "M":
             if matrix.shape[1] > 1:
                 self.header["skipped"][name] = "a matrix of dates"
                 return
             flat = values.ravel().astype("datetime64[ns]")
-            said, matrix = timestamp_array(flat.astype(numpy.int64), numpy.isnat(flat))
+            fields, matrix = timestamp_array(flat.astype(numpy.int64), numpy.isnat(flat))
             matrix = matrix.reshape(-1, 1)
         if unit:
-            said["unit"] = unit[:40]
-        self.header["arrays"].append({"name": name, "rows": matrix.shape[0], "columns": matrix.shape[1], **said})
+            fields["unit"] = unit[:40]
+        self.header["arrays"].append({"name": name, "rows": matrix.shape[0], "columns": matrix.shape[1], **fields})
         self.values.append(matrix)
 
 
 def read_numpy(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     """Return the arrays of a NumPy file; pickled objects are never loaded."""
-    found = Arrays(budget)
+    arrays = Arrays(budget)
     if path.lower().endswith(".npy"):
         with open(path, "rb") as stream:
-            values = numpy_array(stream, "the array", found)
+            values = numpy_array(stream, "the array", arrays)
         if values is None:
-            return found.header, []
-        found.header["text"] = True
+            return arrays.header, []
+        arrays.header["text"] = True
         if values.dtype.names is not None or values.ndim == 1:
-            found.add("" if values.dtype.names else "c1", values)
+            arrays.add("" if values.dtype.names else "c1", values)
         else:
             check_size(0, values.shape[1])
             for k in range(values.shape[1]):
-                found.add(f"c{k + 1}", values[:, k])
-        return found.header, found.values
+                arrays.add(f"c{k + 1}", values[:, k])
+        return arrays.header, arrays.values
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             name = entry.filename.removesuffix(".npy")
             with archive.open(entry) as stream:
-                values = numpy_array(stream, name, found)
+                values = numpy_array(stream, name, arrays)
             if values is not None:
-                found.add(name, values)
-    return found.header, found.values
+                arrays.add(name, values)
+    return arrays.header, arrays.values
 
 
-def numpy_array(stream: Any, name: str, found: Arrays) -> Any:
+def numpy_array(stream: Any, name: str, arrays: Arrays) -> Any:
     """Read one NumPy array; None if it is skipped. The size is checked before the data are read."""
     form: Any = importlib.import_module("numpy.lib.format")
     version = form.read_magic(stream)
@@ -344,7 +344,7 @@ def numpy_array(stream: Any, name: str, found: Arrays) -> Any:
     if read_header is None:
         raise UnreadableError(f"{name!r} is of a format of NumPy's that is not known here ({version})", "save it again")
     shape, order, kind = read_header(stream)
-    if not found.fits(name, shape, kind):
+    if not arrays.fits(name, shape, kind):
         return None
     numpy: Any = importlib.import_module("numpy")
     size = math.prod(shape) * kind.itemsize
@@ -360,43 +360,43 @@ def numpy_array(stream: Any, name: str, found: Arrays) -> Any:
 def read_hdf5(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     """Return the matrices of an HDF5 file, including MATLAB 7.3; external links are not followed."""
     hdf5: Any = importlib.import_module("h5py")
-    found = Arrays(budget)
+    arrays = Arrays(budget)
     with hdf5.File(path, "r") as file:
-        _gather(hdf5, file, "", found, 0)
-    return found.header, found.values
+        _gather(hdf5, file, "", arrays, 0)
+    return arrays.header, arrays.values
 
 
-def _gather(hdf5: Any, group: Any, prefix: str, found: Arrays, depth: int) -> None:
+def _gather(hdf5: Any, group: Any, prefix: str, arrays: Arrays, depth: int) -> None:
     """Collect the arrays of an HDF5 group recursively."""
     for key in group:
         name, link = f"{prefix}{key}", group.get(key, getlink=True)
         if not isinstance(link, hdf5.HardLink):
-            found.header["skipped"][name] = "a link"
+            arrays.header["skipped"][name] = "a link"
             continue
         item = group[key]
         matlab = item.attrs.get("MATLAB_class")
         kind = matlab.decode(errors="replace") if isinstance(matlab, bytes) else "" if matlab is None else str(matlab)
-        if len(found.header["skipped"]) > MAX_ARRAYS:
+        if len(arrays.header["skipped"]) > MAX_ARRAYS:
             raise UnreadableError(f"it holds more than {MAX_ARRAYS} things that are not arrays", "save a part of it")
         if isinstance(item, hdf5.Group):
             if kind or key.startswith("#") or depth >= MAX_GROUP_DEPTH:
-                found.header["skipped"][name] = kind or "of MATLAB's own"
+                arrays.header["skipped"][name] = kind or "of MATLAB's own"
             else:
-                _gather(hdf5, item, f"{name}/", found, depth + 1)
+                _gather(hdf5, item, f"{name}/", arrays, depth + 1)
         elif not isinstance(item, hdf5.Dataset) or (kind and kind not in NUMERIC_MATLAB_CLASSES):
-            found.header["skipped"][name] = kind or "no array"
+            arrays.header["skipped"][name] = kind or "no array"
         elif not has_numbers(item):
-            found.header["skipped"][name] = "no numbers"
+            arrays.header["skipped"][name] = "no numbers"
         elif item.is_virtual or item.external:
-            found.header["skipped"][name] = "its numbers lie in other files"
+            arrays.header["skipped"][name] = "its numbers lie in other files"
         elif "MATLAB_empty" in item.attrs:
-            found.header["skipped"][name] = "empty"
-        elif found.fits(name, item.shape or (), item.dtype):
+            arrays.header["skipped"][name] = "empty"
+        elif arrays.fits(name, item.shape or (), item.dtype):
             values = item[()]
             unit = item.attrs.get("units", item.attrs.get("unit", ""))
             unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit if isinstance(unit, str) else ""
             # MATLAB stores arrays in column-major order, so HDF5 shows them transposed.
-            found.add(name, values.T if kind and values.ndim == 2 else values, unit)
+            arrays.add(name, values.T if kind and values.ndim == 2 else values, unit)
 
 
 def has_numbers(item: Any) -> bool:
@@ -429,12 +429,12 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
     filled = {}
     for name in names if sheet is None else [sheet]:
         try:
-            found = book.get_sheet_by_name(name)
+            sheet_object = book.get_sheet_by_name(name)
         except calamine.WorksheetNotFound:
             continue
-        if found.end is not None:
-            check_size(found.end[0] + 1, found.end[1] + 1)
-            filled[name] = found
+        if sheet_object.end is not None:
+            check_size(sheet_object.end[0] + 1, sheet_object.end[1] + 1)
+            filled[name] = sheet_object
     if not filled:
         raise UnreadableError(
             f"{'its sheets are' if len(names) > 1 else 'its sheet is'} empty", "choose a file that holds a record"
@@ -444,10 +444,10 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
             f"it has {len(filled)} sheets that are not empty: {', '.join(map(repr, list(filled)[:20]))}",
             SHEET_CHOICE_HINT,
         )
-    ((name, found),) = filled.items()
+    ((name, sheet_object),) = filled.items()
     out = io.StringIO(newline="")
     writer = csv.writer(out, delimiter="\t", lineterminator="\n")
-    table = found.to_python(skip_empty_area=False)
+    table = sheet_object.to_python(skip_empty_area=False)
     while table and not any(map(cell_text, table[-1])):
         table.pop()
     for row in table:
@@ -514,8 +514,8 @@ def main(arguments: list[str]) -> None:
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"
     limit_resources(MEMORY_LIMIT, SECONDS_LIMIT)
-    kind, told, *paths = arguments
-    options = json.loads(told)
+    kind, text, *paths = arguments
+    options = json.loads(text)
     budget = SIZE_LIMIT
     for path in paths:
         budget -= answer(kind, path, sys.stdout.buffer, budget, options["sheet"])

@@ -44,10 +44,8 @@ def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
     if len(cell) < len("1.234,"):
         return None
     for mark in THOUSANDS_SEPARATORS:
-        found = (
-            _grouped_number_pattern(mark, comma).fullmatch(cell) if mark != ("comma" if comma else "point") else None
-        )
-        if found and found[1]:
+        pair = _grouped_number_pattern(mark, comma).fullmatch(cell) if mark != ("comma" if comma else "point") else None
+        if pair and pair[1]:
             return mark
     return None
 
@@ -114,8 +112,8 @@ def split_unit(name: str) -> tuple[str, str]:
     text = name.rstrip()
     opening = {"]": "[", ")": "("}.get(text[-1:])
     if opening is None:
-        for before in _BEFORE_UNITS:
-            bare, mark, unit = text.rpartition(before)
+        for word in _BEFORE_UNITS:
+            bare, mark, unit = text.rpartition(word)
             if mark and bare.strip() and parse_unit(unit.strip()) is not None:
                 return bare.rstrip(), unit.strip()
         return name, ""
@@ -127,8 +125,8 @@ def split_unit(name: str) -> tuple[str, str]:
 def split_slash_unit(name: str) -> tuple[str, str]:
     """Split a name such as ``I/A`` into bare name and known unit after the slash; "" if there is no unit."""
     bare, stroke, unit = (part.strip() for part in name.partition("/"))
-    known = stroke and bare and unit and parse_unit(unit) is not None
-    return (bare, unit) if known and parse_unit(name) is None and not is_gap(name) and unit != "1" else (name, "")
+    is_unit = stroke and bare and unit and parse_unit(unit) is not None
+    return (bare, unit) if is_unit and parse_unit(name) is None and not is_gap(name) and unit != "1" else (name, "")
 
 
 def _bracket_content(cell: str) -> str | None:
@@ -179,13 +177,13 @@ def is_timestamp(cell: str) -> bool:
 def _match_timestamp(cell: str) -> re.Match[str] | None:
     """Match a timestamp; None for an invalid one such as 13:00 AM or 24:30."""
     text = cell.strip()
-    found = _TIMESTAMP_PATTERN.fullmatch(text) if len(text) <= _MAX_TIMESTAMP_CHARACTERS else None
-    if found is None:
+    match = _TIMESTAMP_PATTERN.fullmatch(text) if len(text) <= _MAX_TIMESTAMP_CHARACTERS else None
+    if match is None:
         return None
-    groups = found.groups("")
+    groups = match.groups("")
     hour, minute, second, fraction, half, _ = groups[4:10] if groups[1] else groups[10:16]
     late = hour == "24" and int(f"0{minute}{second}{fraction}") > 0
-    return None if late or (half and int(hour) > 12) else found
+    return None if late or (half and int(hour) > 12) else match
 
 
 @dataclass(frozen=True)
@@ -219,10 +217,10 @@ class Timestamps:
         if all(span is not None for span in spans) and cells:
             clock = np.array([_duration_ns(*span.groups("")) for span in spans if span is not None], np.int64)
             return cls(np.zeros((clock.size, 3), np.int64), "", clock, cells[0].strip(), ("passed",))
-        found = [_match_timestamp(cell) for cell in cells]
-        if not found or any(match is None for match in found):
+        matches = [_match_timestamp(cell) for cell in cells]
+        if not matches or any(match is None for match in matches):
             return None
-        groups = [match.groups("") for match in found if match is not None]
+        groups = [match.groups("") for match in matches if match is not None]
         mark = groups[0][1]
         zoned = bool(groups[0][9] or groups[0][15])
         rows = [(*g[:4], *(g[4:10] if g[1] else g[10:16])) for g in groups]
@@ -294,8 +292,8 @@ class Timestamps:
         if second > 12 >= first:
             return "mdy"
         # Dates with points begin with the day; for others the numbers may decide. Equal dates need no order.
-        told = self.mark == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all()
-        return "dmy" if told else ""
+        is_day_first = self.mark == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all()
+        return "dmy" if is_day_first else ""
 
     def _order(self, thing: str, dates: str | None) -> tuple[int, int, int]:
         """Return the positions of year, month and day."""

@@ -62,18 +62,18 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """
     if len(columns) == 1 and not words_of(columns[0]) & _WORDS_BY_ROLE["input"]:
         return [], list(columns)
-    measured = {
+    quantities = {
         _tokens(c) - _WORDS_BY_ROLE["measurement"] for c in columns if _tokens(c) & _WORDS_BY_ROLE["measurement"]
     }
     plant = [
         c
         for c in columns
         if not words_of(c) & _WORDS_BY_ROLE["reference"]
-        and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in measured)
+        and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in quantities)
     ]
-    found, every = _roles_by_words(plant), _roles_by_words(columns)
+    roles, every = _roles_by_words(plant), _roles_by_words(columns)
     # A reference and an output are those of a closed loop.
-    return every if not found[1] or (every[0] and not found[0]) else found
+    return every if not roles[1] or (every[0] and not roles[0]) else roles
 
 
 def _tokens(column: str) -> frozenset[str]:
@@ -83,16 +83,20 @@ def _tokens(column: str) -> frozenset[str]:
 
 def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the columns whose names have words of inputs, and those with words of outputs."""
-    told = {column: words_of(column) for column in columns}
+    words_by_column = {column: words_of(column) for column in columns}
     drives = [
-        c for c, words in told.items() if words & _WORDS_BY_ROLE["input"] and not words & _WORDS_BY_ROLE["output"]
+        c
+        for c, words in words_by_column.items()
+        if words & _WORDS_BY_ROLE["input"] and not words & _WORDS_BY_ROLE["output"]
     ]
     follows = [
-        c for c, words in told.items() if words & _WORDS_BY_ROLE["output"] and not words & _WORDS_BY_ROLE["input"]
+        c
+        for c, words in words_by_column.items()
+        if words & _WORDS_BY_ROLE["output"] and not words & _WORDS_BY_ROLE["input"]
     ]
     either = [
         c
-        for c, words in told.items()
+        for c, words in words_by_column.items()
         if words & _WORDS_BY_ROLE["input or output"] and c not in drives and c not in follows
     ]
     if either and not drives:
@@ -109,9 +113,9 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     return (drives, follows) if drives and follows else ([], [])
 
 
-def known_unit(stated: str, column: str = "") -> str:
+def known_unit(text: str, column: str = "") -> str:
     """Return the ftlm unit of a unit in a file; "" if unknown, or if degrees may mean a temperature."""
-    unit = parse_unit(stated) or ""
+    unit = parse_unit(text) or ""
     return "" if unit in ("deg", "°") and words_of(column) & _WORDS_BY_ROLE["temperature"] else unit
 
 
@@ -122,8 +126,8 @@ def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
         bare = re.sub(r"\W+", "_", split_unit(column)[0].rpartition("/")[2]).strip("_")
         usable = re.fullmatch(r"[^\W\d]\w*", bare) and len(bare) <= 30 and bare.casefold() not in _RESERVED_NAMES
         name = bare if usable else role
-        taken, count = set(names.values()), 1
-        while name in taken:
+        used_names, count = set(names.values()), 1
+        while name in used_names:
             count += 1
             name = f"{bare if usable else role}_{count}"
         names[column] = name
@@ -140,13 +144,13 @@ def has_numbers(column: Column) -> bool:
 
 
 def assume_roles(
-    wanted: ColumnSelection, columns: Sequence[Column], signals: tuple[Sequence[str], Sequence[str]] | None = None
+    selection: ColumnSelection, columns: Sequence[Column], signals: tuple[Sequence[str], Sequence[str]] | None = None
 ) -> tuple[Assumption, ...]:
     """Fill `wanted.inputs` and `wanted.outputs` in place if both are empty, and return the assumptions.
 
     Parameters
     ----------
-    wanted
+    selection
         Column selection to complete.
     columns
         Columns of the file without its time.
@@ -155,17 +159,17 @@ def assume_roles(
         Otherwise roles are guessed from words in the column names, such as input or torque, output or angle; both stay
         empty if these are ambiguous.
     """
-    if wanted.inputs or wanted.outputs:
+    if selection.inputs or selection.outputs:
         return ()
     free = [c for c in columns if has_numbers(c) and c.name and c.name.isprintable()]
     own = {c.name_with_unit: c.name for c in free}
     if signals is not None:
-        known = {name: own[c] for c, name in signal_names(dict.fromkeys(own, "c")).items()} | {
+        columns_by_name = {name: own[c] for c, name in signal_names(dict.fromkeys(own, "c")).items()} | {
             c.name: c.name for c in free
         }
-        if all(name in known for side in signals for name in side):
-            wanted.inputs = {name: known[name] for name in signals[0]}
-            wanted.outputs = {name: known[name] for name in signals[1]}
+        if all(name in columns_by_name for side in signals for name in side):
+            selection.inputs = {name: columns_by_name[name] for name in signals[0]}
+            selection.outputs = {name: columns_by_name[name] for name in signals[1]}
             return ()
     unread = [c.name for c in columns if c.name and not has_numbers(c)]
     if len(own) == 1 and any(words_of(name) & _WORDS_BY_ROLE["input"] for name in unread):
@@ -173,21 +177,21 @@ def assume_roles(
         return ()
     drives, follows = guess_roles(list(own))
     names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
-    wanted.inputs, wanted.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
+    selection.inputs, selection.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
     if not follows:
         return ()
-    inputs, outputs = join_names(wanted.inputs.values(), 10), join_names(wanted.outputs.values(), 10)
-    words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
+    inputs, outputs = join_names(selection.inputs.values(), 10), join_names(selection.outputs.values(), 10)
+    words = f"{inputs} {'drives' if len(selection.inputs) == 1 else 'drive'} {outputs}, by their names"
     if not drives:
         words = f"nothing drives {outputs}, {'by the names of the columns' if len(free) > 1 else 'the only signal'}"
     remedy = f"{parameter('inputs', NAMED_COLUMNS)}, {parameter('outputs', NAMED_COLUMNS)}"
     return (Assumption("inputs", inputs, words, remedy),)
 
 
-def add_file_units(wanted: ColumnSelection, pool: Pool) -> None:
+def add_file_units(selection: ColumnSelection, pool: Pool) -> None:
     """Add the units that a file states for the selected columns to `wanted.units`, unless others are given."""
-    for name, spec in (wanted.inputs | wanted.outputs).items():
+    for name, spec in (selection.inputs | selection.outputs).items():
         column = pool.find(spec, f"signal {name!r}")
         unit = known_unit(column.file_unit, column.name_with_unit)
-        if unit and name not in wanted.units:
-            wanted.units[name] = unit
+        if unit and name not in selection.units:
+            selection.units[name] = unit

@@ -68,36 +68,38 @@ class _BadCells:
     def error(self, column: str, source: str) -> DataError:
         thing = f"{source}: column {column!r}, line {self.line}"
         text = self.cell.strip()
-        shown = repr(text if len(text) <= 40 else text[:40] + "…")
+        cell_text = repr(text if len(text) <= 40 else text[:40] + "…")
         way_out = "correct or remove these rows"
         if not text:
             what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
             way_out = _fill_hint()
         elif is_gap(text):
-            what = f"{shown} stands for no number"
+            what = f"{cell_text} stands for no number"
             way_out = _fill_hint()
         elif (mark := detect_thousands_separator(text, comma=self.comma)) is not None:
-            what = f"{shown} has marks between thousands"
+            what = f"{cell_text} has marks between thousands"
             way_out = f"say {layout_parameter(thousands=mark)}, or write all numbers without"
         elif self.comma and "." in text and is_number(text):
-            what = f"{shown} has a point where decimals follow a comma"
+            what = f"{cell_text} has a point where decimals follow a comma"
             way_out = "write all numbers alike"
             if may_group(text, "point", comma=True):
                 way_out += f", or say {layout_parameter(thousands='point')} where points group thousands"
         elif DECIMAL_COMMA.fullmatch(text):
-            what = f"{shown} has a decimal comma"
+            what = f"{cell_text} has a decimal comma"
             way_out = (
                 f"write all numbers alike, or say {layout_parameter(decimal='comma')} where all of them have commas"
             )
         elif self.other:
-            what = f"{shown} and {self.other!r} are dates or times of day written in two ways"
+            what = f"{cell_text} and {self.other!r} are dates or times of day written in two ways"
             way_out = "write all alike"
         elif self.moments:
             what = (
-                f"{shown} stands among numbers" if is_timestamp(text) else f"{shown} stands among dates or times of day"
+                f"{cell_text} stands among numbers"
+                if is_timestamp(text)
+                else f"{cell_text} stands among dates or times of day"
             )
         else:
-            what = f"{shown} is not a number"
+            what = f"{cell_text} is not a number"
         return bad_rows(thing, what, self.row, self.count, way_out)
 
 
@@ -105,7 +107,7 @@ class _BadCells:
 class _Rows:
     """Rows parsed so far, with invalid cells and timestamps by column."""
 
-    found: TableDialect
+    dialect: TableDialect
     sheet: bool = False
     count: int = 0
     ragged: int = 0
@@ -175,56 +177,56 @@ def parse_text(
     blocks = _line_blocks(path, stream, encoding)
     # Sheets have no comment lines.
     mark = "#" if sheet is None else "\0"
-    begun, sample, remark = _sample(blocks, layout, mark)
+    head, sample, remark = _sample(blocks, layout, mark)
     if not sample:
         raise DataError(f"{source}: the file is empty, 0 rows; choose a file that holds a record")
-    found = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
-    found = _with_gaps(found, begun, sample, layout, sheet=sheet is not None)
-    rows = _Rows(found, sheet is not None)
-    for first, lines in itertools.chain(begun, blocks):
+    dialect = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
+    dialect = _with_gaps(dialect, head, sample, layout, sheet=sheet is not None)
+    rows = _Rows(dialect, sheet is not None)
+    for first, lines in itertools.chain(head, blocks):
         _read_block(rows, first, lines, mark, source)
     columns = _columns(rows, path, source)
     what = Layout(sheet=sheet) if sheet is not None else Layout(encoding=encoding)
     if sheet is not None:
-        found = replace(found, layout=replace(found.layout, separator=None, decimal=None))
-    kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[found.separator]} between cells)"
-    assumed = () if header is not None else guessed + found.assumed
+        dialect = replace(dialect, layout=replace(dialect.layout, separator=None, decimal=None))
+    kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[dialect.separator]} between cells)"
+    assumed = () if header is not None else guessed + dialect.assumed
     if rows.footer:
         first, last = rows.footer[0], rows.footer[-1]
         which = f"lines {first} to {last} are" if last > first else f"line {first} is"
         words = f"{which} below the table and left out"
         assumed = (*assumed, Assumption("", rows.count, words, "remove the empty line above them"))
-    if found.names is None:
-        assumed = tuple(_with_remark(a, remark, found.width) for a in assumed)
-    return FileTable(path, columns, True, header, layout=what.under(found.layout), assumed=assumed, kind=kind)
+    if dialect.names is None:
+        assumed = tuple(_with_remark(a, remark, dialect.width) for a in assumed)
+    return FileTable(path, columns, True, header, layout=what.under(dialect.layout), assumed=assumed, kind=kind)
 
 
 def _with_gaps(
-    found: TableDialect,
-    begun: list[tuple[int, list[str]]],
+    dialect: TableDialect,
+    head: list[tuple[int, list[str]]],
     sample: list[tuple[int, str]],
     layout: Layout,
     *,
     sheet: bool,
 ) -> TableDialect:
     """Account for empty rows right below the header: kept in text, skipped with a note in sheets."""
-    if found.separator != "\t" or found.names is None:
-        return found
-    above = max((at for at, _ in sample if at < found.begin), default=0)
-    lines = ((at, line) for first, part in begun for at, line in enumerate(part, first))
-    between = itertools.takewhile(lambda pair: pair[0] < found.begin, lines)
-    gaps = [at for at, line in between if at > above and not line.strip() and line.count("\t") == found.width - 1]
-    if not gaps or found.width == 1:
-        return found
+    if dialect.separator != "\t" or dialect.names is None:
+        return dialect
+    above = max((at for at, _ in sample if at < dialect.begin), default=0)
+    lines = ((at, line) for first, part in head for at, line in enumerate(part, first))
+    between = itertools.takewhile(lambda pair: pair[0] < dialect.begin, lines)
+    gaps = [at for at, line in between if at > above and not line.strip() and line.count("\t") == dialect.width - 1]
+    if not gaps or dialect.width == 1:
+        return dialect
     if not sheet:
-        return replace(found, begin=gaps[0])
+        return replace(dialect, begin=gaps[0])
     if layout.header is not None:
-        return found
+        return dialect
     words = f"line {gaps[0]}, right below the header, is empty and left out"
     if len(gaps) > 1:
         words = f"lines {gaps[0]} to {gaps[-1]}, right below the header, are empty and left out"
-    header = 1 if found.units is None else 2
-    return replace(found, assumed=(*found.assumed, Assumption("header", header, words, layout_parameter(header=1))))
+    header = 1 if dialect.units is None else 2
+    return replace(dialect, assumed=(*dialect.assumed, Assumption("header", header, words, layout_parameter(header=1))))
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
@@ -239,11 +241,11 @@ def _sample(
     blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
 ) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
     """Return the blocks read so far, the first lines with content, and the comment above them."""
-    begun: list[tuple[int, list[str]]] = []
+    head: list[tuple[int, list[str]]] = []
     sample: list[tuple[int, str]] = []
     size, remark = 0, ""
     for first, lines in blocks:
-        begun.append((first, lines))
+        head.append((first, lines))
         for at, line in enumerate(lines, first):
             if size > _SAMPLE_CHARACTERS and len(sample) >= _MIN_SAMPLE_LINES:
                 break
@@ -254,71 +256,75 @@ def _sample(
                 size += len(line) if at > (layout.skip or 0) else 0
         if size > _SAMPLE_CHARACTERS and len(sample) >= _MIN_SAMPLE_LINES:
             break
-    return begun, sample, remark
+    return head, sample, remark
 
 
 def _has_content(line: str, mark: str) -> bool:
-    begun = line.lstrip()
-    return bool(begun) and begun[0] != mark
+    text = line.lstrip()
+    return bool(text) and text[0] != mark
 
 
 def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
     """Parse the rows of one block."""
-    found = rows.found
-    kept = []
+    dialect = rows.dialect
+    content = []
     for at, line in enumerate(lines, first):
         # With tabs, a line of empty cells is a row of missing values, not a blank line.
-        gap = found.separator == "\t" and "\t" in line and not line.strip()
-        if at >= found.begin and (gap or _has_content(line, mark)):
-            if rows.footer or (rows.after_blank and _is_footer(line, found, source, at)):
+        gap = dialect.separator == "\t" and "\t" in line and not line.strip()
+        if at >= dialect.begin and (gap or _has_content(line, mark)):
+            if rows.footer or (rows.after_blank and _is_footer(line, dialect, source, at)):
                 _check_footer(rows, line, at, source)
                 rows.footer.append(at)
                 continue
-            kept.append((at, line))
+            content.append((at, line))
             rows.after_blank = False
-        elif at >= found.begin and not line.strip():
-            rows.after_blank = bool(kept) or rows.count > 0
-        elif at >= found.begin and line.lstrip()[:1] == mark:
-            _check_remark(line, at, found, source)
-    if not kept:
+        elif at >= dialect.begin and not line.strip():
+            rows.after_blank = bool(content) or rows.count > 0
+        elif at >= dialect.begin and line.lstrip()[:1] == mark:
+            _check_remark(line, at, dialect, source)
+    if not content:
         return
-    cells = split_cells([line for _, line in kept], found.separator, source, kept[0][0])
-    wrong = [index for index, row in enumerate(cells) if len(row) != found.width]
+    cells = split_cells([line for _, line in content], dialect.separator, source, content[0][0])
+    wrong = [index for index, row in enumerate(cells) if len(row) != dialect.width]
     if wrong:
         if not rows.ragged:
-            rows.ragged_line, rows.ragged_cells = kept[wrong[0]][0], cells[wrong[0]]
+            rows.ragged_line, rows.ragged_cells = content[wrong[0]][0], cells[wrong[0]]
         rows.ragged += len(wrong)
     if not rows.ragged:
         # float() accepts underscores between digits; numbers in files must not have them.
-        plain = not found.comma and found.mark is None and not any("_" in line for _, line in kept)
-        rows.blocks.append(_numbers(rows, cells, [at for at, _ in kept], plain=plain))
+        plain = not dialect.comma and dialect.mark is None and not any("_" in line for _, line in content)
+        rows.blocks.append(_numbers(rows, cells, [at for at, _ in content], plain=plain))
     rows.count += len(cells)
 
 
-def _is_footer(line: str, found: TableDialect, source: str, at: int) -> bool:
+def _is_footer(line: str, dialect: TableDialect, source: str, at: int) -> bool:
     """Whether a line after an empty one is text below the table: it begins with a word and is no row."""
-    cells = split_cells([line], found.separator, source, at)[0]
-    numbers = [is_number(cell, comma=found.comma, mark=found.mark) or is_timestamp(cell) for cell in cells]
-    return bool(cells[0].strip()) and not numbers[0] and (len(cells) != found.width or not any(numbers))
+    cells = split_cells([line], dialect.separator, source, at)[0]
+    numbers = [is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells]
+    return bool(cells[0].strip()) and not numbers[0] and (len(cells) != dialect.width or not any(numbers))
 
 
 def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
     """Raise if a line below the table is a row again."""
-    found = rows.found
-    cells = split_cells([line], found.separator, source, at)[0]
-    if len(cells) == found.width and all(is_number(c, comma=found.comma, mark=found.mark) for c in cells):
+    dialect = rows.dialect
+    cells = split_cells([line], dialect.separator, source, at)[0]
+    if len(cells) == dialect.width and all(is_number(c, comma=dialect.comma, mark=dialect.mark) for c in cells):
         raise DataError(
             f"{source}: a table ends above line {rows.footer[0]}, and line {at} is a row of another one; save the "
             f"lines from {rows.footer[0]} on as a second file, and give both files as two runs"
         )
 
 
-def _check_remark(line: str, at: int, found: TableDialect, source: str) -> None:
+def _check_remark(line: str, at: int, dialect: TableDialect, source: str) -> None:
     """Raise if a line among the rows may be a comment as well as a row that begins with #N/A."""
-    cells = line.split(found.separator)
-    numbers = any(is_number(cell, comma=found.comma, mark=found.mark) or is_timestamp(cell) for cell in cells)
+    cells = line.split(dialect.separator)
+    numbers = any(is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells)
     error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
-    if len(cells) == found.width and (found.width > 1 or error) and (numbers or error or found.separator is not None):
+    if (
+        len(cells) == dialect.width
+        and (dialect.width > 1 or error)
+        and (numbers or error or dialect.separator is not None)
+    ):
         raise DataError(
             f"{source}: line {at} begins with # and has as many cells as a row ({line.strip()[:40]!r}), so it may be a "
             "remark or a row; remove that line, or write a number in its first cell"
@@ -326,13 +332,13 @@ def _check_remark(line: str, at: int, found: TableDialect, source: str) -> None:
 
 
 def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
-    found = rows.found
+    dialect = rows.dialect
     if rows.ragged:
         raise _ragged_rows_error(rows, source)
     if rows.count == 0:
         raise DataError(f"{source}: a header and no rows; choose a file that holds a record")
     values = np.concatenate(rows.blocks).T.copy() if len(rows.blocks) > 1 else rows.blocks[0].T.copy()
-    names = found.names if found.names is not None else [f"c{index + 1}" for index in range(found.width)]
+    names = dialect.names if dialect.names is not None else [f"c{index + 1}" for index in range(dialect.width)]
     columns = []
     for k, (name, column) in enumerate(zip(names, values, strict=True)):
         trouble, pieces = rows.bad_cells.get(k), rows.moments.get(k)
@@ -351,28 +357,30 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
                 rows.count,
                 f"name it with {parameter('time')}, or choose another column",
             )
-        unit = (found.units[k] if found.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
+        unit = (
+            (dialect.units[k] if dialect.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
+        )
         blank = trouble is not None and trouble.blank
         columns.append(Column(name, name, path, column, problem, blank=blank, timestamps=moments, file_unit=unit))
     return columns
 
 
 def _ragged_rows_error(rows: _Rows, source: str) -> DataError:
-    found = rows.found
-    first = "line of names" if found.names is not None else "first row"
+    dialect = rows.dialect
+    first = "line of names" if dialect.names is not None else "first row"
     others = [
         words
         for mark, words in SEPARATOR_WORDS.items()
         if mark is not None
-        and mark != found.separator
-        and not (found.comma and mark == ",")
-        and sum(cell.count(mark) for cell in rows.ragged_cells) >= max(1, found.width - 1)
+        and mark != dialect.separator
+        and not (dialect.comma and mark == ",")
+        and sum(cell.count(mark) for cell in rows.ragged_cells) >= max(1, dialect.width - 1)
     ]
-    mixed = f"; that line has {others[0]}s" if others and len(rows.ragged_cells) < found.width else ""
+    mixed = f"; that line has {others[0]}s" if others and len(rows.ragged_cells) < dialect.width else ""
     return DataError(
-        f"{source}: line {rows.ragged_line} has {len(rows.ragged_cells)} cells where the {first} has {found.width}, "
+        f"{source}: line {rows.ragged_line} has {len(rows.ragged_cells)} cells where the {first} has {dialect.width}, "
         f"{rows.ragged} lines in all; give every line the same number of cells "
-        f"(separator: {SEPARATOR_WORDS[found.separator]}{mixed})"
+        f"(separator: {SEPARATOR_WORDS[dialect.separator]}{mixed})"
     )
 
 
@@ -460,7 +468,7 @@ def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> D
 
 def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bool) -> npt.NDArray[np.float64]:
     width = len(cells[0])
-    careful = functools.partial(parse_number, comma=rows.found.comma, mark=rows.found.mark)
+    careful = functools.partial(parse_number, comma=rows.dialect.comma, mark=rows.dialect.mark)
     value: Callable[[str], float] = float if plain else careful
     try:
         flat = np.fromiter(map(value, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
@@ -480,7 +488,7 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
 
 def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
     """Store a column of timestamps, or its cells that are neither numbers nor timestamps."""
-    comma, mark = rows.found.comma, rows.found.mark
+    comma, mark = rows.dialect.comma, rows.dialect.mark
     if is_timestamp(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
         moments = Timestamps.read(column)
         if moments is not None:
@@ -501,8 +509,8 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     blank = all(is_gap(column[row]) for row in bad)
     if blank and not dated:
         values[:, index] = [np.nan if is_gap(cell) else parse_number(cell, comma=comma, mark=mark) for cell in column]
-    known = rows.bad_cells.get(index)
-    if known is None:
+    bad_cell = rows.bad_cells.get(index)
+    if bad_cell is None:
         rows.bad_cells[index] = _BadCells(
             lines[bad[0]],
             rows.count + bad[0],
@@ -515,7 +523,7 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
             column[0].strip()[:40] if ways else "",
         )
         return
-    if known.blank and (dated or not blank):
-        known.line, known.row, known.cell = lines[bad[0]], rows.count + bad[0], column[bad[0]]
-    known.count += len(bad)
-    known.blank &= blank and not dated
+    if bad_cell.blank and (dated or not blank):
+        bad_cell.line, bad_cell.row, bad_cell.cell = lines[bad[0]], rows.count + bad[0], column[bad[0]]
+    bad_cell.count += len(bad)
+    bad_cell.blank &= blank and not dated

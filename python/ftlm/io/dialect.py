@@ -76,14 +76,14 @@ class Layout:
     sheet: str | None = None
 
     def __post_init__(self) -> None:
-        for option, known in (
+        for option, words in (
             ("separator", SEPARATOR_CHARACTERS),
             ("decimal", DECIMAL_CHARACTERS),
             ("thousands", THOUSANDS_CHARACTERS),
         ):
-            given = getattr(self, option)
-            if given is not None:
-                object.__setattr__(self, option, _word(option, given, known))
+            value = getattr(self, option)
+            if value is not None:
+                object.__setattr__(self, option, _word(option, value, words))
         if self.separator == self.decimal == "comma":
             raise DataError(f"{layout_fields('separator', 'decimal')} are both a comma; cells could not be told apart")
         if self.thousands is not None and self.thousands == self.decimal:
@@ -99,11 +99,11 @@ class Layout:
                 f"{layout_fields('dates')} is {self.dates!r}; the known orders are {join_names(DATE_ORDERS)}"
             )
         for option, most in (("skip", _MAX_SKIPPED_LINES), ("header", 2)):
-            given = getattr(self, option)
-            count = None if given is None else whole_number(given)
-            if given is not None and (count is None or not 0 <= count <= most):
+            value = getattr(self, option)
+            count = None if value is None else whole_number(value)
+            if value is not None and (count is None or not 0 <= count <= most):
                 what = "0, 1 (names) or 2 (names and units)" if option == "header" else "a number of lines from 0"
-                raise DataError(f"{layout_fields(option)} is {given!r}; give {what}")
+                raise DataError(f"{layout_fields(option)} is {value!r}; give {what}")
             object.__setattr__(self, option, count)
         if self.encoding is not None:
             object.__setattr__(self, "encoding", _encoding(self.encoding))
@@ -112,24 +112,24 @@ class Layout:
 
     @classmethod
     @check_arguments
-    def of(cls, given: object) -> Layout:
+    def of(cls, layout: object) -> Layout:
         """Build a layout from an argument: None, a layout, or a mapping of its fields."""
-        if given is None:
+        if layout is None:
             return cls()
-        if isinstance(given, Layout):
-            return given
-        if not isinstance(given, Mapping):
+        if isinstance(layout, Layout):
+            return layout
+        if not isinstance(layout, Mapping):
             raise DataError(
-                f"{parameter('layout')} is a {type(given).__name__}; pass a dict, such as dict(decimal='comma')"
+                f"{parameter('layout')} is a {type(layout).__name__}; pass a dict, such as dict(decimal='comma')"
             )
-        known = [f.name for f in fields(cls)]
-        for key in given:
-            if key not in known:
+        keys = [f.name for f in fields(cls)]
+        for key in layout:
+            if key not in keys:
                 raise DataError(
-                    f"{parameter('layout')}: {key!r} is unknown{nearest(key, known)}; the known keys are "
-                    f"{join_names(known)}"
+                    f"{parameter('layout')}: {key!r} is unknown{nearest(key, keys)}; the known keys are "
+                    f"{join_names(keys)}"
                 )
-        return cls(**given)
+        return cls(**layout)
 
     @check_arguments
     def under(self, other: Layout) -> Layout:
@@ -141,9 +141,9 @@ class Layout:
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
     @check_arguments
-    def check_used(self, path: str, kind: str, used: tuple[str, ...]) -> None:
+    def check_used(self, path: str, kind: str, names: tuple[str, ...]) -> None:
         """Raise if an option is set that this file format does not use."""
-        unused = [option for option in self.to_dict() if option not in used]
+        unused = [option for option in self.to_dict() if option not in names]
         if unused:
             raise DataError(f"{path}: {layout_fields(unused[0])} is not used with {kind}; leave it out")
 
@@ -176,27 +176,27 @@ class Assumption:
         return f"{self.words}; otherwise {self.otherwise}" if self.otherwise else self.words
 
 
-def _word(option: str, given: object, known: Mapping[str, str | None]) -> str:
+def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
     """Return the name of an option value given by name or as the character itself."""
-    if isinstance(given, str):
-        if given in known:
-            return given
-        for word, character in known.items():
-            if given == (" " if character is None else character) or (character == "\t" and given == "\\t"):
+    if isinstance(value, str):
+        if value in words:
+            return value
+        for word, character in words.items():
+            if value == (" " if character is None else character) or (character == "\t" and value == "\\t"):
                 return word
-    raise DataError(f"{layout_fields(option)} is {given!r}; the known ones are {join_names(known)}")
+    raise DataError(f"{layout_fields(option)} is {value!r}; the known ones are {join_names(words)}")
 
 
-def _encoding(given: object) -> str:
+def _encoding(value: object) -> str:
     """Return Python's canonical name of a text encoding."""
     try:
-        if not isinstance(given, str):
+        if not isinstance(value, str):
             raise LookupError
-        name = codecs.lookup(given).name
+        name = codecs.lookup(value).name
         b"a".decode(name, errors="replace")  # some codecs of Python are none of text
     except (LookupError, ValueError):
         raise DataError(
-            f"{layout_fields('encoding')} is {str(given)[:40]!r}, which is unknown; utf-8, utf-16, cp1252 and "
+            f"{layout_fields('encoding')} is {str(value)[:40]!r}, which is unknown; utf-8, utf-16, cp1252 and "
             "latin-1 are known"
         ) from None
     return name
@@ -278,14 +278,16 @@ class _Line:
         return self.words > 0 and self.count == 0
 
 
-def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, own: bool, sheet: bool) -> TableDialect:
+def find_table(
+    lines: Sequence[tuple[int, str]], layout_options: Layout, source: str, *, own: bool, sheet: bool
+) -> TableDialect:
     """Detect the table in the first lines of a text.
 
     Parameters
     ----------
     lines
         Pairs of line number and line, without blank lines and comments; at least one.
-    given
+    layout_options
         Layout given by the user; other options are detected.
     source
         Name of the file in error messages.
@@ -300,27 +302,31 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
         No row of numbers, or an ambiguous layout.
     """
     if own:
-        given = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(given)
+        layout_options = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(
+            layout_options
+        )
     elif sheet:
-        given = Layout(separator="tab", decimal="point", thousands="none").under(given)
-    kept = [(at, line) for at, line in lines if at > (given.skip or 0)]
-    if not kept:
+        layout_options = Layout(separator="tab", decimal="point", thousands="none").under(layout_options)
+    rows = [(at, line) for at, line in lines if at > (layout_options.skip or 0)]
+    if not rows:
         raise DataError(
-            f"{source}: no table below the first {given.skip} lines; say another number with "
+            f"{source}: no table below the first {layout_options.skip} lines; say another number with "
             f"{layout_parameter(skip=Placeholder('LINES'))}"
         )
-    _check_width(kept[-2:], source)
-    separator, comma, mark, cut = _choose_separator(kept, given, source)
+    _check_width(rows[-2:], source)
+    separator, comma, mark, cut = _choose_separator(rows, layout_options, source)
     width = _width(cut)
-    first = 0 if given.skip is not None and given.header is not None else _first_row(cut, width)
-    top = first if given.skip is None or given.header is None else min(given.header, len(cut))
-    names, units, top = _header(cut, top, width, given, source, own=own)
-    layout, assumed = _summarize_layout(cut, given, separator, comma, mark, names, units, top, first)
-    if given.skip is None:
+    first = 0 if layout_options.skip is not None and layout_options.header is not None else _first_row(cut, width)
+    top = (
+        first if layout_options.skip is None or layout_options.header is None else min(layout_options.header, len(cut))
+    )
+    names, units, top = _header(cut, top, width, layout_options, source, own=own)
+    layout, assumed = _summarize_layout(cut, layout_options, separator, comma, mark, names, units, top, first)
+    if layout_options.skip is None:
         _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source, (comma, mark))
     if not own and names is None and top < len(cut):
-        _check_headless(cut[top], source, given)
-    if names is not None and not own and given.separator is None:
+        _check_headless(cut[top], source, layout_options)
+    if names is not None and not own and layout_options.separator is None:
         _check_mixed(cut, top, separator, comma, source)
     begin = cut[top].at if top < len(cut) else cut[-1].at + 1
     if names is not None:
@@ -328,9 +334,9 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     return TableDialect(separator, comma, names, units, begin, width, layout, assumed, mark)
 
 
-def _check_width(kept: Sequence[tuple[int, str]], source: str) -> None:
+def _check_width(rows: Sequence[tuple[int, str]], source: str) -> None:
     """Raise for lines with too many columns, whatever separates them."""
-    for at, line in kept:
+    for at, line in rows:
         count = max(len(line.split()), *(line.count(mark) + 1 for mark in _SEPARATOR_CANDIDATES if mark is not None))
         if count > MAX_COLUMNS:
             raise DataError(
@@ -340,53 +346,53 @@ def _check_width(kept: Sequence[tuple[int, str]], source: str) -> None:
 
 
 def _split_lines(
-    kept: Sequence[tuple[int, str]], separator: str | None, source: str, given: Layout, *, comma: bool
+    rows: Sequence[tuple[int, str]], separator: str | None, source: str, layout: Layout, *, comma: bool
 ) -> tuple[list[_Line], str | None]:
     """Split lines into cells, and detect the thousands separator.
 
     Quotes are ignored in a line with unbalanced quotes; reading its row raises later.
     """
     cut, parted = [], []
-    for at, line in kept:
+    for at, line in rows:
         try:
             (cells,) = split_cells([line], separator, source, at)
         except DataError:
             cells = line.split(separator)
         parted.append((at, cells))
-    mark = None if given.thousands == "none" else given.thousands
-    if given.thousands is None:
+    mark = None if layout.thousands == "none" else layout.thousands
+    if layout.thousands is None:
         marks = (detect_thousands_separator(cell, comma=comma) for _, cells in parted for cell in cells)
-        mark = next((found for found in marks if found is not None), None)
+        mark = next((candidate for candidate in marks if candidate is not None), None)
     for at, cells in parted:
-        there = [bool(cell.strip()) for cell in cells]
+        is_full = [bool(cell.strip()) for cell in cells]
         numbers = [
             full and (is_number(cell, comma=comma, mark=mark) or is_timestamp(cell))
-            for cell, full in zip(cells, there, strict=True)
+            for cell, full in zip(cells, is_full, strict=True)
         ]
-        cut.append(_Line(at, cells, numbers, sum(there) - sum(numbers)))
+        cut.append(_Line(at, cells, numbers, sum(is_full) - sum(numbers)))
     return cut, mark
 
 
-def _dialect_candidates(text: str, given: Layout) -> Iterator[tuple[str | None, bool]]:
+def _dialect_candidates(text: str, layout: Layout) -> Iterator[tuple[str | None, bool]]:
     """Yield candidate pairs of separator and decimal mark."""
-    for separator in _SEPARATOR_CANDIDATES if given.separator is None else (SEPARATOR_CHARACTERS[given.separator],):
-        if given.separator is None and separator is not None and separator not in text:
+    for separator in _SEPARATOR_CANDIDATES if layout.separator is None else (SEPARATOR_CHARACTERS[layout.separator],):
+        if layout.separator is None and separator is not None and separator not in text:
             continue
-        for comma in (False, True) if given.decimal is None else (given.decimal == "comma",):
-            if comma and (separator == "," or ("," not in text and given.decimal is None)):
+        for comma in (False, True) if layout.decimal is None else (layout.decimal == "comma",):
+            if comma and (separator == "," or ("," not in text and layout.decimal is None)):
                 continue
             yield separator, comma
 
 
 def _choose_separator(
-    kept: Sequence[tuple[int, str]], given: Layout, source: str
+    table_rows: Sequence[tuple[int, str]], layout: Layout, source: str
 ) -> tuple[str | None, bool, str | None, list[_Line]]:
     """Choose separator and decimal mark such that most lines are rows of equal width."""
-    text = "".join(line for _, line in kept)
+    text = "".join(line for _, line in table_rows)
     best: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
-    for separator, comma in _dialect_candidates(text, given):
-        cut, mark = _split_lines(kept, separator, source, given, comma=comma)
-        if comma and given.decimal is None and _decimal_comma(cut) is None:
+    for separator, comma in _dialect_candidates(text, layout):
+        cut, mark = _split_lines(table_rows, separator, source, layout, comma=comma)
+        if comma and layout.decimal is None and _decimal_comma(cut) is None:
             continue
         width = _width(cut)
         rows = [line for line in cut[_first_row(cut, width) :] if line.width == width and line.is_row_candidate]
@@ -397,9 +403,9 @@ def _choose_separator(
     if best is None:
         raise DataError(f"{source}: {layout_fields('separator', 'decimal')} do not go together; say others")
     _, separator, comma, mark, cut = best
-    if given.decimal is None and given.separator is None and separator == ",":
-        _check_commas(kept, cut, source)
-    if given.decimal is None and comma:
+    if layout.decimal is None and layout.separator is None and separator == ",":
+        _check_commas(table_rows, cut, source)
+    if layout.decimal is None and comma:
         _check_thousands(cut, source)
     return separator, comma, mark, cut
 
@@ -479,7 +485,7 @@ def _has_unit(units: Sequence[str]) -> bool:
 
 
 def _header(
-    cut: list[_Line], top: int, width: int, given: Layout, source: str, *, own: bool
+    cut: list[_Line], top: int, width: int, layout: Layout, source: str, *, own: bool
 ) -> tuple[list[str] | None, list[str] | None, int]:
     """Return names and units of the header, and the index of the first row."""
     rows = [line for line in cut[top:] if line.width == width]
@@ -492,7 +498,7 @@ def _header(
             return names[:-1]
         return [*names, ""] if spare and len(names) == width - 1 else names
 
-    count = given.header
+    count = layout.header
     if count is None:
         count = 0
         units_above = top > 1 and (_is_unit_line(cut[top - 1]) or _is_settings_line(cut, top - 1))
@@ -502,9 +508,9 @@ def _header(
                 count = 2
             elif len(fit_names(cut[top - 1])) != width and top > 1:
                 # A remark of one cell may stand between names and rows.
-                named = len(fit_names(cut[top - 2])) == width and cut[top - 2].has_only_words
-                count = 2 if named and cut[top - 1].width == 1 else 0
-    if count > top and given.skip is None and count < len(cut):
+                has_names = len(fit_names(cut[top - 2])) == width and cut[top - 2].has_only_words
+                count = 2 if has_names and cut[top - 1].width == 1 else 0
+    if count > top and layout.skip is None and count < len(cut):
         # A header of numbers looks like a row.
         top = count
     if count > top:
@@ -515,7 +521,7 @@ def _header(
         return None, None, top
     line = cut[top - count]
     names = fit_names(line)
-    if not own and count == 1 and line.count and given.header is None:
+    if not own and count == 1 and line.count and layout.header is None:
         raise _mixed_line(line, source)
     commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
     if commas and not own and count == 1:
@@ -542,9 +548,9 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
             )
 
 
-def _check_headless(line: _Line, source: str, given: Layout) -> None:
+def _check_headless(line: _Line, source: str, layout: Layout) -> None:
     """Raise if the first row mixes words and numbers and could be a header."""
-    if line.words and given.header is None:
+    if line.words and layout.header is None:
         raise _mixed_line(line, source)
 
 
@@ -579,9 +585,9 @@ def _mixed_line(line: _Line, source: str) -> DataError:
     )
 
 
-def _check_commas(kept: Sequence[tuple[int, str]], cut: list[_Line], source: str) -> None:
+def _check_commas(rows_of_text: Sequence[tuple[int, str]], cut: list[_Line], source: str) -> None:
     """Raise if commas may be separators as well as decimal marks."""
-    rows = [(line, text) for line, (_, text) in zip(cut, kept, strict=True) if line.has_only_numbers]
+    rows = [(line, text) for line, (_, text) in zip(cut, rows_of_text, strict=True) if line.has_only_numbers]
     if not rows:
         return
     pairs = all(_COMMA_PAIRS_PATTERN.fullmatch(text) for _, text in rows)
@@ -589,9 +595,9 @@ def _check_commas(kept: Sequence[tuple[int, str]], cut: list[_Line], source: str
         line.width == 2 and all(cell.strip().lstrip("+-").isdecimal() for cell in line.cells) for line, _ in rows
     )
     if pairs or single:
-        at, shown = rows[0][0].at, rows[0][1].strip()[:40]
+        at, example = rows[0][0].at, rows[0][1].strip()[:40]
         raise DataError(
-            f"{source}: line {at}: the commas of {shown!r} may stand between cells or before decimals; say "
+            f"{source}: line {at}: the commas of {example!r} may stand between cells or before decimals; say "
             f"{layout_parameter(separator='comma')}, or {layout_parameter(decimal='comma')} where spaces separate"
         )
 
@@ -605,9 +611,9 @@ def _check_thousands(cut: list[_Line], source: str) -> None:
         if n and "," in cell and not is_timestamp(cell)
     ]
     if cells and all(_COMMA_THOUSANDS_PATTERN.fullmatch(cell) for _, cell in cells):
-        at, shown = cells[0]
+        at, text = cells[0]
         raise DataError(
-            f"{source}: line {at}: the comma of {shown!r} may stand before decimals or group thousands, as in every "
+            f"{source}: line {at}: the comma of {text!r} may stand before decimals or group thousands, as in every "
             f"other number there; say {layout_parameter(decimal='comma')}, or write them without"
         )
 
@@ -628,7 +634,7 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
 
 def _summarize_layout(
     cut: list[_Line],
-    given: Layout,
+    layout_options: Layout,
     separator: str | None,
     comma: bool,
     mark: str | None,
@@ -640,39 +646,47 @@ def _summarize_layout(
     """Return the detected layout and the assumptions in it."""
     header = 0 if names is None else 2 if units is not None else 1
     start = top - header
-    skip = given.skip if given.skip is not None else 0 if start == 0 else cut[start].at - 1 if start < len(cut) else 0
+    skip = (
+        layout_options.skip
+        if layout_options.skip is not None
+        else 0
+        if start == 0
+        else cut[start].at - 1
+        if start < len(cut)
+        else 0
+    )
     layout = Layout(
         separator=_WORDS_BY_SEPARATOR[separator],
         decimal="comma" if comma else "point",
         thousands=mark,
         skip=skip,
         header=header,
-    ).under(given)
+    ).under(layout_options)
     assumed = []
-    if given.separator is None:
+    if layout_options.separator is None:
         words = f"{SEPARATOR_WORDS[separator]} between cells"
         assumed.append(
             Assumption(
                 "separator", str(layout.separator), words, layout_parameter(separator=Placeholder("NAME")), False
             )
         )
-    if given.decimal is None and comma:
-        shown = _decimal_comma(cut)
-        words, otherwise = f"decimal commas, as in {shown!r}", layout_parameter(decimal="point")
+    if layout_options.decimal is None and comma:
+        example = _decimal_comma(cut)
+        words, otherwise = f"decimal commas, as in {example!r}", layout_parameter(decimal="point")
         assumed.append(Assumption("decimal", "comma", words, otherwise))
-    if given.thousands is None and mark is not None:
-        shown = next(
+    if layout_options.thousands is None and mark is not None:
+        example = next(
             c.strip() for line in cut for c in line.cells if detect_thousands_separator(c, comma=comma) == mark
         )
-        words = f"{mark}s group thousands, as in {shown!r}"
+        words = f"{mark}s group thousands, as in {example!r}"
         assumed.append(Assumption("thousands", mark, words, layout_parameter(thousands="none")))
-    if given.skip is None and skip:
+    if layout_options.skip is None and skip:
         words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
         assumed.append(Assumption("skip", skip, words, layout_parameter(skip=Placeholder("LINES"))))
-    if given.header is None and units is not None:
+    if layout_options.header is None and units is not None:
         words = f"line {cut[top - 1].at} holds units" if any(units) else f"line {cut[top - 1].at} is a remark"
         assumed.append(Assumption("header", 2, words, layout_parameter(header=1)))
-    elif given.header is None and header == 0:
+    elif layout_options.header is None and header == 0:
         assumed.append(
             Assumption("header", 0, "no line of names: columns are c1, c2, …", layout_parameter(header=1), False)
         )

@@ -85,8 +85,8 @@ def binary_format_of(path: Path) -> BinaryFormat | None:
         if inner is not None:
             raise DataError(f"{str(path)!r}: {inner.label} files cannot be read compressed; unpack it with gunzip")
         return None
-    found = next((kind for kind in BINARY_FORMATS if suffixes and suffixes[-1] in kind.suffixes), None)
-    return MATLAB_73_FORMAT if found is MATLAB_FORMAT and _is_hdf5(path) else found
+    match = next((kind for kind in BINARY_FORMATS if suffixes and suffixes[-1] in kind.suffixes), None)
+    return MATLAB_73_FORMAT if match is MATLAB_FORMAT and _is_hdf5(path) else match
 
 
 def _is_hdf5(path: Path) -> bool:
@@ -107,10 +107,10 @@ def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list
             f"'ftlm[{kind.extra}]'"
         )
     files = [str(path.resolve()) for path in paths]
-    told = json.dumps({"sheet": layout.sheet})
+    request = json.dumps({"sheet": layout.sheet})
     try:
-        done = subprocess.run(
-            **python_child(_READER_PATH, kind.kind, told, *files),
+        process = subprocess.run(
+            **python_child(_READER_PATH, kind.kind, request, *files),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_READER_TIMEOUT_S,
@@ -124,12 +124,12 @@ def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list
         raise DataError(
             f"{str(paths[0])!r}: Python could not be started to read it ({error.strerror}); check the installation"
         ) from None
-    answers = _ReaderOutput(done.stdout)
+    answers = _ReaderOutput(process.stdout)
     tables = []
     for path in paths:
         table = answers.table(path, layout)
         if table is None:
-            raise _damaged_file_error(path, _describe_exit(done.returncode), kind)
+            raise _damaged_file_error(path, _describe_exit(process.returncode), kind)
         tables.append(table if table.kind else replace(table, kind=kind.label))
     return tables
 
@@ -270,9 +270,9 @@ def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
 def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Column:
     """Build the column of an array of dates."""
     values = matrix.ravel(order="F")
-    thing, gone = f"{path.name}: column {name!r}", np.isnan(values)
-    if gone.any():
-        rows = np.flatnonzero(gone)
+    thing, is_missing = f"{path.name}: column {name!r}", np.isnan(values)
+    if is_missing.any():
+        rows = np.flatnonzero(is_missing)
         problem = bad_rows(thing, "no date", int(rows[0]), rows.size, "remove or fill these rows yourself")
         return Column(name, name, path, None, problem)
     first = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"

@@ -132,18 +132,18 @@ def load(
     >>> run = load("arm.csv", time="t_s", inputs={"I1": "Im1_meas_A"}, outputs={"theta11": "th11_deg"},
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
-    wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
-    return load_selection(path, wanted, LoadOptions(window, resample, name, time_unit, missing))
+    selection = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
+    return load_selection(path, selection, LoadOptions(window, resample, name, time_unit, missing))
 
 
 def load_selection(
     path: PathLike | Sequence[PathLike],
-    wanted: ColumnSelection,
+    selection: ColumnSelection,
     options: LoadOptions,
     signals: Signals | None = None,
 ) -> Run:
     """Load a run; `signals` are the inputs and outputs of an equation, for columns that are not selected."""
-    run = run_from_tables(read_tables(path, wanted.layout), wanted, options, signals)
+    run = run_from_tables(read_tables(path, selection.layout), selection, options, signals)
     PACKAGE_LOGGER.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
     return run
 
@@ -173,41 +173,41 @@ Signals = tuple[Sequence[str], Sequence[str]]
 
 
 def run_from_tables(
-    tables: list[FileTable], wanted: ColumnSelection, options: LoadOptions, signals: Signals | None = None
+    tables: list[FileTable], selection: ColumnSelection, options: LoadOptions, signals: Signals | None = None
 ) -> Run:
     """Build the run of selected columns from file tables; see :func:`load` for columns that are not selected."""
     header = tables[0].header
-    chosen = options.missing_policy(header)
+    policy = options.missing_policy(header)
     if header is not None and len(tables) > 1:
         raise DataError(f"{str(tables[0].path)!r} is a complete run; load it alone")
     if header is not None:
-        _apply_header(wanted, header)
+        _apply_header(selection, header)
     pool = Pool(tables)
-    roles = _assume_roles(wanted, pool, signals) if header is None else ()
-    _check_disjoint_roles(wanted, pool)
-    if not wanted.outputs:
+    roles = _assume_roles(selection, pool, signals) if header is None else ()
+    _check_disjoint_roles(selection, pool)
+    if not selection.outputs:
         raise DataError(
             "no output is named, and the names of the columns do not say which they are; name the signals with "
             f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}, or in a file for "
             f"{parameter('columns')}; {pool.describe()}"
         )
     if header is None:
-        add_file_units(wanted, pool)
+        add_file_units(selection, pool)
     labels: dict[str, str] = {}
-    used: list[Column] = []
+    used_columns: list[Column] = []
 
     def gather(columns: Mapping[str, Hashable], *, blank: bool) -> dict[str, object]:
         picked: dict[str, object] = {}
         for signal, spec in columns.items():
             column = pool.find(spec, f"signal {signal!r}")
             labels[signal] = f"{column.source.name}: column {column.name!r} (signal {signal!r})"
-            used.append(column)
+            used_columns.append(column)
             picked[signal] = column.numbers(blank=blank)
         return picked
 
-    given_inputs = gather(wanted.inputs, blank=chosen == "hold")
-    given_outputs = gather(wanted.outputs, blank=chosen != "refuse")
-    clock = _clock(wanted, pool, used, options)
+    given_inputs = gather(selection.inputs, blank=policy == "hold")
+    given_outputs = gather(selection.outputs, blank=policy != "refuse")
+    clock = _clock(selection, pool, used_columns, options)
     name = options.name
     if name is None:
         stem = base_name(tables[0].path)
@@ -217,13 +217,13 @@ def run_from_tables(
         f"{table.path.name}: {a}" if several else str(a) for table in tables for a in table.assumed if a.counts
     )
     facts += (*map(str, roles), *clock.notes)
-    asked = RunArguments(
+    arguments = RunArguments(
         given_inputs,
         given_outputs,
-        step=wanted.step,
+        step=selection.step,
         time=clock.times,
-        units=wanted.units,
-        intersample=wanted.intersample,
+        units=selection.units,
+        intersample=selection.intersample,
         name=name,
         resample=options.resample,
         window=options.window,
@@ -231,12 +231,12 @@ def run_from_tables(
         labels=labels,
         notes=facts,
         time_label=clock.label,
-        missing=chosen,
+        missing=policy,
     )
     if header is not None:
-        stated = header.step if clock.name == CSV_TIME else None
-        asked = replace(asked, known_step=stated, notes=(*header.warnings, *facts), metadata=header.about)
-    return Run._from_checked(**asked.checked_fields())
+        known_step = header.step if clock.name == CSV_TIME else None
+        arguments = replace(arguments, known_step=known_step, notes=(*header.warnings, *facts), metadata=header.about)
+    return Run._from_checked(**arguments.checked_fields())
 
 
 @dataclass(frozen=True)
@@ -250,42 +250,42 @@ class _TimeColumn:
     notes: tuple[str, ...] = ()
 
 
-def _clock(wanted: ColumnSelection, pool: Pool, used: list[Column], options: LoadOptions) -> _TimeColumn:
-    given = options.time_unit
-    if wanted.step is not None:
-        if given is not None:
+def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], options: LoadOptions) -> _TimeColumn:
+    unit_option = options.time_unit
+    if selection.step is not None:
+        if unit_option is not None:
             raise DataError(
-                f"{parameter('time_unit', given)} is the unit of {parameter('time')}, which is not used; "
+                f"{parameter('time_unit', unit_option)} is the unit of {parameter('time')}, which is not used; "
                 f"{parameter('step')} is in s"
             )
         return _TimeColumn()
-    matrices = [column.matrix for column in used if column.matrix is not None]
-    column, assumed = pool.time(wanted.time, matrices, {column.name for column in used})
+    matrices = [column.matrix for column in columns if column.matrix is not None]
+    column, assumed = pool.time(selection.time, matrices, {column.name for column in columns})
     label = f"{column.source.name}: column {column.name!r} (time)"
     facts: tuple[str, ...] = () if assumed is None else (str(assumed),)
     if column.timestamps is None:
-        unit, said = time_unit_of(time_header(column), label, given)
-        return _TimeColumn(column.numbers(), unit, label, column.name, facts + said)
-    if given is not None:
+        unit, notes = time_unit_of(time_header(column), label, unit_option)
+        return _TimeColumn(column.numbers(), unit, label, column.name, facts + notes)
+    if unit_option is not None:
         raise DataError(
-            f"{parameter('time_unit', given)} is the unit of numbers, and {label} holds dates or times of day"
+            f"{parameter('time_unit', unit_option)} is the unit of numbers, and {label} holds dates or times of day"
         )
-    seconds = column.timestamps.seconds(label, wanted.layout.dates)
-    order = date_order_assumption(column, wanted.layout.dates)
+    seconds = column.timestamps.seconds(label, selection.layout.dates)
+    order = date_order_assumption(column, selection.layout.dates)
     facts += () if order is None else (str(order),)
     facts += (f"time counted from {column.timestamps.first!r} on",)
     return _TimeColumn(seconds, "s", label, column.name, facts)
 
 
-def _assume_roles(wanted: ColumnSelection, pool: Pool, signals: Signals | None) -> tuple[Assumption, ...]:
+def _assume_roles(selection: ColumnSelection, pool: Pool, signals: Signals | None) -> tuple[Assumption, ...]:
     """Choose inputs and outputs by column names if none are named."""
-    if wanted.inputs or wanted.outputs:
+    if selection.inputs or selection.outputs:
         return ()
     matrices = list(dict.fromkeys(c.matrix for c in pool.columns if c.matrix is not None))
     clock = None
-    if wanted.step is None:
-        clock, _ = pool.time(wanted.time, matrices if len(matrices) == 1 else [], set())
-    return assume_roles(wanted, [c for c in pool.columns if c is not clock], signals)
+    if selection.step is None:
+        clock, _ = pool.time(selection.time, matrices if len(matrices) == 1 else [], set())
+    return assume_roles(selection, [c for c in pool.columns if c is not clock], signals)
 
 
 def base_name(path: Path) -> str:
@@ -293,12 +293,12 @@ def base_name(path: Path) -> str:
     return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
 
 
-def _check_disjoint_roles(wanted: ColumnSelection, pool: Pool) -> None:
+def _check_disjoint_roles(selection: ColumnSelection, pool: Pool) -> None:
     """Raise if a column is both an input and an output; its model would be trivial."""
-    driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in wanted.inputs.items()}
+    driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in selection.inputs.items()}
     twice = [
         (driven[id(column)], name)
-        for name, spec in wanted.outputs.items()
+        for name, spec in selection.outputs.items()
         if id(column := pool.find(spec, f"signal {name!r}")) in driven
     ]
     if twice and twice[0][0][0] != twice[0][1]:
@@ -317,11 +317,11 @@ def time_header(clock: Column) -> str:
     return f"{clock.variable} [{clock.file_unit}]" if below else clock.variable
 
 
-def _paths(given: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
+def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
     """Return files, each with the group of an HDF5 file that the path goes on to; "" for the whole file."""
-    entries = [given] if isinstance(given, (str, os.PathLike)) else given
+    entries = [argument] if isinstance(argument, (str, os.PathLike)) else argument
     if not isinstance(entries, Sequence) or not all(isinstance(entry, (str, os.PathLike)) for entry in entries):
-        raise DataError(f"path is a {type(given).__name__}; pass the path of a file, or a list of paths")
+        raise DataError(f"path is a {type(argument).__name__}; pass the path of a file, or a list of paths")
     if not entries:
         raise DataError("path: the list is empty; pass the path of at least one file")
     places = [_split_group(Path(entry)) for entry in entries]
@@ -411,26 +411,26 @@ def select_columns(
     layout: object,
 ) -> ColumnSelection:
     """Merge the column selection of the arguments and of a columns file; arguments take precedence."""
-    told = _columns_file(columns)
+    specification = _columns_file(columns)
     if time is not None and step is not None:
         raise DataError(f"{parameter('time')} and {parameter('step')}: both are given; pass one of them")
     if time is None and step is None:
-        time, step = told.get("time"), told.get("step")
+        time, step = specification.get("time"), specification.get("step")
         if time is not None and step is not None:
             raise DataError(f"{parameter('columns')}: both time and step are given; keep one of them")
     return ColumnSelection(
         time,
         cast("float | None", step),
-        names_to_columns("inputs", told.get("inputs")) | names_to_columns("inputs", inputs),
-        names_to_columns("outputs", told.get("outputs")) | names_to_columns("outputs", outputs),
-        _words("units", told.get("units")) | _words("units", units),
-        _words("intersample", told.get("intersample")) | _words("intersample", intersample),
-        Layout.of(told.get("layout")).under(Layout.of(layout)),
+        names_to_columns("inputs", specification.get("inputs")) | names_to_columns("inputs", inputs),
+        names_to_columns("outputs", specification.get("outputs")) | names_to_columns("outputs", outputs),
+        _words("units", specification.get("units")) | _words("units", units),
+        _words("intersample", specification.get("intersample")) | _words("intersample", intersample),
+        Layout.of(specification.get("layout")).under(Layout.of(layout)),
     )
 
 
-def _words(argument: str, given: object) -> dict[str, str]:
-    return {} if given is None else dict(cast("Mapping[str, str]", as_mapping(argument, given, "word")))
+def _words(argument: str, value: object) -> dict[str, str]:
+    return {} if value is None else dict(cast("Mapping[str, str]", as_mapping(argument, value, "word")))
 
 
 def _columns_file(columns: object) -> Mapping[str, object]:
@@ -442,36 +442,36 @@ def _columns_file(columns: object) -> Mapping[str, object]:
         return {key: value for key, value in read.items() if value is not None}
     if not isinstance(columns, Mapping):
         raise DataError(f"{parameter('columns')} is a {type(columns).__name__}; pass a dict or the path of a TOML file")
-    known = COLUMN_KEYS
-    unknown = [key for key in columns if key not in known]
+    keys = COLUMN_KEYS
+    unknown = [key for key in columns if key not in keys]
     if unknown:
         raise DataError(
-            f"{parameter('columns')}: the key {unknown[0]!r} is unknown{nearest(unknown[0], known)}, {len(unknown)} in "
-            f"all; the known keys are {join_names(known)}"
+            f"{parameter('columns')}: the key {unknown[0]!r} is unknown{nearest(unknown[0], keys)}, {len(unknown)} in "
+            f"all; the known keys are {join_names(keys)}"
         )
     return columns
 
 
-def _apply_header(wanted: ColumnSelection, header: Header) -> None:
+def _apply_header(selection: ColumnSelection, header: Header) -> None:
     """Complete the column selection by the ftlm header of a file."""
-    if wanted.time is None and wanted.step is None:
-        wanted.time = CSV_TIME
-    if not wanted.inputs and not wanted.outputs:
-        wanted.inputs = {name: name for name in header.inputs}
-        wanted.outputs = {name: name for name in header.outputs}
-    elif not wanted.outputs:
-        wanted.outputs = {name: name for name in header.outputs if name not in wanted.inputs}
-    elif not wanted.inputs:
-        wanted.inputs = {name: name for name in header.inputs if name not in wanted.outputs}
-    for name, column in (wanted.inputs | wanted.outputs).items():
-        stated = header.units.get(str(column))
-        told = wanted.units.get(name)
-        if stated and told and told != stated:
+    if selection.time is None and selection.step is None:
+        selection.time = CSV_TIME
+    if not selection.inputs and not selection.outputs:
+        selection.inputs = {name: name for name in header.inputs}
+        selection.outputs = {name: name for name in header.outputs}
+    elif not selection.outputs:
+        selection.outputs = {name: name for name in header.outputs if name not in selection.inputs}
+    elif not selection.inputs:
+        selection.inputs = {name: name for name in header.inputs if name not in selection.outputs}
+    for name, column in (selection.inputs | selection.outputs).items():
+        file_unit = header.units.get(str(column))
+        unit = selection.units.get(name)
+        if file_unit and unit and unit != file_unit:
             raise DataError(
-                f"{parameter('units')}: {told!r} is asked for signal {name!r}, and the file itself says {stated!r}; "
+                f"{parameter('units')}: {unit!r} is asked for signal {name!r}, and the file itself says {file_unit!r}; "
                 "leave the unit out for a file written by ftlm"
             )
-        if stated and not told:
-            wanted.units[name] = stated
-        if name in wanted.inputs and str(column) in header.intersample:
-            wanted.intersample.setdefault(name, header.intersample[str(column)])
+        if file_unit and not unit:
+            selection.units[name] = file_unit
+        if name in selection.inputs and str(column) in header.intersample:
+            selection.intersample.setdefault(name, header.intersample[str(column)])

@@ -140,21 +140,21 @@ def load_frequency(
         columns = dict(zip(HEADERLESS_PARTS, pool.names, strict=True))
         way_out = parameter("columns", PART_COLUMNS)
         notes.append(f"no line of names: the columns are taken as {join_names(HEADERLESS_PARTS)}; otherwise {way_out}")
-    found = _select_parts(pool, columns) if columns is not None else _find_parts(pool)
-    omega = _frequencies(found["frequency"], frequency_unit, notes)
+    parts = _select_parts(pool, columns) if columns is not None else _find_parts(pool)
+    omega = _frequencies(parts["frequency"], frequency_unit, notes)
     factor, unit = 1.0, ""
-    if "real" in found and "imag" in found:
+    if "real" in parts and "imag" in parts:
         if magnitude_unit is not None or phase_unit is not None:
             which = "magnitude_unit" if magnitude_unit is not None else "phase_unit"
             raise DataError(f"{parameter(which)} is not used: the file gives real and imaginary part; leave it out")
-        response, factor, unit = _cartesian(found, negated, notes)
-        if "magnitude" in found:
-            _compare(found, response / factor, notes)
+        response, factor, unit = _cartesian(parts, negated, notes)
+        if "magnitude" in parts:
+            _compare(parts, response / factor, notes)
     else:
-        response, factor, unit = _polar(found, magnitude_unit, phase_unit, negated, notes)
+        response, factor, unit = _polar(parts, magnitude_unit, phase_unit, negated, notes)
     deviation = None
-    if "deviation" in found:
-        deviation = factor * found["deviation"].column.numbers().astype(np.float64)
+    if "deviation" in parts:
+        deviation = factor * parts["deviation"].column.numbers().astype(np.float64)
     label = base_name(table.path) if name is None else name
     rest = omega == 0.0
     if np.any(rest) and not np.all(rest):
@@ -177,25 +177,25 @@ def is_response(pool: Pool) -> bool:
 
 def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
     """Find the parts of a frequency response by column names; raise if a part is ambiguous."""
-    found: dict[str, _ResponseColumn] = {}
+    parts: dict[str, _ResponseColumn] = {}
     for column in pool.columns:
         item = _recognize_column(column)
         if item is None:
             continue
-        if item.part in found:
+        if item.part in parts:
             raise DataError(
-                f"the columns {found[item.part].column.name!r} and {column.name!r} may both be the {item.part}; name "
+                f"the columns {parts[item.part].column.name!r} and {column.name!r} may both be the {item.part}; name "
                 f"one with {parameter('columns', PART_COLUMNS)}"
             )
-        found[item.part] = item
-    _check_parts(found, pool)
-    return found
+        parts[item.part] = item
+    _check_parts(parts, pool)
+    return parts
 
 
 def _select_parts(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _ResponseColumn]:
     if not isinstance(columns, Mapping):
         raise DataError(f"columns is a {type(columns).__name__}; pass a dict of part: column")
-    found = {}
+    parts = {}
     for part, spec in columns.items():
         if part not in _PART_SYNONYMS:
             raise DataError(
@@ -205,19 +205,19 @@ def _select_parts(pool: Pool, columns: Mapping[str, str | int]) -> dict[str, _Re
         column = pool.find(spec, part)
         item = _recognize_column(column)
         word, unit = (item.word, item.unit) if item is not None else _split_name_and_unit(column)
-        found[part] = _ResponseColumn(column, part, unit, item is not None and item.is_negated, word)
-    _check_parts(found, pool)
-    return found
+        parts[part] = _ResponseColumn(column, part, unit, item is not None and item.is_negated, word)
+    _check_parts(parts, pool)
+    return parts
 
 
-def _check_parts(found: Mapping[str, _ResponseColumn], pool: Pool) -> None:
-    whole = {"real", "imag"} <= found.keys() or {"magnitude", "phase"} <= found.keys()
-    if "frequency" in found and whole:
+def _check_parts(parts: Mapping[str, _ResponseColumn], pool: Pool) -> None:
+    whole = {"real", "imag"} <= parts.keys() or {"magnitude", "phase"} <= parts.keys()
+    if "frequency" in parts and whole:
         return
-    known = ", ".join(f"{i.part} {i.column.name!r}" for i in found.values()) or "none"
-    missing = "the frequency" if "frequency" not in found else "real and imaginary part, or magnitude and phase"
+    names = ", ".join(f"{i.part} {i.column.name!r}" for i in parts.values()) or "none"
+    missing = "the frequency" if "frequency" not in parts else "real and imaginary part, or magnitude and phase"
     raise DataError(
-        f"{missing} cannot be recognized by column names (recognized: {known}); name the columns with "
+        f"{missing} cannot be recognized by column names (recognized: {names}); name the columns with "
         f"{parameter('columns', PART_COLUMNS)}, parts frequency, real and imag, or frequency, magnitude and phase; "
         f"{pool.describe()}"
     )
@@ -234,8 +234,8 @@ def _split_name_and_unit(column: Column) -> tuple[str, str]:
     if bare.casefold().endswith("_rad_s"):
         return bare[:-6], "rad/s"
     for mark in ("/", "_", " ", ","):
-        head, found, tail = bare.rpartition(mark)
-        if found and head and _unit_kind(tail.strip()) is not None:
+        head, separator, tail = bare.rpartition(mark)
+        if separator and head and _unit_kind(tail.strip()) is not None:
             return head.strip(), tail.strip()
     return bare, ""
 
@@ -253,14 +253,14 @@ def _unit_kind(unit: str) -> str | None:
 
 def _phase_unit(unit: str) -> str | None:
     """Return the unit of a phase; None for other units."""
-    known = parse_unit(unit.casefold())
-    return "deg" if known == "°" else known if known in _PHASE_UNITS else None
+    unit_name = parse_unit(unit.casefold())
+    return "deg" if unit_name == "°" else unit_name if unit_name in _PHASE_UNITS else None
 
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
     """Recognize a column by its name, with or without unit, such as ``Re(Z)`` or ``dB``; None if unknown."""
-    whole, stated = column.name.strip(), column.file_unit
-    own = whole if _unit_kind(whole) else stated if _unit_kind(stated) else ""
+    whole, file_unit = column.name.strip(), column.file_unit
+    own = whole if _unit_kind(whole) else file_unit if _unit_kind(file_unit) else ""
     for text, unit in ((whole, own), _split_name_and_unit(column)):
         word = re.sub(
             r"[\s_]", "", text.replace(_OHM_SIGN, "Ω") if len(text) < _MAX_PART_NAME_CHARACTERS else ""
@@ -274,20 +274,20 @@ def _recognize_column(column: Column) -> _ResponseColumn | None:
     return None
 
 
-def _frequencies(item: _ResponseColumn, asked: str | None, notes: list[str]) -> Floats:
+def _frequencies(item: _ResponseColumn, option: str | None, notes: list[str]) -> Floats:
     values = item.column.numbers().astype(np.float64)
-    stated = item.unit if _unit_kind(item.unit) == "frequency" else ""
-    if stated and stated not in FREQUENCY_UNITS:
+    file_unit = item.unit if _unit_kind(item.unit) == "frequency" else ""
+    if file_unit and file_unit not in FREQUENCY_UNITS:
         folded = {"hz": "Hz", "khz": "kHz", "rad/s": "rad/s", "rad/sec": "rad/s", "1/s": "rad/s"}
-        stated = folded[stated.casefold()]
-    if asked is not None:
-        frequency_factor(asked)
-        if stated and stated != asked:
+        file_unit = folded[file_unit.casefold()]
+    if option is not None:
+        frequency_factor(option)
+        if file_unit and file_unit != option:
             raise DataError(
-                f"column {item.column.name!r} states {stated}, and {parameter('frequency_unit', asked)} is asked "
+                f"column {item.column.name!r} states {file_unit}, and {parameter('frequency_unit', option)} is asked "
                 f"for; leave {parameter('frequency_unit')} out, or rename the column"
             )
-    unit = asked or stated
+    unit = option or file_unit
     if not unit:
         if item.unit:
             raise DataError(
@@ -317,9 +317,9 @@ def _magnitude_scale(item: _ResponseColumn) -> tuple[float, str]:
 
 
 def _cartesian(
-    found: Mapping[str, _ResponseColumn], negated: bool | None, notes: list[str]
+    parts: Mapping[str, _ResponseColumn], negated: bool | None, notes: list[str]
 ) -> tuple[Complex, float, str]:
-    real, imag = found["real"], found["imag"]
+    real, imag = parts["real"], parts["imag"]
     factor, unit = _magnitude_scale(real)
     other, _ = _magnitude_scale(imag)
     if (factor, unit) != _magnitude_scale(imag) and imag.unit and real.unit:
@@ -345,13 +345,13 @@ def _cartesian(
 
 
 def _polar(
-    found: Mapping[str, _ResponseColumn],
+    parts: Mapping[str, _ResponseColumn],
     magnitude_unit: str | None,
     phase_unit: str | None,
     negated: bool | None,
     notes: list[str],
 ) -> tuple[Complex, float, str]:
-    size, angle = found["magnitude"], found["phase"]
+    size, angle = parts["magnitude"], parts["phase"]
     values, phase = (i.column.numbers().astype(np.float64) for i in (size, angle))
     decibels = _resolve_unit(
         "magnitude",
@@ -361,14 +361,14 @@ def _polar(
         "dB" if size.unit.casefold() == "db" else "abs" if size.unit else None,
         notes,
     )
-    if decibels == "dB" and "deviation" in found:
+    if decibels == "dB" and "deviation" in parts:
         raise DataError(
-            f"column {found['deviation'].column.name!r} is read as the standard deviation of real and imaginary "
+            f"column {parts['deviation'].column.name!r} is read as the standard deviation of real and imaginary "
             "part, which does not apply to magnitudes in dB; give real and imaginary part, or name the columns with "
             f"{parameter('columns', PART_COLUMNS)}"
         )
-    stated = _phase_unit(angle.unit)
-    radians = SIGNAL_UNITS[_resolve_unit("phase", angle, phase_unit, _PHASE_UNITS, stated, notes)][1]
+    file_unit = _phase_unit(angle.unit)
+    radians = SIGNAL_UNITS[_resolve_unit("phase", angle, phase_unit, _PHASE_UNITS, file_unit, notes)][1]
     factor, unit = (1.0, "") if decibels == "dB" else _magnitude_scale(size)
     if decibels == "dB":
         values = 10.0 ** (values / 20.0)
@@ -388,28 +388,28 @@ def _polar(
 
 
 def _resolve_unit(
-    what: str, item: _ResponseColumn, asked: str | None, known: tuple[str, ...], stated: str | None, notes: list[str]
+    what: str, item: _ResponseColumn, option: str | None, choices: tuple[str, ...], unit: str | None, notes: list[str]
 ) -> str:
     """Return the unit: given by the user, stated by the file, or assumed with a note."""
-    if asked is not None:
-        if asked not in known:
-            hint = nearest(asked, known)
+    if option is not None:
+        if option not in choices:
+            hint = nearest(option, choices)
             raise DataError(
-                f"{parameter(f'{what}_unit', asked)} is unknown{hint}; the known ones are {join_names(known)}"
+                f"{parameter(f'{what}_unit', option)} is unknown{hint}; the known ones are {join_names(choices)}"
             )
-        if stated is not None and stated != asked:
+        if unit is not None and unit != option:
             raise DataError(
-                f"column {item.column.name!r} states {stated}, and {parameter(f'{what}_unit', asked)} is asked for; "
+                f"column {item.column.name!r} states {unit}, and {parameter(f'{what}_unit', option)} is asked for; "
                 f"leave {parameter(f'{what}_unit')} out, or rename the column"
             )
-        return asked
-    if stated is not None:
-        return stated
+        return option
+    if unit is not None:
+        return unit
     words = "a size, not decibels" if what == "magnitude" else "degrees"
     notes.append(
-        f"the {what} {item.column.name!r} is taken for {words}; otherwise {parameter(f'{what}_unit', known[1])}"
+        f"the {what} {item.column.name!r} is taken for {words}; otherwise {parameter(f'{what}_unit', choices[1])}"
     )
-    return known[0]
+    return choices[0]
 
 
 def _truth(name: str, value: object) -> bool:
@@ -418,13 +418,13 @@ def _truth(name: str, value: object) -> bool:
     return value
 
 
-def _compare(found: Mapping[str, _ResponseColumn], response: Complex, notes: list[str]) -> None:
+def _compare(parts: Mapping[str, _ResponseColumn], response: Complex, notes: list[str]) -> None:
     """Compare a redundant magnitude column with real and imaginary part; note a mismatch."""
-    item = found["magnitude"]
+    item = parts["magnitude"]
     if item.unit.casefold() == "db" or item.column.problem is not None:
         return
     own, units = item.column.numbers(), _ohms(item.unit) or 1.0
-    scale = (_ohms(found["real"].unit) or 1.0) / units
+    scale = (_ohms(parts["real"].unit) or 1.0) / units
     off = np.abs(np.abs(response) * scale - own) > _MAGNITUDE_TOLERANCE * np.abs(own)
     if np.any(off):
         notes.append(

@@ -153,21 +153,21 @@ class OpenedFile:
         """
         if self.problem:
             raise DataError(f"{self.path} is not a run yet, so there are no columns to write: {self.problem}")
-        said = {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items() if k in COLUMN_KEYS}
-        lines = [f"{key} = {_toml(value)}" for key, value in said.items() if not isinstance(value, dict)]
-        for table, values in ((k, v) for k, v in said.items() if isinstance(v, dict)):
+        options = {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items() if k in COLUMN_KEYS}
+        lines = [f"{key} = {_toml(value)}" for key, value in options.items() if not isinstance(value, dict)]
+        for table, values in ((k, v) for k, v in options.items() if isinstance(v, dict)):
             lines += ["", f"[{table}]", *(f"{_toml(str(k))} = {_toml(v)}" for k, v in values.items())]
         return write_atomically(path, ("\n".join(lines) + "\n").encode(), force=force)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the preview as a JSON-compatible dictionary."""
-        said = {**asdict(self), "layout": self.layout.to_dict(), "commands": self._commands()}
-        return {**said, "options": {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items()}}
+        fields = {**asdict(self), "layout": self.layout.to_dict(), "commands": self._commands()}
+        return {**fields, "options": {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items()}}
 
     def __str__(self) -> str:
         heads = ("column", "role", "unit", "first", "low", "high")
-        shown = self.columns[:_MAX_LISTED_COLUMNS]
-        cells = [heads, *((_truncate_text(c.name), _role(c), _truncate_text(c.unit), *_figures(c)) for c in shown)]
+        columns = self.columns[:_MAX_LISTED_COLUMNS]
+        cells = [heads, *((_truncate_text(c.name), _role(c), _truncate_text(c.unit), *_figures(c)) for c in columns)]
         widths = [max(len(row[k]) for row in cells) for k in range(6)]
         counts = f"{self.rows} row{'s' * (self.rows != 1)}, {len(self.columns)} column{'s' * (len(self.columns) != 1)}"
         lines = [f"{_truncate_text(self.path)}: {self.kind}; {counts}"]
@@ -189,20 +189,22 @@ class OpenedFile:
 
     def _flags(self) -> list[str]:
         """Return the options of the command line that correspond to `options`."""
-        told = self.options
+        options = self.options
         # Options that are detected reliably or equal the default are omitted.
         plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
         words = []
         for key in ("time", "step", "time_unit", "resample", "missing"):
-            if key in told and key not in plain:
-                words += [flag_of(key), str(told[key])]
-        if "window" in told:
-            words += [flag_of("window"), ":".join("" if end is None else repr(end) for end in told["window"])]
+            if key in options and key not in plain:
+                words += [flag_of(key), str(options[key])]
+        if "window" in options:
+            words += [flag_of("window"), ":".join("" if end is None else repr(end) for end in options["window"])]
         for key in ("inputs", "outputs", "units", "intersample"):
             bare = key in ("inputs", "outputs")
-            pairs = (name if bare and name == value else f"{name}={value}" for name, value in told.get(key, {}).items())
+            pairs = (
+                name if bare and name == value else f"{name}={value}" for name, value in options.get(key, {}).items()
+            )
             words += [w for pair in pairs for w in (flag_of(key), pair)]
-        told_layout: Layout = told.get("layout", Layout())
+        told_layout: Layout = options.get("layout", Layout())
         words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (flag_of(k), str(v))]
         return words
 
@@ -248,14 +250,14 @@ def open_file(
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
-    wanted = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
-    return preview_selection(path, wanted, LoadOptions(window, resample, None, time_unit, missing))
+    selection = select_columns(columns, time, step, inputs, outputs, units, intersample, layout)
+    return preview_selection(path, selection, LoadOptions(window, resample, None, time_unit, missing))
 
 
-def preview_selection(path: PathLike, wanted: ColumnSelection, options: LoadOptions) -> OpenedFile:
+def preview_selection(path: PathLike, selection: ColumnSelection, options: LoadOptions) -> OpenedFile:
     """Preview a file with a selection of its columns."""
-    (table,) = read_tables(path, wanted.layout)
-    return _FilePreview(table, Pool([table]), wanted, options).result(os.fspath(path))
+    (table,) = read_tables(path, selection.layout)
+    return _FilePreview(table, Pool([table]), selection, options).result(os.fspath(path))
 
 
 @dataclass
@@ -264,47 +266,47 @@ class _FilePreview:
 
     table: FileTable
     pool: Pool
-    wanted: ColumnSelection
+    selection: ColumnSelection
     asked: LoadOptions
 
     def result(self, path: str) -> OpenedFile:
-        table, wanted = self.table, self.wanted
+        table, selection = self.table, self.selection
         every = self.pool.columns
         clock, assumed, problem = self._time(every)
         of_clock = () if clock is None else self._time_assumptions(clock)
-        roles, said, open_roles = self._roles(every, clock)
-        assumed = (*table.assumed, *assumed, *of_clock, *said)
+        roles, role_assumptions, open_roles = self._roles(every, clock)
+        assumed = (*table.assumed, *assumed, *of_clock, *role_assumptions)
         step, notes = None, tuple[str, ...]()
         if not problem:
             problem = open_roles
         options = self._options(clock, of_clock)
         if not problem:
             try:
-                run = run_from_tables([table], wanted, self.asked)
+                run = run_from_tables([table], selection, self.asked)
                 step, notes = run.step, tuple(n for n in run.warnings if n not in {str(a) for a in assumed})
             except DataError as error:
                 problem = str(error)
-        shown = tuple(_summarize_column(column, roles) for column in every)
+        columns = tuple(_summarize_column(column, roles) for column in every)
         rows = max((0 if c.values is None else c.values.size for c in every), default=0)
-        return OpenedFile(path, table.kind, rows, shown, table.layout, assumed, options, step, problem, notes)
+        return OpenedFile(path, table.kind, rows, columns, table.layout, assumed, options, step, problem, notes)
 
     def _named_signals(self) -> set[str]:
         """Return the columns that the user names as inputs or outputs and that exist."""
         names = set[str]()
-        for spec in (*self.wanted.inputs.values(), *self.wanted.outputs.values()):
+        for spec in (*self.selection.inputs.values(), *self.selection.outputs.values()):
             with contextlib.suppress(DataError):
                 names.add(self.pool.find(spec, "signal").name)
         return names
 
     def _time(self, every: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
         """Return the time column, assumptions about it, and the problem if there is none."""
-        wanted, header = self.wanted, self.table.header
-        if header is not None and wanted.time is None and wanted.step is None:
-            wanted.time = CSV_TIME
-        if wanted.step is not None:
+        selection, header = self.selection, self.table.header
+        if header is not None and selection.time is None and selection.step is None:
+            selection.time = CSV_TIME
+        if selection.step is not None:
             return None, (), ""
         signals = self._named_signals()
-        if header is None and wanted.time is None and not signals and is_response(self.pool):
+        if header is None and selection.time is None and not signals and is_response(self.pool):
             path = shlex.quote(os.fspath(self.table.path))
             command = f"ftlm identify-frequency {path} {parameter('circuit', _ARC_CIRCUIT)}"
             how = choose_text(f"ftlm.identify_frequency(ftlm.load_frequency(path), {_ARC_CIRCUIT!r})", command)
@@ -313,12 +315,12 @@ class _FilePreview:
             return None, (), f"{words}; {how} {fits}"
         matrices = list(dict.fromkeys(c.matrix for c in every if c.matrix is not None))
         try:
-            clock, assumed = self.pool.time(wanted.time, matrices if len(matrices) == 1 else [], signals)
+            clock, assumed = self.pool.time(selection.time, matrices if len(matrices) == 1 else [], signals)
         except DataError as error:
             return None, (), str(error)
         if assumed is not None:
             return clock, (assumed,), ""
-        if wanted.time is None and clock.matrix is not None:
+        if selection.time is None and clock.matrix is not None:
             words = f"the time is the first column of the matrix, {clock.name!r}"
             return (
                 clock,
@@ -331,22 +333,22 @@ class _FilePreview:
         self, every: list[Column], clock: Column | None
     ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
         """Return role and signal by column, assumptions, and the problem if roles are unknown."""
-        wanted, header = self.wanted, self.table.header
-        said = tuple[Assumption, ...]()
-        if header is not None and not wanted.inputs and not wanted.outputs:
-            wanted.inputs, wanted.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
+        selection, header = self.selection, self.table.header
+        assumptions = tuple[Assumption, ...]()
+        if header is not None and not selection.inputs and not selection.outputs:
+            selection.inputs, selection.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
         else:
-            said = assume_roles(wanted, [c for c in every if c is not clock])
+            assumptions = assume_roles(selection, [c for c in every if c is not clock])
         roles: dict[str, tuple[str, str]] = {} if clock is None else {clock.name: ("time", "")}
-        for role, asked in (("input", wanted.inputs), ("output", wanted.outputs)):
-            for name, spec in asked.items():
+        for role, specs in (("input", selection.inputs), ("output", selection.outputs)):
+            for name, spec in specs.items():
                 roles[self.pool.find(spec, f"signal {name!r}").name] = (role, name)
         if header is None:
-            add_file_units(wanted, self.pool)
-        left = ""
-        if not wanted.outputs:
+            add_file_units(selection, self.pool)
+        open_roles = ""
+        if not selection.outputs:
             choice = join_names((c.name for c in every if c is not clock and has_numbers(c)), 20)
-            left = (
+            open_roles = (
                 "which columns are inputs and which are outputs, their names do not say; name them with "
                 f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
                 f"{choice or 'none'}"
@@ -355,42 +357,42 @@ class _FilePreview:
             others = [f"{c.name!r} ({_first_bad_cell(c)})" for c in wordy]
             if others:
                 more = f" and {len(others) - _MAX_LISTED_COLUMNS} more" * (len(others) > _MAX_LISTED_COLUMNS)
-                left += f"; no column of numbers is {', '.join(others[:_MAX_LISTED_COLUMNS])}{more}"
-        return roles, said, left
+                open_roles += f"; no column of numbers is {', '.join(others[:_MAX_LISTED_COLUMNS])}{more}"
+        return roles, assumptions, open_roles
 
     def _time_assumptions(self, clock: Column) -> tuple[Assumption, ...]:
         """Return the assumptions about unit or date order of the time column."""
         if self.table.header is not None:
             return ()
         if clock.timestamps is not None:
-            order = date_order_assumption(clock, self.wanted.layout.dates)
+            order = date_order_assumption(clock, self.selection.layout.dates)
             return () if order is None else (order,)
         name = time_header(clock)
-        known = split_time_header(name)[1] is not None or name.casefold() in _SECONDS_COLUMN_NAMES
-        if self.asked.time_unit is not None or known or clock.problem is not None:
+        is_certain = split_time_header(name)[1] is not None or name.casefold() in _SECONDS_COLUMN_NAMES
+        if self.asked.time_unit is not None or is_certain or clock.problem is not None:
             return ()
         words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
         return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
         """Return the arguments of `load` that give the same run."""
-        wanted = self.wanted
-        options: dict[str, Any] = {"step": wanted.step} if wanted.step is not None else {}
+        selection = self.selection
+        options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
         if clock is not None and self.table.header is None:
             options["time"] = clock.name
-        asked = self.asked
+        load_options = self.asked
         more = {
-            "window": asked.window,
-            "resample": asked.resample,
-            "time_unit": asked.time_unit,
-            "missing": asked.missing,
+            "window": load_options.window,
+            "resample": load_options.resample,
+            "time_unit": load_options.time_unit,
+            "missing": load_options.missing,
         }
         options |= {key: value for key, value in more.items() if value is not None}
         for key in ("inputs", "outputs", "units", "intersample"):
-            if getattr(wanted, key) and (self.table.header is None or key in ("inputs", "outputs")):
-                options[key] = dict(getattr(wanted, key))
-        said = {*wanted.layout.to_dict(), *(a.option for a in self.table.assumed)}
-        layout = Layout.of({key: value for key, value in self.table.layout.to_dict().items() if key in said})
+            if getattr(selection, key) and (self.table.header is None or key in ("inputs", "outputs")):
+                options[key] = dict(getattr(selection, key))
+        keys = {*selection.layout.to_dict(), *(a.option for a in self.table.assumed)}
+        layout = Layout.of({key: value for key, value in self.table.layout.to_dict().items() if key in keys})
         for assumption in of_clock:
             if assumption.option == "dates":
                 layout = layout.under(Layout(dates=str(assumption.value)))
@@ -401,8 +403,8 @@ class _FilePreview:
 
 def _first_bad_cell(column: Column) -> str:
     """Return the first cell that is not a number, with its line."""
-    found = _IN_LINE.search(str(column.problem))
-    return "" if found is None else found[0]
+    match = _IN_LINE.search(str(column.problem))
+    return "" if match is None else match[0]
 
 
 def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
@@ -414,10 +416,10 @@ def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> F
         why = _first_bad_cell(column)
         words = "no numbers" if not why else f"no numbers ({why})"
         return FileColumn(column.name, role, signal, unit, None, None, None, words)
-    there = values[~np.isnan(values)]
-    if not there.size:
+    finite = values[~np.isnan(values)]
+    if not finite.size:
         return FileColumn(column.name, role, signal, unit, None, None, None, "empty")
-    return FileColumn(column.name, role, signal, unit, float(values[0]), float(there.min()), float(there.max()))
+    return FileColumn(column.name, role, signal, unit, float(values[0]), float(finite.min()), float(finite.max()))
 
 
 def _toml(value: object) -> str:

@@ -169,9 +169,9 @@ class Pool:
         if not isinstance(spec, str):
             raise DataError(f"column {spec!r} ({thing}) is neither a name nor a position; give one of them")
         name = spec
-        written = _MATLAB_COLUMN.fullmatch(spec)
-        if spec not in self._columns and written:
-            name = f"{written[1]}.{int(written[2])}" if len(written[2]) < 10 else spec
+        match = _MATLAB_COLUMN.fullmatch(spec)
+        if spec not in self._columns and match:
+            name = f"{match[1]}.{int(match[2])}" if len(match[2]) < 10 else spec
         column = self._columns.get(name)
         if column is None:
             # Accept a name without its unit in brackets, if it is unique.
@@ -213,20 +213,20 @@ class Pool:
             return self.find(spec, "time"), None
         clocks, assumed = [], None
         for table in self._tables:
-            named, why = self._clocks(table, signals)
-            if len(named) > 1 and table.runs:
+            columns, why = self._clocks(table, signals)
+            if len(columns) > 1 and table.runs:
                 raise DataError(
                     f"{table.path.name} holds {len(table.runs)} runs, a group with a time each; give the path of one, "
                     f"as in {str(table.path / table.runs[0])!r}; the groups are {join_names(table.runs)}"
                 )
-            if len(named) > 1:
+            if len(columns) > 1:
                 raise DataError(
-                    f"{table.path.name}: the columns {join_names(column.name for column in named)} may all be the "
+                    f"{table.path.name}: the columns {join_names(column.name for column in columns)} may all be the "
                     f"time; name one with {parameter('time')}"
                 )
-            if named and why:
-                assumed = Assumption("time", named[0].name, why, parameter("time", Placeholder("COLUMN")))
-            clocks += named
+            if columns and why:
+                assumed = Assumption("time", columns[0].name, why, parameter("time", Placeholder("COLUMN")))
+            clocks += columns
         if not clocks:
             first = [self._columns[f"{matrix}.1"] for matrix in dict.fromkeys(matrices)]
             clocks = [column for column in first if column.name not in signals]
@@ -251,9 +251,9 @@ class Pool:
         sure = [c for c in own if is_time_name(c.variable) or is_time_name(c.variable.rpartition("/")[2])]
         if sure:
             return sure, ""
-        named = [c for c in own if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]
-        if named:
-            return named, f"the time is column {named[0].name!r}, by its name"
+        columns = [c for c in own if split_time_header(c.variable)[0].translate(_JOINER_REMOVAL) in _OTHER_TIMES]
+        if columns:
+            return columns, f"the time is column {columns[0].name!r}, by its name"
         dated = [c for c in own if c.timestamps is not None]
         if dated:
             return dated, f"the time is column {dated[0].name!r}, which holds dates or times of day"

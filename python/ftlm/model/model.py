@@ -162,10 +162,10 @@ class Model:
     @property
     def coefficients(self) -> dict[str, float]:
         """Values of the coefficients by name."""
-        named = {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
+        values = {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
         for item in self.equations:
-            named |= {} if item.friction is None else item.friction.identified_coefficients
-        return named
+            values |= {} if item.friction is None else item.friction.identified_coefficients
+        return values
 
     @property
     def equations(self) -> tuple[Equation, ...]:

@@ -81,7 +81,7 @@ def parameter_estimates(
     }
 
 
-def parameter_frame(parameters: Iterable[Parameter], stated: Mapping[str, float]) -> Any:
+def parameter_frame(parameters: Iterable[Parameter], reference_values: Mapping[str, float]) -> Any:
     """Return parameters as a pandas frame by name: value, standard error, 95 % interval, unit, nominal value."""
     rows = [
         {
@@ -92,7 +92,7 @@ def parameter_frame(parameters: Iterable[Parameter], stated: Mapping[str, float]
             "high": p.interval[1],
             "unit": p.unit,
             "fixed": p.fixed,
-            "stated": stated.get(p.name, math.nan),
+            "stated": reference_values.get(p.name, math.nan),
         }
         for p in parameters
     ]
@@ -116,10 +116,10 @@ def parameter_units(model: Model) -> dict[str, str]:
             own = model.units.get(item.output, "")
             force = f"s^-{alpha:g} {own}" if own else ""
             near = item.friction.stribeck
-            named = [(item.friction.name, force)]
+            units_by_name = [(item.friction.name, force)]
             if near is not None:
-                named += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
-            out |= {name: unit for name, unit in named if name is not None}
+                units_by_name += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
+            out |= {name: unit for name, unit in units_by_name if name is not None}
     out |= {f"delay_{name}": "s" for name in model.structure.delay}
     out |= {limit.name: model.units.get(limit.signal, "") for limit in model.structure.limits}
     return {name: unit for name, unit in out.items() if unit}

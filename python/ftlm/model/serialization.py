@@ -165,9 +165,9 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
             raise ModelError("its sensor filter has neither signals nor outputs, or both; one of them names them")
         if not isinstance(self.signals, UnsetType):
             return SensorFilter(self.signals, self.numerator, self.denominator)
-        named = () if isinstance(self.outputs, UnsetType) else self.outputs
-        kept = tuple(n for n in named if n in followed or not followed)
-        return SensorFilter(kept, self.numerator, self.denominator) if kept else None
+        names = () if isinstance(self.outputs, UnsetType) else self.outputs
+        signals = tuple(n for n in names if n in followed or not followed)
+        return SensorFilter(signals, self.numerator, self.denominator) if signals else None
 
 
 class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -196,8 +196,8 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         # Absent fields are omitted, so that files of older structures do not change.
         offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
         sensor = FilterFile.of(s)
-        known = [(limit, limit.value) for limit in s.limits]
-        limits = [LimitFile(limit.signal, limit.law, v) for limit, v in known if not isinstance(v, tuple)] or UNSET
+        values = [(limit, limit.value) for limit in s.limits]
+        limits = [LimitFile(limit.signal, limit.law, v) for limit, v in values if not isinstance(v, tuple)] or UNSET
         equations = [EquationFile.of(e) for e in s.equations]
         return cls(
             "ftlm-model",
@@ -261,15 +261,15 @@ def schema_of(
     """Smallest schema version that contains all parts of a model, so that older files do not change."""
     profiled = estimate is not None and estimate.intervals is not UNSET
     doubted = estimate is not None and not (estimate.findings is UNSET and estimate.against is UNSET)
-    named = sensor is not None and not isinstance(sensor.signals, UnsetType)
-    known = estimate is not None and estimate.free is not UNSET
+    is_partial = sensor is not None and not isinstance(sensor.signals, UnsetType)
+    has_parameter_set = estimate is not None and estimate.free is not UNSET
     in_pieces = estimate is not None and estimate.piece_duration is not UNSET
     return max(
         BASE_SCHEMA if isinstance(offset, UnsetType) else LEVEL_SCHEMA if offset == "level" else OFFSET_SCHEMA,
-        PROFILE_SCHEMA if profiled or named else BASE_SCHEMA,
+        PROFILE_SCHEMA if profiled or is_partial else BASE_SCHEMA,
         BASE_SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA,
         *(e.schema for e in equations),
-        FIT_SCHEMA if known else BASE_SCHEMA,
+        FIT_SCHEMA if has_parameter_set else BASE_SCHEMA,
         FINDING_SCHEMA if doubted else BASE_SCHEMA,
         PIECES_SCHEMA if in_pieces else BASE_SCHEMA,
     )

@@ -254,20 +254,20 @@ class Throughput:
 
 def run_on_executor(
     send: Callable[[CandidateBlock], tuple[Any, ...]],
-    left: list[CandidateBlock],
+    blocks: list[CandidateBlock],
     executor: Executor,
     throughput: Throughput,
 ) -> Iterator[tuple[CandidateBlock, Any]]:
     """Submit blocks in tasks of about :data:`TASK_DURATION_S` seconds each, and yield their results."""
     count = worker_count(executor)
-    ahead = TASKS_PER_WORKER * count + 2
+    queue_size = TASKS_PER_WORKER * count + 2
     # In a small batch every worker gets a share.
-    share = max(throughput.min_count, -(-sum(s.last - s.first for s in left) // count))
+    share = max(throughput.min_count, -(-sum(s.last - s.first for s in blocks) // count))
     pending: dict[Future[Any], CandidateBlock] = {}
-    waiting = left[::-1]
+    waiting = blocks[::-1]
     try:
         while waiting or pending:
-            while waiting and len(pending) < ahead:
+            while waiting and len(pending) < queue_size:
                 block = waiting.pop()
                 size = min(throughput.count_for(TASK_DURATION_S), share)
                 if block.start is None and block.attempts == 0 and block.last - block.first > size:
@@ -277,8 +277,8 @@ def run_on_executor(
                     pending[executor.submit(run_in_worker, *send(block))] = block
                 except (BrokenExecutor, RuntimeError) as error:
                     raise _executor_error(error) from error
-            done, _ = wait(pending, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
-            for future in done:
+            finished, _ = wait(pending, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
+            for future in finished:
                 block = pending.pop(future)
                 timed = _result(future, block)
                 if timed is None:
@@ -326,12 +326,12 @@ CHECKPOINT_INTERVAL_S = 0.25
 #: Minimum number of candidates under an order law in one task, used for the first batch. The first worker then receives
 #: the record before the others ask for it.
 MIN_BLOCK_CANDIDATES = 256
-Done = TypeVar("Done", Rounds, Verdicts)
+Frame = TypeVar("Frame", Rounds, Verdicts)
 #: Callback that stores a checkpoint of the rounds from the first to the last.
 Save = Callable[[int, int, Checkpoint | None], None]
 
 
-class SearchState(ABC, Generic[Done, Table]):
+class SearchState(ABC, Generic[Frame, Table]):
     """Search state: number of candidates done and in total, and the current batch."""
 
     #: Whether a search begun by an earlier version can be resumed.
@@ -359,7 +359,7 @@ class SearchState(ABC, Generic[Done, Table]):
 
     @abstractmethod
     def evaluate_locally(
-        self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
+        self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Any]]:
         """Evaluate blocks in this process."""
 
@@ -368,11 +368,11 @@ class SearchState(ABC, Generic[Done, Table]):
         """Return a function and its arguments that evaluate a block in a worker."""
 
     @abstractmethod
-    def frame(self, number: int, block: CandidateBlock, piece: Any) -> Done:
+    def frame(self, number: int, block: CandidateBlock, piece: Any) -> Frame:
         """Convert the result of a block to a frame of search ``number``."""
 
     @abstractmethod
-    def add_block(self, done: Done) -> int:
+    def add_block(self, frame: Frame) -> int:
         """Add a block to the current batch; return how many of its candidates were stopped early, if known."""
 
     @abstractmethod
@@ -410,18 +410,20 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
             first = end
 
     def evaluate_locally(
-        self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
+        self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Part]]:
         """Evaluate each block in one call, from its checkpoint."""
-        for block in left:
+        for block in blocks:
             first, last = block.first, block.last
-            told = None if progress is None else partial(self._report_progress, progress, self.done)
+            listener = None if progress is None else partial(self._report_progress, progress, self.done)
             saved = None if save is None else partial(save, first, last)
-            part = self._search.rounds(first, last, self._seed, block.start, self.threads, told, saved)
+            part = self._search.rounds(first, last, self._seed, block.start, self.threads, listener, saved)
             yield block, cast("Part", part)
 
-    def _report_progress(self, progress: ProgressCallback, before: int, done: int, _all: int, pruned: int) -> None:
-        progress(min(before + done, self.total), self.total, pruned)
+    def _report_progress(
+        self, progress: ProgressCallback, count_before: int, count: int, _all: int, pruned: int
+    ) -> None:
+        progress(min(count_before + count, self.total), self.total, pruned)
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
         """Return the function and arguments that evaluate a block of rounds."""
@@ -432,10 +434,10 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         """Return the frame of a block of rounds."""
         return Rounds(number, block.first, block.last, piece)
 
-    def add_block(self, done: Rounds) -> int:
+    def add_block(self, frame: Rounds) -> int:
         """Add a block of rounds."""
-        self._parts.append(done.part)
-        self.done += finished_count(done.part[1])
+        self._parts.append(frame.part)
+        self.done += finished_count(frame.part[1])
         return 0
 
     def table(self) -> _core._Found:
@@ -473,10 +475,10 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         self.total = self._first
 
     def evaluate_locally(
-        self, left: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
+        self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Outcomes]]:
         """Evaluate candidates in tasks of about :data:`CHECKPOINT_INTERVAL_S` seconds."""
-        for block in left:
+        for block in blocks:
             at = block.first
             while at < block.last:
                 piece = CandidateBlock(at, min(block.last, at + self.throughput.count_for(CHECKPOINT_INTERVAL_S)))
@@ -504,11 +506,11 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         """Return the frame of a block of candidates."""
         return Verdicts(number, block.first, block.last, *piece)
 
-    def add_block(self, done: Verdicts) -> int:
+    def add_block(self, frame: Verdicts) -> int:
         """Add a block of verdicts."""
-        self._wave.append(done)
-        self.done += len(done.kinds)
-        return done.kinds.count(1) + done.kinds.count(2)
+        self._wave.append(frame)
+        self.done += len(frame.kinds)
+        return frame.kinds.count(1) + frame.kinds.count(2)
 
     def table(self) -> _core._FoundStage:
         """Join the equations under their order law."""
@@ -565,7 +567,7 @@ def search_coupled(
 
 
 def _run_batches(
-    state: SearchState[Done, Table],
+    state: SearchState[Frame, Table],
     store: Store | None,
     number: int,
     executor: Executor | None,
@@ -576,15 +578,15 @@ def _run_batches(
     save = None if store is None else partial(store.save, number)
     pruned = 0
     for first, end in state.batches():
-        for held in _stored_frames(section, first, end):
-            state.add_block(held)
-        left = list(_pending_blocks(section, first, end))
-        if left and store is not None and not state.can_resume:
+        for stored_frame in _stored_frames(section, first, end):
+            state.add_block(stored_frame)
+        blocks = list(_pending_blocks(section, first, end))
+        if blocks and store is not None and not state.can_resume:
             raise store.outdated_error()
         if executor is None:
-            pieces = state.evaluate_locally(left, progress, save)
+            pieces = state.evaluate_locally(blocks, progress, save)
         else:
-            pieces = run_on_executor(state.task, left, executor, state.throughput)
+            pieces = run_on_executor(state.task, blocks, executor, state.throughput)
         for block, piece in pieces:
             frame = state.frame(number, block, piece)
             if store is not None:
@@ -613,8 +615,8 @@ def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | 
         return section.processed_count, _table(work, section.table)["rows"][0][1]
     state = CoupledSearchState(work)
     for first, end in state.batches():
-        for held in _stored_frames(section, first, end):
-            state.add_block(held)
+        for frame in _stored_frames(section, first, end):
+            state.add_block(frame)
         if any(_pending_blocks(section, first, end)):
             break
     return state.search.state()
@@ -645,12 +647,12 @@ def _stored_frames(section: Section | None, first: int, end: int) -> list[Any]:
 
 def _pending_blocks(section: Section | None, first: int, end: int) -> Iterator[CandidateBlock]:
     """Yield the blocks of a batch to evaluate: partial ones from their checkpoint, and the gaps between."""
-    known: list[CandidateBlock] = []
+    blocks: list[CandidateBlock] = []
     if section is not None:
-        known = [CandidateBlock(at, frame.last) for at, frame in section.frames.items()]
-        known += [CandidateBlock(at, half.last, half.checkpoint) for at, half in section.open.items()]
+        blocks = [CandidateBlock(at, frame.last) for at, frame in section.frames.items()]
+        blocks += [CandidateBlock(at, half.last, half.checkpoint) for at, half in section.open.items()]
     at = first
-    for block in sorted(known, key=lambda s: s.first):
+    for block in sorted(blocks, key=lambda s: s.first):
         if not first <= block.first < end:
             continue
         if at < block.first:

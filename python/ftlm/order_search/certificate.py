@@ -118,10 +118,10 @@ def certify_orders(
     job = make_job(runs, equation, order_grid, SearchSettings(**CERTIFIED_SETTINGS), m=m, threads=threads)
     _check_certifiable(job)
     errors = tuple(_equation_error(job, orders, k, len(start)) for k, orders in enumerate(start))
-    found = certify_job(
+    certificate = certify_job(
         job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress
     )
-    return replace(found, start_errors=errors)
+    return replace(certificate, start_errors=errors)
 
 
 def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: int) -> float:
@@ -150,11 +150,11 @@ def _check_certifiable(job: Job) -> None:
             "there is no certificate over all orders with initial terms; give the equation "
             f"{parameter('initial', 'rest')}"
         )
-    known = [t for t in item.terms if t.fixed is not None]
-    if known:
+    fixed_terms = [t for t in item.terms if t.fixed is not None]
+    if fixed_terms:
         raise ModelError(
-            f"there is no certificate over all orders with known coefficients, and {len(known)} of the terms of "
-            f"{item.output} have one (the first is {known[0].fixed:g}); name them"
+            f"there is no certificate over all orders with known coefficients, and {len(fixed_terms)} of the terms of "
+            f"{item.output} have one (the first is {fixed_terms[0].fixed:g}); name them"
         )
 
 
@@ -182,7 +182,7 @@ def certify_job(
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
     output, alpha, terms = _search_region(item, intervals, record.signals)
     try:
-        found = _core.certify(
+        answer = _core.certify(
             [r.core() for r in job.records],
             output=output,
             alpha=alpha,
@@ -193,24 +193,24 @@ def certify_job(
             max_cells=max_cells,
             threads=job.threads,
             memory=memory_limit(),
-            progress=None if progress is None else lambda done, total, _pruned: progress(done, total),
+            progress=None if progress is None else lambda count, total, _pruned: progress(count, total),
         )
     except ModelError as error:
         raise named_signals(error, record.signals) from None
-    values = [found["alpha"], *found["orders"]] if found["orders"] else []
+    values = [answer["alpha"], *answer["orders"]] if answer["orders"] else []
     names = [item.order, *(t.order for t in item.terms)]
     orders = {o.names[0]: v for o, v in zip(names, values, strict=False) if o.names}
     nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)
     return OrderCertificate(
-        found["at_least"],
-        found["best"],
+        answer["at_least"],
+        answer["best"],
         orders,
         tolerance,
         intervals,
         min_separation,
         max_term_ratio,
-        found["cells"],
-        found["open"],
+        answer["cells"],
+        answer["open"],
         record.m,
         nr,
         unstable,
@@ -222,13 +222,13 @@ def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
     settings = SearchSettings(**{**CERTIFIED_SETTINGS, "criterion": "output-error", "pruning": False})
     values = {name: (orders[name],) for name in job.values}
     try:
-        found = run_job(replace(job, values=values, settings=settings, progress=None))
+        result = run_job(replace(job, values=values, settings=settings, progress=None))
     except FtlmError:
         # No candidate has a finite score.
         return math.inf, math.nan
     with contextlib.suppress(FtlmError):
-        return found.score / job.standard_deviations()[0], found.model.stability().unstable_poles
-    return found.score / job.standard_deviations()[0], math.nan
+        return result.score / job.standard_deviations()[0], result.model.stability().unstable_poles
+    return result.score / job.standard_deviations()[0], math.nan
 
 
 def _search_region(

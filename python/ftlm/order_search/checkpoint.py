@@ -239,8 +239,8 @@ class Section:
     @property
     def processed_count(self) -> int:
         """Number of candidates evaluated or excluded."""
-        done = (len(f.kinds) if isinstance(f, Verdicts) else finished_count(f.part[1]) for f in self.frames.values())
-        return sum(done) + sum(finished_count(half.counts) for half in self.open.values())
+        counts = (len(f.kinds) if isinstance(f, Verdicts) else finished_count(f.part[1]) for f in self.frames.values())
+        return sum(counts) + sum(finished_count(half.counts) for half in self.open.values())
 
     @property
     def best(self) -> float | None:
@@ -334,9 +334,9 @@ class Store:
             # A payload read back must be the one asked for: what would not survive is found before any work.
             payloads = [RECORD_ENCODER.encode(Requests(ALGORITHM_VERSION, __version__, tuple(requests)))]
             self._file.append(payloads)
-        self.contents = held = contents_of(self.path, payloads, corruption)
+        self.contents = contents = contents_of(self.path, payloads, corruption)
         if requests is not None:
-            self._check_same(requests, held.requests)
+            self._check_same(requests, contents.requests)
         if corruption is None:
             return
         if not recover:
@@ -349,13 +349,13 @@ class Store:
         self.notes.append(
             f"the {len(payloads)} records before the damage ({corruption}) were kept; {copy} has the rest"
         )
-        held.corruption = None
+        contents.corruption = None
 
-    def _check_same(self, asked: Sequence[Request], held: Sequence[Request]) -> None:
-        if [r.name for r in asked] != [r.name for r in held]:
-            names = ", ".join(r.name for r in held)
+    def _check_same(self, requests: Sequence[Request], stored: Sequence[Request]) -> None:
+        if [r.name for r in requests] != [r.name for r in stored]:
+            names = ", ".join(r.name for r in stored)
             raise DataError(f"store {self.path} holds searches of {names}; choose another file")
-        for one, other in zip(asked, held, strict=True):
+        for one, other in zip(requests, stored, strict=True):
             difference = one.difference(other)
             if difference is not None:
                 raise DataError(
@@ -365,16 +365,16 @@ class Store:
 
     def outdated_error(self) -> DataError:
         """Return the error of a search that another version began and this one cannot resume."""
-        held = self.contents
+        content = self.contents
         return DataError(
-            f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
+            f"store {self.path} is of ftlm {content.version}, whose rounds follow algorithm {content.algorithm}; this "
             f"version's is {ALGORITHM_VERSION}: finish the search with that version, or start it again in another "
             "file"
         )
 
     def _append(self, added: Sequence[Frame]) -> None:
-        held = self.contents
-        if held.algorithm not in (ALGORITHM_VERSION, *RESUMABLE_ALGORITHMS):
+        contents = self.contents
+        if contents.algorithm not in (ALGORITHM_VERSION, *RESUMABLE_ALGORITHMS):
             # A finished search is only read, whatever made it.
             raise self.outdated_error()
         self._file.append([RECORD_ENCODER.encode(frame) for frame in added])
@@ -386,11 +386,13 @@ class Store:
         """Queue the progress of a block of rounds; write the queue if the flush interval has passed."""
         if checkpoint is not None:
             (*place, order), anew, (rows, counts, failures) = checkpoint
-            before = self._waiting.get((search, first))
-            rows = (*(before.rows if before else ()), *rows)
-            anew = anew or (before is not None and before.anew)
-            told = cast("Place", tuple(place))
-            self._waiting[search, first] = PartialRounds(search, first, last, told, rows, counts, failures, order, anew)
+            rounds_before = self._waiting.get((search, first))
+            rows = (*(rounds_before.rows if rounds_before else ()), *rows)
+            anew = anew or (rounds_before is not None and rounds_before.anew)
+            checkpoint_place = cast("Place", tuple(place))
+            self._waiting[search, first] = PartialRounds(
+                search, first, last, checkpoint_place, rows, counts, failures, order, anew
+            )
         if time.monotonic() - self._last >= FLUSH_INTERVAL_S:
             self.flush()
 

@@ -127,20 +127,20 @@ def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float
     return list(values[order.names[0]]) if order.names else [order.constant]
 
 
-def check_order_grid_names(given: OrderGrid | None, structure: Structure) -> None:
+def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None:
     """Raise if an order grid names an order that is not free."""
-    for name in given.orders if given is not None else ():
+    for name in grid.orders if grid is not None else ():
         if name not in structure.order_names and name != "alpha":
             free = ", ".join(structure.order_names) or "none"
             raise ModelError(f"order {name!r} of {parameter('order_grid')} is not a free order; free are {free}")
 
 
-def restrict_order_grid(given: OrderGrid | None, part: Structure) -> OrderGrid | None:
+def restrict_order_grid(grid: OrderGrid | None, part: Structure) -> OrderGrid | None:
     """Restrict an order grid to the free orders of a substructure."""
-    if given is None:
+    if grid is None:
         return None
     names = (*part.order_names, "alpha")
-    return replace(given, orders={n: v for n, v in given.orders.items() if n in names})
+    return replace(grid, orders={n: v for n, v in grid.orders.items() if n in names})
 
 
 Criterion = Literal["output-error", "equation-error"]
@@ -192,8 +192,8 @@ class SearchSettings:
                 f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read"
             )
         length = check_integer("innovation_length", self.innovation_length, 1)
-        given = self.prior_covariance
-        covariance = None if given is None else real_number("prior_covariance", given)
+        covariance_value = self.prior_covariance
+        covariance = None if covariance_value is None else real_number("prior_covariance", covariance_value)
         if covariance is not None and not 0 < covariance < math.inf:
             raise ModelError(
                 f"{setting('prior_covariance')} {self.prior_covariance!r} is not positive; a large one is a weak prior"

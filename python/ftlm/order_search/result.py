@@ -98,37 +98,37 @@ class OrderCertificate:
         """Return a dictionary for JSON."""
         proof = ("lower_bound", "best", "proved_tolerance", "requested_tolerance", "orders", "intervals")
         options = ("min_separation", "max_term_ratio", "cells", "open_cells", "m")
-        told = attributes(self, (*proof, *options, "free_run_nr", "start_errors", "beatable", "findings"))
-        return told if self.orders else told | {"best": None}
+        attributes_shown = attributes(self, (*proof, *options, "free_run_nr", "start_errors", "beatable", "findings"))
+        return attributes_shown if self.orders else attributes_shown | {"best": None}
 
     def __str__(self) -> str:
-        given = [
+        lines = [
             f"start {k}: {error:.5g}, {'may still be beaten' if open_ else 'is not beaten by more than that'}"
             for k, (error, open_) in enumerate(zip(self.start_errors, self.beatable, strict=True))
         ]
-        return "\n".join([self._bound_text, *given, *(f"! {f}; {f.remedy}" for f in self.findings)])
+        return "\n".join([self._bound_text, *lines, *(f"! {f}; {f.remedy}" for f in self.findings)])
 
     @property
     def _bound_text(self) -> str:
         intervals = ", ".join(f"{n} from {low:g} to {high:g}" for n, (low, high) in self.intervals.items())
         separation = f"{self.min_separation:g}"
-        apart = f"orders of the output {separation} below its highest, of one signal {separation} apart"
-        found = ", ".join(f"{name} {value:.5g}" for name, value in self.orders.items())
+        separations = f"orders of the output {separation} below its highest, of one signal {separation} apart"
+        orders_text = ", ".join(f"{name} {value:.5g}" for name, value in self.orders.items())
         cells = f"{self.cells} boxes of orders"
         if self.lower_bound == 0:
             return (
-                f"certificate: nothing is proved of all orders with {intervals} ({apart}): {self.open_cells} of "
+                f"certificate: nothing is proved of all orders with {intervals} ({separations}): {self.open_cells} of "
                 f"{cells} are "
                 "left; narrow the intervals, keep orders farther apart, or allow more boxes"
             )
         # Rounded up: a share that is said must be true.
         share = math.ceil(1000 * self.proved_tolerance - 1e-4) / 10
         text = (
-            f"certificate: no orders with {intervals} ({apart}), on the order grid or between, have an RMS "
+            f"certificate: no orders with {intervals} ({separations}), on the order grid or between, have an RMS "
             f"equation error "
             f"below {self.lower_bound:.5g} with coefficients whose terms are together at most "
             f"{self.max_term_ratio:g} times the "
-            f"output; {found} leave {self.best:.5g}, so nothing is better by more than {share:g} % ({cells})"
+            f"output; {orders_text} leave {self.best:.5g}, so nothing is better by more than {share:g} % ({cells})"
         )
         if self.open_cells:
             text += (
@@ -238,10 +238,10 @@ class SearchResult:
     @property
     def excluded_summary(self) -> str:
         """Text with the counts of the excluded candidates, by reason."""
-        told = {reason: f"{count} {reason}" for reason, count in self.exclusion_counts.items() if count}
+        texts = {reason: f"{count} {reason}" for reason, count in self.exclusion_counts.items() if count}
         if self.excluded_by_box:
-            told["bound"] += f" ({self.excluded_by_box} of them in boxes excluded whole)"
-        return "".join(f", {words}" for words in told.values())
+            texts["bound"] += f" ({self.excluded_by_box} of them in boxes excluded whole)"
+        return "".join(f", {words}" for words in texts.values())
 
     def to_frame(self) -> Any:
         """Return the ranked table as a pandas frame, by rank."""
@@ -430,13 +430,13 @@ def search_top(name: str, search: SearchResult, *, rows: int = 10) -> Table:
     law = len(search.model.equations) > 1
     score = {"l1": "error (45)", "l2": "RMSE"}.get(search.settings["norm"], "score")
     orders, coefficients = list(search.orders), list(search.coefficients)
-    kept = search.table[:rows]
+    rows_shown = search.table[:rows]
     return Table(
-        f"Best {len(kept)} of {number(search.candidates)} candidates: {_search_name(name)}",
+        f"Best {len(rows_shown)} of {number(search.candidates)} candidates: {_search_name(name)}",
         ("rank", "score" if law else score, *map(symbol_html, orders), *map(symbol_html, coefficients)),
         [
             [r.rank, r.score, *(Exact(r.orders[n]) for n in orders), *(r.coefficients[n] for n in coefficients)]
-            for r in kept
+            for r in rows_shown
         ],
         groups=(("", 2), ("orders", len(orders)), ("coefficients", len(coefficients))),
         note=f"The score is the sum over the equations of each one's {score}, divided by the spread of its output."
@@ -449,13 +449,13 @@ def _search_name(name: str) -> str:
     return "whole stage, under its order law" if name == "stage" else symbol(name)
 
 
-def search_html(found: SearchResult) -> str:
+def search_html(result: SearchResult) -> str:
     """Return the best rows of an order search and the counts of the excluded candidates."""
-    rows: list[list[Cell]] = [["kept", len(found.table)]]
-    for reason, count in found.exclusion_counts.items():
+    rows: list[list[Cell]] = [["kept", len(result.table)]]
+    for reason, count in result.exclusion_counts.items():
         rows.append([reason, count])
-        if reason == "bound" and found.excluded_by_box:
-            rows.append(["of these in boxes excluded whole", found.excluded_by_box])
-    name = found.model.outputs[0] if len(found.model.outputs) == 1 else "stage"
-    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows)
-    return str(search_top(name, found).to_html() + rest.to_html())
+        if reason == "bound" and result.excluded_by_box:
+            rows.append(["of these in boxes excluded whole", result.excluded_by_box])
+    name = result.model.outputs[0] if len(result.model.outputs) == 1 else "stage"
+    rest = Table(f"{result.candidates} candidates", ("became of them", "count"), rows)
+    return str(search_top(name, result).to_html() + rest.to_html())

@@ -99,9 +99,9 @@ def free_run_score(
         return math.inf
     score = 0.0
     for name, scale in zip(model.outputs, scales, strict=True):
-        left = np.concatenate([e[name] for e in errors])
+        residuals = np.concatenate([e[name] for e in errors])
         with np.errstate(over="ignore", invalid="ignore"):
-            own = float(np.abs(left).sum()) if norm == "l1" else math.sqrt(float(np.mean(left**2)))
+            own = float(np.abs(residuals).sum()) if norm == "l1" else math.sqrt(float(np.mean(residuals**2)))
         score += own / scale
     return score if math.isfinite(score) else math.inf
 
@@ -167,7 +167,7 @@ class Job:
     def of(cls, request: Request, threads: int, progress: ProgressCallback | None) -> Job:
         """Restore a job from a checkpoint file; raise ModelError for an invalid request."""
         try:
-            kept: dict[str, Any] = {f.name: request.settings[f.name] for f in fields(SearchSettings)}
+            settings: dict[str, Any] = {f.name: request.settings[f.name] for f in fields(SearchSettings)}
         except KeyError as error:
             raise ModelError(f"setting {error} is missing") from None
         records = list(request.records)
@@ -182,7 +182,14 @@ class Job:
         if any(n not in request.values for n in structure.order_names):
             raise ModelError("an order has no values")
         return cls(
-            request.runs, request.units, structure, request.values, records, SearchSettings(**kept), threads, progress
+            request.runs,
+            request.units,
+            structure,
+            request.values,
+            records,
+            SearchSettings(**settings),
+            threads,
+            progress,
         )
 
     def _common_arguments(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, SearchSettings, int]:
@@ -265,16 +272,16 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
     """
     settings = job.settings
     if job.structure.has_nonlinear_terms and settings.criterion == "output-error":
-        kept = max(settings.top, FREE_RUN_CANDIDATES)
-        first = replace(job, settings=replace(settings, criterion="equation-error", top=kept))
-        found = run_job(first, store=store, number=number, executor=executor)
-        table = rank_by_free_runs(found.table, job.structure, job.records, settings.norm, job.scales())
-        counts = {"candidates": found.candidates, "kept": min(settings.top, len(table)), **found.exclusion_counts}
-        counts["diverged"] += len(found.table) - len(table)
+        count = max(settings.top, FREE_RUN_CANDIDATES)
+        first = replace(job, settings=replace(settings, criterion="equation-error", top=count))
+        ranked = run_job(first, store=store, number=number, executor=executor)
+        table = rank_by_free_runs(ranked.table, job.structure, job.records, settings.norm, job.scales())
+        counts = {"candidates": ranked.candidates, "kept": min(settings.top, len(table)), **ranked.exclusion_counts}
+        counts["diverged"] += len(ranked.table) - len(table)
         counts["beaten"] += len(table) - counts["kept"]
-        counted = cast("_core._Counts", counts)
-        result = _result(job, table[: settings.top], found.failures, counted, found.excluded_by_box)
-        return replace(result, free_runs=len(found.table))
+        totals = cast("_core._Counts", counts)
+        result = _result(job, table[: settings.top], ranked.failures, totals, ranked.excluded_by_box)
+        return replace(result, free_runs=len(ranked.table))
     if job.structure.has_order_law:
         stage = search_coupled(
             job.coupled_problem(), store=store, number=number, executor=executor, progress=job.progress
@@ -289,7 +296,7 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
     return _result(job, *_equation_rows(job.structure, one), one["counts"], one["boxed"])
 
 
-def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[SearchRow], Failures]:
+def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[SearchRow], Failures]:
     """Return rows and failures of one equation, by names of orders and coefficients."""
     item = structure.equations[0]
 
@@ -305,20 +312,20 @@ def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[Sear
             orders_by_name(row["alpha"], row["orders"]),
             named_coefficients(item, row["coefficients"]),
         )
-        for rank, row in enumerate(found["rows"], 1)
+        for rank, row in enumerate(answer["rows"], 1)
     ]
-    return table, [(orders_by_name(alpha, orders), str(reason)) for _, alpha, orders, reason in found["failures"]]
+    return table, [(orders_by_name(alpha, orders), str(reason)) for _, alpha, orders, reason in answer["failures"]]
 
 
-def _stage_rows(structure: Structure, found: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
+def _stage_rows(structure: Structure, answer: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
     """Return rows and failures of a coupled search, by names of free orders and of all coefficients."""
     names, table = structure.order_names, []
-    for rank, (index, score, free, parts) in enumerate(found["rows"], 1):
+    for rank, (index, score, free, parts) in enumerate(answer["rows"], 1):
         coefficients: dict[str, float] = {}
         for item, (_, _, _, c, _) in zip(structure.equations, parts, strict=True):
             coefficients |= named_coefficients(item, c)
         table.append(SearchRow(rank, index, score, dict(zip(names, free, strict=True)), coefficients))
-    return table, [(dict(zip(names, free, strict=True)), str(reason)) for _, free, reason in found["failures"]]
+    return table, [(dict(zip(names, free, strict=True)), str(reason)) for _, free, reason in answer["failures"]]
 
 
 def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core._Counts, boxed: int) -> SearchResult:
@@ -357,15 +364,15 @@ def rank_orders(
     **settings: Any,
 ) -> SearchResult:
     """Return the table of an order search without a verdict; see :func:`ftlm.search_orders`."""
-    chosen = SearchSettings(**settings)
+    search_settings = SearchSettings(**settings)
     check_executor(executor)
     job = make_job(
-        runs, equation, order_grid, chosen, m=m, threads=threads_per_task(threads, executor), progress=progress
+        runs, equation, order_grid, search_settings, m=m, threads=threads_per_task(threads, executor), progress=progress
     )
     if store is None:
         return run_job(job, executor=executor)
-    with Store(store, [job.request(job.name)]) as kept:
-        return run_job(job, store=kept, executor=executor)
+    with Store(store, [job.request(job.name)]) as open_store:
+        return run_job(job, store=open_store, executor=executor)
 
 
 def make_job(
@@ -394,9 +401,9 @@ def make_job(
         )
     check_order_grid(order_grid)
     values = (order_grid or OrderGrid()).values(equation)
-    known = {n: v[0] for n, v in values.items() if len(v) == 1}
+    order_values = {n: v[0] for n, v in values.items() if len(v) == 1}
     for run in checked:
-        check_derivative_orders(run, equation, known)
+        check_derivative_orders(run, equation, order_values)
     records = prepare(checked, equation, m, power_of_two=settings.needs_haar)
     units = {n: u for n, u in checked[0].units.items() if n in equation.signals}
     names = tuple(r.name for r in checked)
@@ -527,7 +534,7 @@ def _core_callback(progress: Callable[[int, int], None] | None) -> ProgressCallb
     """Return the callback of the core: a progress bar gets the excluded fraction too, other callables do not."""
     if progress is None or isinstance(progress, Progress):
         return progress
-    return lambda done, total, _pruned: progress(done, total)
+    return lambda count, total, _pruned: progress(count, total)
 
 
 @check_arguments
@@ -605,9 +612,9 @@ def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = N
         return
     least = most = 0.0
     for number, job in enumerate(jobs):
-        left = 1.0 if store is None else _remaining_fraction(job, store, number)
-        low, high = expected_seconds(job) if left > 0 else (0.0, 0.0)
-        least, most = least + left * low, most + left * high
+        fraction = 1.0 if store is None else _remaining_fraction(job, store, number)
+        low, high = expected_seconds(job) if fraction > 0 else (0.0, 0.0)
+        least, most = least + fraction * low, most + fraction * high
     progress.expect("the search", least, most)
 
 
@@ -617,38 +624,38 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
     Takes up to a tenth of the search or half a second, whichever is less.
     """
     whole = _candidates(job)
-    tried: list[tuple[float, float]] = []
+    trials: list[tuple[float, float]] = []
     for every in SUBSAMPLING_FACTORS:
         part = replace(job, values={name: axis[::every] for name, axis in job.values.items()}, progress=None)
         try:
             count = _candidates(part)
-            if tried and count <= tried[-1][0]:
+            if trials and count <= trials[-1][0]:
                 continue
             if count > MAX_PROBE_FRACTION * whole:
                 break
-            begun = clock()
+            start_time = clock()
             (part.coupled_problem() if job.structure.has_order_law else part.equation_problem()).search(None)
         except FtlmError:
             # So coarse a lattice may have no candidate, or none with a finite score.
             continue
-        tried.append((count, clock() - begun))
-        if tried[-1][1] >= PROBE_TIME_S:
+        trials.append((count, clock() - start_time))
+        if trials[-1][1] >= PROBE_TIME_S:
             break
-    if not tried:
+    if not trials:
         return 0.0, 0.0
-    (count, took), power = tried[-1], TIME_EXPONENT_RANGE[1]
-    if len(tried) > 1 and tried[-2][1] > 0:
-        power = math.log(max(took / tried[-2][1], 1e-9)) / math.log(count / tried[-2][0])
+    (count, took), power = trials[-1], TIME_EXPONENT_RANGE[1]
+    if len(trials) > 1 and trials[-2][1] > 0:
+        power = math.log(max(took / trials[-2][1], 1e-9)) / math.log(count / trials[-2][0])
         power = min(max(power, TIME_EXPONENT_RANGE[0]), TIME_EXPONENT_RANGE[1])
-    grown = took * (whole / count) ** power
+    extrapolated = took * (whole / count) ** power
     boxed = (
-        grown
+        extrapolated
         if whole < BOX_EXCLUSION_CANDIDATES
         else took
         * (BOX_EXCLUSION_CANDIDATES / count) ** power
         * (whole / BOX_EXCLUSION_CANDIDATES) ** BOX_TIME_EXPONENT
     )
-    return TIME_FACTOR_RANGE[0] * boxed, TIME_FACTOR_RANGE[1] * grown
+    return TIME_FACTOR_RANGE[0] * boxed, TIME_FACTOR_RANGE[1] * extrapolated
 
 
 def _candidates(job: Job) -> float:

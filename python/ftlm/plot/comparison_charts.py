@@ -58,7 +58,7 @@ def comparison_charts(
     bands
         Lower and upper end of a 95 % band of the simulated output of the only run, by output.
     """
-    known = bands or {}
+    bands_by_output = bands or {}
     return [
         LineChart(
             pulse_times(comparison, k),
@@ -68,9 +68,9 @@ def comparison_charts(
             y_label=with_unit(symbol(name), units, name),
             points=points,
             slider=True,
-            bands=_behind_measured(known[name]) if name in known else (),
+            bands=_behind_measured(bands_by_output[name]) if name in bands_by_output else (),
             caption=f"Simulation: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
-            + (" Shade: 95 % confidence band of the simulation." if name in known else ""),
+            + (" Shade: 95 % confidence band of the simulation." if name in bands_by_output else ""),
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)
         for name, figures in output_error.items()
@@ -292,22 +292,22 @@ def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label:
     )
 
 
-def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
+def _residual_caption(test: CorrelationTest, values: Floats, signal: str) -> str:
     """Caption of the chart of one test: result and limit; an empty signal means the residual itself."""
     if not test.conclusive:
         why = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
         return f"Whether the residual follows {signal} is undecided: {why}."
     if not np.isfinite(test.statistic):
         return "The residual is not finite, so there are no correlations."
-    outside = int(np.sum(np.abs(drawn) > test.band))
-    bars = f"Shade: 99 % band of one bar; {outside} of {drawn.size} bars leave{'s' if outside == 1 else ''} it."
+    outside = int(np.sum(np.abs(values) > test.band))
+    bars = f"Shade: 99 % band of one bar; {outside} of {values.size} bars leave{'s' if outside == 1 else ''} it."
     if signal:
         word = "could be independent of" if test.passed else "is not independent of"
-        judged = f"largest bar at lags from 0 on {number(test.statistic)}, limit {number(test.limit)}"
-        return f"{bars} The residual {word} earlier {signal}: {judged} (99 %, both through the whitening filter)."
+        result = f"largest bar at lags from 0 on {number(test.statistic)}, limit {number(test.limit)}"
+        return f"{bars} The residual {word} earlier {signal}: {result} (99 %, both through the whitening filter)."
     word = "could be" if test.passed else "is not"
-    judged = f"statistic {number(test.statistic)}, limit {number(test.limit)}"
-    return f"{bars} The residual {word} white noise: {judged} (99 %)."
+    result = f"statistic {number(test.statistic)}, limit {number(test.limit)}"
+    return f"{bars} The residual {word} white noise: {result} (99 %)."
 
 
 def run_charts(run: Run, *signals: str) -> Figures:
@@ -345,14 +345,14 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
     errors, values = np.sqrt(np.diag(spread)), parameter_vector(model)
     if not np.all(np.isfinite(spread)):
         return {}
-    used = np.flatnonzero(errors)
+    rows = np.flatnonzero(errors)
     derivatives: dict[str, list[Floats]] = {name: [] for name in comparison.simulated}
-    for k in used:
+    for k in rows:
         step = DERIVATIVE_STEP_IN_ERRORS * errors[k]
-        moved = values.copy()
-        moved[k] += step
+        shifted = values.copy()
+        shifted[k] += step
         try:
-            beside = compare(with_parameter_vector(model, moved), run)
+            beside = compare(with_parameter_vector(model, shifted), run)
         except FtlmError:
             return {}
         for name, centre in comparison.simulated.items():
@@ -360,7 +360,7 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
     bands = {}
     for name, columns in derivatives.items():
         matrix, middle = np.array(columns), comparison.simulated[name][0]
-        variance = np.einsum("kt,kl,lt->t", matrix, spread[np.ix_(used, used)], matrix)
+        variance = np.einsum("kt,kl,lt->t", matrix, spread[np.ix_(rows, rows)], matrix)
         half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
         if np.all(np.isfinite(half)):
             bands[name] = (middle - half, middle + half)

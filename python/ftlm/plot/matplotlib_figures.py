@@ -76,16 +76,16 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     """Return (figure, grid of rows by columns) from the given axes or a new figure."""
     if ax is None:
         return figure_of(rows, columns, **options)
-    given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
-    strange = [type(a).__name__ for a in given if not hasattr(a, "plot") or not hasattr(a, "figure")]
+    axes_given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
+    strange = [type(a).__name__ for a in axes_given if not hasattr(a, "plot") or not hasattr(a, "figure")]
     if strange:
         raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")
-    if given.size != rows * columns:
+    if axes_given.size != rows * columns:
         raise ModelError(
-            f"this figure has {rows * columns} axes ({rows} by {columns}), and ax has {given.size}; give as many, "
+            f"this figure has {rows * columns} axes ({rows} by {columns}), and ax has {axes_given.size}; give as many, "
             f"such as subplots({rows}, {columns})[1], or leave ax out"
         )
-    return given[0].figure, given.reshape(rows, columns)
+    return axes_given[0].figure, axes_given.reshape(rows, columns)
 
 
 def draw_figure(rows: Sequence[Sequence[Figure]], ax: Any, **options: Any) -> Any:
@@ -270,7 +270,7 @@ def fit(
             comparison = result.comparison
         else:
             raise ModelError("a model alone has nothing to be compared with; give runs")
-    shown = _runs_of(result, runs) if inputs else []
+    runs_of_result = _runs_of(result, runs) if inputs else []
     pairs = zip(comparison_charts(comparison, units=units), residual_rows(comparison, units=units), strict=True)
     charts, heights = [], []
     for k in range(len(comparison.per_run)):
@@ -280,7 +280,7 @@ def fit(
                 replace(lower, title="", y_label="residual"),
             ]
             heights += [1.0, RESIDUAL_HEIGHT_SHARE]
-        own = [signal_chart(shown[k], name) for name in shown[k].inputs] if inputs else []
+        own = [signal_chart(runs_of_result[k], name) for name in runs_of_result[k].inputs] if inputs else []
         charts += own
         heights += [0.7] * len(own)
     return draw_figure([[chart] for chart in charts], ax, row=ROW_HEIGHT_INCH * 0.75, height_ratios=heights)
@@ -342,12 +342,12 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     ModelError
         An identification whose runs were too short for tests, something that is not a result, or no matplotlib.
     """
-    found = tests.residuals if isinstance(tests, Identification) else tests
-    if found is None:
+    results = tests.residuals if isinstance(tests, Identification) else tests
+    if results is None:
         raise ModelError("the runs were too short for residual tests, so there is nothing to draw")
     rows = [
         [correlation_chart(*each, label=each[-1].verdict) for each in tests_of_one]
-        for _, tests_of_one in groupby(found.tests, key=lambda each: each[0])
+        for _, tests_of_one in groupby(results.tests, key=lambda each: each[0])
     ]
     return draw_figure(rows, ax)
 
@@ -376,9 +376,9 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         An identification without a search, or without that one; fewer than two free orders; no matplotlib.
     """
     if not isinstance(result, Identification):
-        found: Landscape | None = result
+        surface: Landscape | None = result
     elif result.joint is not None:
-        found = output_error_landscape(result)
+        surface = output_error_landscape(result)
     else:
         if not result.searches or result.task is None:
             raise ModelError("this identification searched no order grid, so it has no landscape")
@@ -386,10 +386,10 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         if name not in result.searches:
             raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")
         part = result.task.structure if name == "stage" else result.task.structure.equation(name)
-        found = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
-    if found is None:
+        surface = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
+    if surface is None:
         raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
-    return draw_figure([[found]], ax, row=3.2)
+    return draw_figure([[surface]], ax, row=3.2)
 
 
 @check_arguments
@@ -486,9 +486,12 @@ def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax:
     return _response_figure(_model_of(model).impulse(time), ax)
 
 
-def _response_figure(found: TimeResponse, ax: Any) -> Any:
-    inputs = range(len(found.inputs))
-    charts = [[response_chart(found, i, j, found.units) for j in inputs] for i in range(len(found.outputs))]
+def _response_figure(time_responses: TimeResponse, ax: Any) -> Any:
+    inputs = range(len(time_responses.inputs))
+    charts = [
+        [response_chart(time_responses, i, j, time_responses.units) for j in inputs]
+        for i in range(len(time_responses.outputs))
+    ]
     return draw_figure(charts, ax)
 
 

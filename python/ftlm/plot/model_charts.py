@@ -72,9 +72,9 @@ def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
 def pole_points(model: Model) -> tuple[float, Complex]:
     """Order q of the plane s^q and the poles in it with their conjugates; empty for a model that is not linear."""
     q = plane_order(model)
-    found = modes(model) if model.structure.is_linear else ()
+    model_modes = modes(model) if model.structure.is_linear else ()
     points = []
-    for m in found:
+    for m in model_modes:
         angle = math.acos(max(-1.0, min(1.0, -m.damping)))
         # Beyond the negative axis of s a relaxation of fractional order stands on the one of s^q.
         turn = math.pi if not m.oscillatory and not m.unstable else q * angle
@@ -97,10 +97,12 @@ def pole_charts(model: Model) -> list[PlaneChart]:
     q, points = pole_points(model)
     if not points.size:
         return []
-    found = modes(model)
+    model_modes = modes(model)
     plane = "s" if q == 1 else f"s^{q:.4g}"
-    inside = sum(m.unstable for m in found)
-    words = "it has no pole" if not inside else f"it has {inside} of {len(found)} modes, so the model is not stable"
+    inside = sum(m.unstable for m in model_modes)
+    words = (
+        "it has no pole" if not inside else f"it has {inside} of {len(model_modes)} modes, so the model is not stable"
+    )
     caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, the unstable sector; {words}."
     if q != 1:
         caption += f" A relaxation is drawn at −T^−{q:.4g}."
@@ -196,21 +198,21 @@ def bode(model: Model, w: ArrayLike | None = None) -> Bode:
 
 
 @check_arguments
-def response_charts(found: Response, *, units: Mapping[str, str] | None = None) -> list[LineChart]:
+def response_charts(result: Response, *, units: Mapping[str, str] | None = None) -> list[LineChart]:
     """Return step or impulse response charts of every connected pair of input and output, with 95 % bands.
 
     Parameters
     ----------
-    found
+    result
         Responses, sample times and standard deviations.
     units
         Units of the signals by name.
     """
     return [
-        response_chart(found, i, j, units or {})
-        for i in range(len(found.outputs))
-        for j, signal in enumerate(found.inputs)
-        if np.any(found.values[i, j]) and not signal.startswith(COULOMB_PREFIX)
+        response_chart(result, i, j, units or {})
+        for i in range(len(result.outputs))
+        for j, signal in enumerate(result.inputs)
+        if np.any(result.values[i, j]) and not signal.startswith(COULOMB_PREFIX)
     ]
 
 
@@ -272,5 +274,5 @@ class TimeResponse(Response):
 
 def time_response(model: Model, time: ArrayLike | None, kind: str) -> TimeResponse:
     """Return a step or impulse response of a model with charts; see :meth:`ftlm.Model.step`."""
-    found = response(model, time, kind=kind)
-    return TimeResponse(**vars(found), units=dict(model.units))
+    result = response(model, time, kind=kind)
+    return TimeResponse(**vars(result), units=dict(model.units))

@@ -71,29 +71,29 @@ MOST_FIGURES = 9
 _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
-def verdict_box(judged: Verdict, of: str = "") -> Markup:
+def verdict_box(judgement: Verdict, of: str = "") -> Markup:
     """Return a verdict as the first box of a page; `of` names the model if there are several."""
-    remedy = Markup(' <span class="todo">→ {}</span>').format(judged.remedy) if judged.remedy else ""
+    remedy = Markup(' <span class="todo">→ {}</span>').format(judgement.remedy) if judgement.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
-        _LEVEL_CSS_CLASSES[judged.level],
-        f"{of}{judged.level}" if of else judged.level.capitalize(),
-        judged.reason[0].upper() + judged.reason[1:],
+        _LEVEL_CSS_CLASSES[judgement.level],
+        f"{of}{judgement.level}" if of else judgement.level.capitalize(),
+        judgement.reason[0].upper() + judgement.reason[1:],
         remedy,
     )
 
 
 def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
     """Split findings into the most serious groups, with remedies, and the sentences of the others."""
-    shown: list[str] = []
-    left: list[str] = []
+    first: list[str] = []
+    rest: list[str] = []
     for k, group in enumerate(group_findings(findings)):
         if k >= MAX_SUMMARY_FINDINGS:
-            left += texts(group.findings)
+            rest += texts(group.findings)
             continue
         todo = Markup(' <span class="todo">→ {}</span>').format(group.remedy) if group.remedy else Markup("")
-        shown.append(Markup("{}{}{}").format(group.first_finding.text, group.count, todo))
-        left += texts(group.findings[1:])
-    return shown, left
+        first.append(Markup("{}{}{}").format(group.first_finding.text, group.count, todo))
+        rest += texts(group.findings[1:])
+    return first, rest
 
 
 def _on_validation(findings: Iterable[Finding], run: Run) -> list[Finding]:
@@ -117,8 +117,8 @@ def behavior_tables(model: Model) -> list[Table]:
         return []
     tables = []
     try:
-        found = modes(model)
-        grows = any(mode.unstable for mode in found)
+        model_modes = modes(model)
+        grows = any(mode.unstable for mode in model_modes)
         states = () if grows or model.structure.limits else steady_states(model)
     except FtlmError:
         # Equations that cannot be solved for their outputs together have neither.
@@ -140,7 +140,7 @@ def behavior_tables(model: Model) -> list[Table]:
         tables.append(
             Table("Steady state under a unit step", ("output", "value", "standard error", "unit", "what it is"), rows)
         )
-    if found:
+    if model_modes:
         rows = [
             [
                 f"{k + 1}",
@@ -154,7 +154,7 @@ def behavior_tables(model: Model) -> list[Table]:
                 m.time_constant if math.isfinite(m.time_constant) else "∞",
                 m.time_constant_error,
             ]
-            for k, m in enumerate(found)
+            for k, m in enumerate(model_modes)
         ]
         note = (
             "The time constant is 1/|Re s| of an oscillation and 1/|s| of a relaxation; standard errors are to "
@@ -230,7 +230,7 @@ def identification_page(
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
     tests += tests_on(model, others)
     pooled = validate(result, others) if len(others) > 1 else validated[0] if validated else None
-    judged = verdict(result, pooled)
+    judgement = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
     bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
@@ -246,7 +246,12 @@ def identification_page(
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
     sections += [replace(section, collapsed=True) for section in details]
     return write_page(
-        path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
+        path,
+        title=title_of(model),
+        sections=sections,
+        lead=lead_of(compared),
+        force=force,
+        verdict=verdict_box(judgement),
     )
 
 
@@ -272,7 +277,7 @@ def first_sections(
     if not validated:
         words.append("No validation run was given, so the prediction of other data is unknown.")
     warned = unique(findings)
-    shown, left = first_findings(warned)
+    findings_shown, rest = first_findings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(MAX_LINE_POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
@@ -282,11 +287,11 @@ def first_sections(
         stability_note(model),
     ]
     validated_on = [(label, c) for label, c in compared if label == "validation"]
-    fitted = [(label, c) for label, c in compared if label != "validation"]
+    fits = [(label, c) for label, c in compared if label != "validation"]
     left_runs = list(runs)
-    known = _with_inputs(model, fitted, left_runs, points)
+    figures_with_inputs = _with_inputs(model, fits, left_runs, points)
     new = _with_inputs(model, validated_on, left_runs, points, bands)
-    first = new or known
+    first = new or figures_with_inputs
     sections = []
     if first:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table of errors has every run."
@@ -294,15 +299,15 @@ def first_sections(
         sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
     sections += [
         Section("Equations", equations, tables=[parameter_table(model, joint)]),
-        Section("Warnings", words[1:] if warned else words, shown, more=left),
+        Section("Warnings", words[1:] if warned else words, findings_shown, more=rest),
     ]
     if figures := behavior_figures(model):
         tables = behavior_tables(model)
         sections.append(Section("Gain, modes and steps", tables=tables, figures=figures, small=True, collapsed=True))
     if compared:
         sections.append(Section("Errors", tables=[errors_table(compared, units=units)], collapsed=True))
-    if new and known:
-        figures = known[: max(PAGE_CHARTS - len(new), 0)]
+    if new and figures_with_inputs:
+        figures = figures_with_inputs[: max(PAGE_CHARTS - len(new), 0)]
         sections.append(Section("Estimation: measured and simulated", figures=figures, collapsed=True))
     return sections
 
@@ -319,16 +324,16 @@ def _with_inputs(
     Takes the runs of the comparisons from the front of `runs`.
     """
     inputs = [s for s in model.structure.signals if s not in model.outputs]
-    drawn: list[Figure] = []
+    charts: list[Figure] = []
     for place, (label, comparison) in enumerate(compared):
         band = bands[place] if place < len(bands) else {}
         figures = comparison_charts(comparison, units=model.units, label=label, points=points, bands=band)
         for k, (name, _, _) in enumerate(comparison.per_run):
-            here = len(comparison.output_error)
-            drawn += figures[k * here : (k + 1) * here]
+            output_count = len(comparison.output_error)
+            charts += figures[k * output_count : (k + 1) * output_count]
             if runs and runs[0].name == name:
-                drawn += input_charts([runs.pop(0)], inputs, points=max(points // 2, 4))
-    return drawn
+                charts += input_charts([runs.pop(0)], inputs, points=max(points // 2, 4))
+    return charts
 
 
 def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
@@ -380,8 +385,8 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     words = "Exact, orders as they are; the equations together, from what is not modelled."
     if model.estimate is None or model.estimate.covariance is None:
-        told = model.estimate is None or None not in model.estimate.standard_errors.values()
-        lacking = "This estimator gives no covariance" if told else "The runs do not identify all parameters"
+        has_errors = model.estimate is None or None not in model.estimate.standard_errors.values()
+        lacking = "This estimator gives no covariance" if has_errors else "The runs do not identify all parameters"
         words += f" {lacking}, so there are no bands."
     return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
 
@@ -434,9 +439,9 @@ def _traces(result: Identification) -> list[LineChart]:
         return []
     if "offset" in result.settings:
         return []
-    run, used = result.task.runs[0], result.settings
-    every = max(1, int(used["m"]) // TRACE_POINTS)
-    options = {n: used[n] for n in ("prior_covariance", "row_basis", "m")}
+    run, settings = result.task.runs[0], result.settings
+    every = max(1, int(settings["m"]) // TRACE_POINTS)
+    options = {n: settings[n] for n in ("prior_covariance", "row_basis", "m")}
     figures = []
     for solved in result.model.equations:
         single = result.task.structure.equation(solved.output)
@@ -448,7 +453,7 @@ def _traces(result: Identification) -> list[LineChart]:
             continue
         traces = [
             (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=every, **options))
-            for p in sorted({*COMPARED_INNOVATION_LENGTHS, int(used["innovation_length"])})
+            for p in sorted({*COMPARED_INNOVATION_LENGTHS, int(settings["innovation_length"])})
         ]
         figures.append(trace_chart(traces, title=f"Error (45) of {symbol(solved.output)}, run {run.name}"))
     return figures
@@ -470,9 +475,9 @@ def estimates_table(result: Identification | None, truth: Mapping[str, float] | 
     if result is not None and result.joint is not None:
         for name, value in {**result.orders, **result.joint.coefficients}.items():
             low, high = result.intervals[name]
-            known = [truth.get(name)] if truth else []
+            true_value = [truth.get(name)] if truth else []
             spread = [v if math.isfinite(v) else format_bound(v) for v in (result.standard_errors[name], low, high)]
-            rows.append([symbol_html(name), value, *spread, *known])
+            rows.append([symbol_html(name), value, *spread, *true_value])
     columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
     if truth:
         columns, groups = [*columns, "true value"], [*groups, ("", 1)]
@@ -554,11 +559,11 @@ def identification_html(result: Identification) -> str:
             for o, white in result.residuals.white.items()
         ]
         parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
-    shown, left = first_findings(result.findings)
-    parts.append(warnings_html(shown))
-    if left:
+    first, rest = first_findings(result.findings)
+    parts.append(warnings_html(first))
+    if rest:
         folded = Markup("<details><summary>{} more warning{}</summary>{}</details>")
-        parts.append(folded.format(len(left), "" if len(left) == 1 else "s", warnings_html(left)))
+        parts.append(folded.format(len(rest), "" if len(rest) == 1 else "s", warnings_html(rest)))
     return str(Markup("").join(parts))
 
 
@@ -576,15 +581,17 @@ def model_page(
     """
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)
-    known = model.estimate
-    findings = [] if known is None else list(known.known_findings)
+    estimate = model.estimate
+    findings = [] if estimate is None else list(estimate.known_findings)
     validated = [compare(model, run) for run in others]
     for run, comparison in zip(others, validated, strict=True):
-        there = [*comparison.findings, *data_notes(run)]
-        if known is not None:
-            there += validation_fit_findings({n: f for n, f in known.fit.items() if f is not None}, comparison)
-            there += [make_finding("run_of_its_own", run=run.name)] * (run.name in known.runs)
-        findings += _on_validation(there, run)
+        findings_there = [*comparison.findings, *data_notes(run)]
+        if estimate is not None:
+            findings_there += validation_fit_findings(
+                {n: f for n, f in estimate.fit.items() if f is not None}, comparison
+            )
+            findings_there += [make_finding("run_of_its_own", run=run.name)] * (run.name in estimate.runs)
+        findings += _on_validation(findings_there, run)
     compared = [("validation", comparison) for comparison in validated]
     bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
     sections = first_sections(model, findings, compared, bool(others), None, others, bands)
@@ -596,14 +603,19 @@ def model_page(
         ["structure", model.structure.name],
         ["coupling in simulations", model.structure.coupling],
     ]
-    if known is not None:
-        about += [["estimator", known.method], ["identified from", ", ".join(known.runs)]]
-        about += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in known.fit.items()]
-        about += [[n.upper().replace("AICC", "AICc"), v] for n, v in known.information.items()]
+    if estimate is not None:
+        about += [["estimator", estimate.method], ["identified from", ", ".join(estimate.runs)]]
+        about += [[Markup("fit of {} there, %").format(symbol_html(n)), f] for n, f in estimate.fit.items()]
+        about += [[n.upper().replace("AICC", "AICc"), v] for n, v in estimate.information.items()]
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
     details.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
     sections += [replace(section, collapsed=True) for section in details]
-    judged = saved_verdict(model, validated)
+    judgement = saved_verdict(model, validated)
     return write_page(
-        path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
+        path,
+        title=title_of(model),
+        sections=sections,
+        lead=lead_of(compared),
+        force=force,
+        verdict=verdict_box(judgement),
     )

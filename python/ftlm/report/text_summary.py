@@ -30,8 +30,8 @@ MOST_MODES = 6
 
 def summary(result: Identification, validation: Comparison | None = None) -> str:
     """Return the summary of a result as text."""
-    judged = verdict(result, validation)
-    lines = [*wrap_text(str(judged)), ""]
+    judgement = verdict(result, validation)
+    lines = [*wrap_text(str(judgement)), ""]
     lines += equation_lines(result.model, result.comparison)
     lines += ["", *parameter_lines(result), *behavior_lines(result.model), ""]
     lines += [*fit_lines(result, validation), *_residuals(result), *_starts(result)]
@@ -46,8 +46,8 @@ def equation_lines(model: Model, comparison: Comparison | None = None) -> list[s
     structure = model.structure
     lines = []
     for item in model.equations:
-        known = _offset(item.output, comparison)
-        tail = structure.offset_in_words if known is None else known
+        offset = _offset(item.output, comparison)
+        tail = structure.offset_in_words if offset is None else offset
         lines.append(format_equation(_readable(item), structure.describe_inputs(".6g")) + tail)
     return lines
 
@@ -68,19 +68,19 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
     if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
         return None
     parts = comparison.offsets[0][output]
-    written = [(parts[name], tail) for name, tail in (("constant", ""), ("ramp", " t")) if name in parts]
-    return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
+    parts_with_units = [(parts[name], tail) for name, tail in (("constant", ""), ("ramp", " t")) if name in parts]
+    return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in parts_with_units)
 
 
 def parameter_lines(result: Identification) -> list[str]:
     """Return orders and coefficients with standard errors, units and nominal values, one line each."""
-    errors, stated = result.standard_errors, result.model.structure.reference
+    errors, reference = result.standard_errors, result.model.structure.reference
     rows = []
     for name, p in result.parameters.items():
         spread = f"± {format_bound(p.standard_error)}" if name in errors else "fixed" if p.fixed else ""
         tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
-        if name in stated:
-            tail = f"{tail}  (stated {stated[name]:.6g})".strip()
+        if name in reference:
+            tail = f"{tail}  (stated {reference[name]:.6g})".strip()
         rows.append((name, f"{p.value:.6g}", spread, p.unit, tail))
     if not rows:
         return []
@@ -100,12 +100,14 @@ def behavior_lines(model: Model) -> list[str]:
     lines: list[str] = []
     # Equations that cannot be solved for their outputs together have neither; everything else can be told.
     with contextlib.suppress(FtlmError):
-        found = modes(model)
-        grows = any(mode.unstable for mode in found)
-        word = "mode" if len(found) == 1 else "modes"
-        lines += [f"  {word if k == 0 else '':<7}{describe_mode(mode)}" for k, mode in enumerate(found[:MOST_MODES])]
-        if len(found) > MOST_MODES:
-            lines.append(f"         and {len(found) - MOST_MODES} faster ones: .model.modes()")
+        model_modes = modes(model)
+        grows = any(mode.unstable for mode in model_modes)
+        word = "mode" if len(model_modes) == 1 else "modes"
+        lines += [
+            f"  {word if k == 0 else '':<7}{describe_mode(mode)}" for k, mode in enumerate(model_modes[:MOST_MODES])
+        ]
+        if len(model_modes) > MOST_MODES:
+            lines.append(f"         and {len(model_modes) - MOST_MODES} faster ones: .model.modes()")
         if not (grows or model.structure.limits):
             lines = [f"  {'gain':<7}{describe_gain(s, model)}" for s in steady_states(model)] + lines
     return lines
@@ -138,9 +140,11 @@ def describe_order(state: SteadyState) -> str:
     if not error:
         return ""
     whole = float(round(state.order))
-    told = abs(state.order - whole) > NORMAL_95 * error
+    is_determined = abs(state.order - whole) > NORMAL_95 * error
     meaning = {0.0: "a gain", 1.0: "an integrator"}.get(whole, f"order {whole:g}")
-    return f"; order {with_error(state.order, error)}" + ("" if told else f", which may be {whole:g}: {meaning}")
+    return f"; order {with_error(state.order, error)}" + (
+        "" if is_determined else f", which may be {whole:g}: {meaning}"
+    )
 
 
 def fit_lines(result: Identification, validation: Comparison | None) -> list[str]:
@@ -167,9 +171,9 @@ def _residuals(result: Identification) -> list[str]:
 def _starts(result: Identification) -> list[str]:
     """Return lines on offsets outside the equations, and on runs with nonzero initial conditions."""
     comparison = result.comparison
-    shown = {o for o in result.output_error if _offset(o, comparison) is not None}
-    hidden = any(o not in shown or "level" in run[o] for run in comparison.offsets for o in run)
-    lines = describe_offsets(comparison) if hidden else []
+    visible = {o for o in result.output_error if _offset(o, comparison) is not None}
+    has_hidden_offset = any(o not in visible or "level" in run[o] for run in comparison.offsets for o in run)
+    lines = describe_offsets(comparison) if has_hidden_offset else []
     moving = "" if comparison.offsets else describe_initial_terms(comparison)
     if moving and not any(f.code == "runs_split" for f in result.findings):
         lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {moving}")
@@ -178,15 +182,15 @@ def _starts(result: Identification) -> list[str]:
 
 def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[str]:
     """Return up to three groups of findings with remedies, most serious first."""
-    found = group_findings(findings)
+    groups = group_findings(findings)
     lines = []
-    for group in found[:MAX_SUMMARY_FINDINGS]:
+    for group in groups[:MAX_SUMMARY_FINDINGS]:
         lines += wrap_text(
             f"{group.first_finding}{group.count}", "  " if group.first_finding.level == LEVEL_NOTE else "! "
         )
         if group.remedy:
             lines += wrap_text(group.remedy, "  -> ")
-    more = hidden_findings_text(found)
+    more = hidden_findings_text(groups)
     return (
         [*lines, f"  ({more}: {how or choose_text('print(result.details())', '--verbose shows all')})"]
         if more

@@ -133,18 +133,18 @@ def _symbol_math(name: str) -> Markup:
 
 
 def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[InputNonlinearity] = ()) -> Markup:
-    written = _symbol_math(signal)
+    text = _symbol_math(signal)
     if delay > 0:
-        written += _DELAYED_TIME.format(_number_math(_short(delay)), THIN_SPACE)
+        text += _DELAYED_TIME.format(_number_math(_short(delay)), THIN_SPACE)
     for limit in limits:
         if limit.signal == signal and not isinstance(limit.value, tuple):
-            written = _LIMITED_INPUT.format(
-                INPUT_EFFECT_ABBREVIATIONS[limit.law], written, _number_math(_short(float(limit.value)))
+            text = _LIMITED_INPUT.format(
+                INPUT_EFFECT_ABBREVIATIONS[limit.law], text, _number_math(_short(float(limit.value)))
             )
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
-        return written
+        return text
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed_math(order.constant)
-    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN_SPACE, written)
+    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN_SPACE, text)
 
 
 def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
@@ -152,11 +152,11 @@ def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[Input
     shape = term.nonlinear
     if shape is None:
         return _derivative_math(term.order, term.signal, delay.get(term.signal, 0.0), limits)
-    written = _expression_math(shape, delay, limits)
+    text = _expression_math(shape, delay, limits)
     if not term.order.names and round(term.order.constant, ORDER_DECIMALS) == 0:
-        return _IN_PARENTHESES.format(written) if shape.operation == "add" else written
+        return _IN_PARENTHESES.format(text) if shape.operation == "add" else text
     value = Markup("<mi>{}</mi>").format(str(term.order)) if term.order.names else _signed_math(term.order.constant)
-    return Markup("<msup><mi>D</mi>{}</msup>{}").format(value, _IN_PARENTHESES.format(written))
+    return Markup("<msup><mi>D</mi>{}</msup>{}").format(value, _IN_PARENTHESES.format(text))
 
 
 def _expression_math(item: Expression, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
@@ -179,11 +179,11 @@ def _expression_math(item: Expression, delay: Mapping[str, float], limits: Seque
         case "multiply":
             if first.operation == "constant" and first.value == -1.0:
                 parts[0] = Markup("<mo>−</mo>")
-            written = [
+            operand_texts = [
                 _IN_PARENTHESES.format(part) if argument.operation == "add" else part
                 for argument, part in zip(item.arguments, parts, strict=True)
             ]
-            return THIN_SPACE.join(written)
+            return THIN_SPACE.join(operand_texts)
         case "power":
             plain = first.operation == "abs" or (first.operation == "channel" and first.value == 0)
             base = parts[0] if plain else _IN_PARENTHESES.format(parts[0])
@@ -234,18 +234,18 @@ def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
             n: (-math.inf if low is None else low, math.inf if high is None else high)
             for n, (low, high) in saved.items()
         }
-    known = any(e is not None for e in errors.values())
+    has_errors = any(e is not None for e in errors.values())
 
-    def row(name: str, value: float, stated: float | None, place: str) -> list[Cell]:
+    def row(name: str, value: float, reference_value: float | None, place: str) -> list[Cell]:
         error = errors.get(name)
         half = None if error is None else NORMAL_95 * error
         ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
         if name in profiles:
             ends = [v if math.isfinite(v) else format_bound(v) for v in profiles[name]]
-        return [symbol_html(name), value, error, *ends, stated, unit_html(units.get(name, "")), place]
+        return [symbol_html(name), value, error, *ends, reference_value, unit_html(units.get(name, "")), place]
 
-    rows = [row(n, v if known else Exact(v), None, "free order") for n, v in model.orders.items()]
-    shown = set(model.orders)
+    rows = [row(n, v if has_errors else Exact(v), None, "free order") for n, v in model.orders.items()]
+    names = set(model.orders)
     for item in model.equations:
         for term in item.terms:
             if term.name is None:
@@ -253,17 +253,24 @@ def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
             linear = term.nonlinear is None
             derivative = derivative_html(term.order, term.signal) if linear else term.format_operand({})
             place = Markup("of {} in the equation of {}").format(derivative, symbol_html(item.output))
-            stated = reference.get(term.name)
-            shown.add(term.name)
+            reference_value = reference.get(term.name)
+            names.add(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
-            rows.append(row(term.name, float(term.coefficient), None if stated is None else stated + 0.0, place))
+            rows.append(
+                row(
+                    term.name,
+                    float(term.coefficient),
+                    None if reference_value is None else reference_value + 0.0,
+                    place,
+                )
+            )
         if item.friction is not None:
             near = item.friction.stribeck
             of = {item.friction.name: "Coulomb friction"}
             if near is not None:
                 of |= {near.name: "Stribeck friction, beyond Coulomb's at rest,", near.speed_name: "Stribeck's speed"}
             for name, value in item.friction.identified_coefficients.items():
-                shown.add(name)
+                names.add(name)
                 place = Markup("{} in the equation of {}").format(of[name], symbol_html(item.output))
                 rows.append(row(name, value, reference.get(name), place))
     inputs = {input_name("delay", n): (f"delay of {symbol(n)}", v) for n, v in model.structure.delay.items()}
@@ -272,23 +279,25 @@ def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
             inputs[limit.name] = (f"{INPUT_EFFECT_LABELS[limit.law]} of {symbol(limit.signal)}", limit.value)
     inputs = {n: known_of for n, known_of in inputs.items() if n in errors}
     rows += [
-        row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in inputs
+        row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in names and n not in inputs
     ]
     rows += [row(n, v, None, place) for n, (place, v) in inputs.items()]
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
-    if known:
+    if has_errors:
         note = "Intervals assume a right model. A coefficient without one is fixed or given by the law."
         if profiles:
             note += f" Those of {', '.join(map(symbol, profiles))} are by profile likelihood, the others symmetric."
     else:
         note = "No standard errors are given here: this table does not say how many of the digits mean something."
-    left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
+    left_out = ([] if has_errors else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
     if reference:
         note += " Stated values belong to the integer orders of the manufacturer's model."
-    kept = [i for i in range(len(columns)) if i not in left_out]
-    groups = (("", 3), ("95 % interval", 2), ("", len(kept) - 5)) if known else ()
-    shown_rows = [[cells[i] for i in kept] for cells in rows]
-    return Table("Orders and coefficients", tuple(columns[i] for i in kept), shown_rows, groups=groups, note=note)
+    columns_kept = [i for i in range(len(columns)) if i not in left_out]
+    groups = (("", 3), ("95 % interval", 2), ("", len(columns_kept) - 5)) if has_errors else ()
+    shown_rows = [[cells[i] for i in columns_kept] for cells in rows]
+    return Table(
+        "Orders and coefficients", tuple(columns[i] for i in columns_kept), shown_rows, groups=groups, note=note
+    )
 
 
 def unit_html(unit: str) -> Markup:
@@ -304,5 +313,5 @@ def unit_html(unit: str) -> Markup:
 def model_html(model: Model) -> str:
     """Return the equations and parameters of a model as HTML."""
     lines = Markup("").join(Markup("<p>{}</p>").format(e) for e in equations_html(model))
-    known = model.orders or model.coefficients
-    return str(lines + parameter_table(model).to_html() if known else lines)
+    has_values = model.orders or model.coefficients
+    return str(lines + parameter_table(model).to_html() if has_values else lines)

@@ -86,7 +86,7 @@ class ClaimVerdict:
     def counts(self) -> str:
         """Number of cases in which the claim holds, also by level of the deciding factor."""
         name = "K0 = " if self.factors[:1] == ("K0",) else ""
-        parts = "; ".join(f"{name}{level}: {held} of {count}" for level, count, held in self.levels)
+        parts = "; ".join(f"{name}{level}: {holding} of {count}" for level, count, holding in self.levels)
         return f"{self.holding_cases} of {self.cases} cases" + (f"; {parts}" if parts else "")
 
 
@@ -102,13 +102,13 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
     factors whose change alone changes the outcome. A claim about the machine is not decidable by simulation if it
     depends on the arm, or if there is only one arm.
     """
-    held = sum(c.holds for c in cases)
+    holding = sum(c.holds for c in cases)
 
     def outcomes(level_of: Callable[[Mapping[str, str]], Any]) -> dict[Any, list[bool]]:
-        found: dict[Any, list[bool]] = defaultdict(list)
+        outcomes_by_level: dict[Any, list[bool]] = defaultdict(list)
         for c in cases:
-            found[level_of(c.factors)].append(c.holds)
-        return found
+            outcomes_by_level[level_of(c.factors)].append(c.holds)
+        return outcomes_by_level
 
     def flips(name: str) -> int:
         # Pairs of cases that differ in this factor only, and in the outcome.
@@ -118,14 +118,14 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
     def verdict(word: Word, factors: Sequence[str] = (), by: str | None = None) -> ClaimVerdict:
         groups = {} if by is None else outcomes(itemgetter(by))
         levels = tuple((level, len(each), sum(each)) for level, each in groups.items())
-        return ClaimVerdict(word, tuple(factors), len(cases), held, levels)
+        return ClaimVerdict(word, tuple(factors), len(cases), holding, levels)
 
     if not cases:
         return verdict("cannot be told")
     if of_the_machine and len({c.factors.get(ARM_FACTOR) for c in cases}) < 2:
         return verdict("cannot be told from a simulated truth", [ARM_FACTOR])
-    if held in (0, len(cases)):
-        return verdict("holds" if held else "does not hold")
+    if holding in (0, len(cases)):
+        return verdict("holds" if holding else "does not hold")
     names = list(cases[0].factors)
     turning = sorted(filter(flips, names), key=flips, reverse=True)
     if of_the_machine and ARM_FACTOR in turning:
@@ -194,8 +194,8 @@ def _of_angles(holding: Mapping[str, bool], **of: bool) -> ClaimVerdict:
     return combine_cases([case(v, the_angle=symbol(o)) for o, v in holding.items()], **of)
 
 
-def _of_rows(found: Reproduction, holds: Callable[[PrintedModelRun], bool]) -> ClaimVerdict:
-    return combine_cases([case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in found.ran])
+def _of_rows(reproduction: Reproduction, holds: Callable[[PrintedModelRun], bool]) -> ClaimVerdict:
+    return combine_cases([case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in reproduction.ran])
 
 
 def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: bool) -> ClaimVerdict:
@@ -206,11 +206,11 @@ def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: boo
     return combine_cases(cases, **of)
 
 
-def _by_prior(found: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
+def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
     """Format numbers of the trials on the first record of the main arm, by K0 and angle."""
     texts = []
     for prior in PRIOR_COVARIANCES:
-        first = {t.output: numbers(t) for t in reversed(found.panel.trials) if t.prior == prior}
+        first = {t.output: numbers(t) for t in reversed(reproduction.panel.trials) if t.prior == prior}
         texts.append(f"K0 = {prior_text(prior)}: {by_angle({o: first[o] for o in ANGLE_NAMES if o in first}, 4)}")
     return "; ".join(texts)
 
@@ -225,19 +225,19 @@ def _printed_text(
     return by_angle({o: [number(printed.FRACTIONAL_ROWS[o][p]) for p in lengths] for o in outputs}, digits)
 
 
-def deviation_text(found: Reproduction) -> str:
+def deviation_text(reproduction: Reproduction) -> str:
     """Describe the ratio of implied to simulated standard deviations, and the NR that it implies."""
-    ratios = sorted(r.deviation_ratio for r in found.ran)
+    ratios = sorted(r.deviation_ratio for r in reproduction.ran)
     # A response r times smaller than the angle leaves at least 1 - 1/r of its deviation.
-    floors = [max(1 - 1 / r.deviation_ratio, 0.0) for r in found.ran]
-    stated = [printed.FRACTIONAL_ROWS[r.output][r.p].nr for r in found.ran]
-    beyond = sum(low > nr for low, nr in zip(floors, stated, strict=True))
+    floors = [max(1 - 1 / r.deviation_ratio, 0.0) for r in reproduction.ran]
+    values = [printed.FRACTIONAL_ROWS[r.output][r.p].nr for r in reproduction.ran]
+    count = sum(low > nr for low, nr in zip(floors, values, strict=True))
     middle = f"from {ratios[0]:.3g} to {ratios[-1]:.3g}, median {statistics.median(ratios):.3g}"
-    if not beyond:
+    if not count:
         return middle
     return (
-        f"{middle}. The NR of a free run is at least {min(floors):.2g} to {max(floors):.3g}, where {min(stated):.2g} "
-        f"to {max(stated):.2g} is printed: in {beyond} of {len(stated)} rows Tables 4 and 5 do not hold errors of free "
+        f"{middle}. The NR of a free run is at least {min(floors):.2g} to {max(floors):.3g}, where {min(values):.2g} "
+        f"to {max(values):.2g} is printed: in {count} of {len(values)} rows Tables 4 and 5 do not hold errors of free "
         "runs"
     )
 
@@ -246,38 +246,38 @@ def deviation_text(found: Reproduction) -> str:
 Outcome = tuple[ClaimVerdict, dict[str, Any]] | None
 
 
-def movement(found: Reproduction) -> Outcome:
+def movement(reproduction: Reproduction) -> Outcome:
     """Return whether the printed models move as much as the paper's arm."""
-    if not found.ran:
+    if not reproduction.ran:
         return None
-    worst = max(found.ran, key=lambda r: r.deviation_ratio)
-    return _of_rows(found, lambda r: 1 / MAX_DEVIATION_RATIO < r.deviation_ratio < MAX_DEVIATION_RATIO), {
+    worst = max(reproduction.ran, key=lambda r: r.deviation_ratio)
+    return _of_rows(reproduction, lambda r: 1 / MAX_DEVIATION_RATIO < r.deviation_ratio < MAX_DEVIATION_RATIO), {
         "angle": symbol(worst.output),
         "p": worst.p,
         "deviation": worst.angle_deviation,
         "ratio": worst.deviation_ratio,
         "implied": worst.implied_deviation,
-        "ratios": deviation_text(found),
-        "deviations": by_angle({r.output: [r.implied_deviation] for r in found.ran}),
+        "ratios": deviation_text(reproduction),
+        "deviations": by_angle({r.output: [r.implied_deviation] for r in reproduction.ran}),
     }
 
 
-def stability(found: Reproduction) -> Outcome:
+def stability(reproduction: Reproduction) -> Outcome:
     """Return whether the printed models are stable."""
-    if not found.ran:
+    if not reproduction.ran:
         return None
-    outputs = dict.fromkeys(r.output for r in found.ran)
-    poles = {o: [r.stability.unstable_poles for r in found.ran if r.output == o] for o in outputs}
-    return _of_rows(found, lambda r: r.stability.stable), {"poles": by_angle(poles, 2)}
+    outputs = dict.fromkeys(r.output for r in reproduction.ran)
+    poles = {o: [r.stability.unstable_poles for r in reproduction.ran if r.output == o] for o in outputs}
+    return _of_rows(reproduction, lambda r: r.stability.stable), {"poles": by_angle(poles, 2)}
 
 
-def returned_coefficients(found: Reproduction) -> Outcome:
+def returned_coefficients(reproduction: Reproduction) -> Outcome:
     """Return whether multi-innovation finds the coefficients of the printed models again."""
-    if not found.ran:
+    if not reproduction.ran:
         return None
     back = [
         (r, k, r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan))
-        for r in found.ran
+        for r in reproduction.ran
         for k in PRIOR_COVARIANCES
     ]
     last = {k: {r.output: [a] for r, prior, a in back if r.p == LAST_P and prior == k} for k in PRIOR_COVARIANCES}
@@ -299,13 +299,13 @@ def returned_coefficients(found: Reproduction) -> Outcome:
     return combine_cases(cases), {
         "values": ". ".join(f"a of p = {LAST_P} with K0 = {prior_text(k)}: {by_angle(a)}" for k, a in last.items()),
         "orders": orders,
-        "stated": _printed_text(lambda row: row.coefficients["a"], dict.fromkeys(r.output for r in found.ran)),
+        "stated": _printed_text(lambda row: row.coefficients["a"], dict.fromkeys(r.output for r in reproduction.ran)),
     }
 
 
-def recomputed_tables(found: Reproduction) -> Outcome:
+def recomputed_tables(reproduction: Reproduction) -> Outcome:
     """Return whether Tables 4 and 5 follow from what the paper says."""
-    tables = found.as_printed
+    tables = reproduction.as_printed
     if not tables:
         return None
     settings = (f"{symbol(o)} {t.reading}, with K0 = 1 {t.ratio_at_unit_prior:.3g}" for o, t in tables.items())
@@ -317,9 +317,9 @@ def recomputed_tables(found: Reproduction) -> Outcome:
     }
 
 
-def printed_orders(found: Reproduction) -> Outcome:
+def printed_orders(reproduction: Reproduction) -> Outcome:
     """Return whether no neighboring orders have a smaller equation error than the printed ones."""
-    tables = found.as_printed
+    tables = reproduction.as_printed
     if not tables:
         return None
     return _of_angles({o: t.rank == 1 for o, t in tables.items()}), {
@@ -344,33 +344,33 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
     return math.isfinite(max(steps)) and earlier
 
 
-def innovation_length(found: Reproduction) -> Outcome:
+def innovation_length(reproduction: Reproduction) -> Outcome:
     """Return whether a larger p gives a smaller error."""
-    return _of_trials(found.panel.trials, error_falls), {
-        "errors": _by_prior(found, lambda t: t.errors.values()),
+    return _of_trials(reproduction.panel.trials, error_falls), {
+        "errors": _by_prior(reproduction, lambda t: t.errors.values()),
         "stated": _printed_text(lambda row: row.error, lengths=INNOVATION_LENGTHS),
     }
 
 
-def convergence(found: Reproduction) -> Outcome:
+def convergence(reproduction: Reproduction) -> Outcome:
     """Return whether a larger p needs fewer steps."""
-    trials = found.panel.trials
+    trials = reproduction.panel.trials
     if not trials:
         return None
-    apart = [t for t in trials if converges_faster(t.convergence_steps) is not None]
-    return _of_trials(apart, lambda t: converges_faster(t.convergence_steps)), {
-        "steps": _by_prior(found, lambda t: t.convergence_steps.values()),
-        "left_out": len(trials) - len(apart),
+    comparable = [t for t in trials if converges_faster(t.convergence_steps) is not None]
+    return _of_trials(comparable, lambda t: converges_faster(t.convergence_steps)), {
+        "steps": _by_prior(reproduction, lambda t: t.convergence_steps.values()),
+        "left_out": len(trials) - len(comparable),
         "trials": len(trials),
     }
 
 
-def weak_prior(found: Reproduction) -> Outcome:
+def weak_prior(reproduction: Reproduction) -> Outcome:
     """Return whether a larger p gives a smaller error where the data alone decide."""
-    weak = [t for t in found.panel.trials if t.prior == WEAK_PRIOR]
+    weak = [t for t in reproduction.panel.trials if t.prior == WEAK_PRIOR]
     ruling = _of_trials(weak, error_falls)
     ratios = [t.errors[LAST_P] / e for t in weak if math.isfinite(e := t.errors[FIRST_P]) and e]
-    spread = [weak_prior_variation(each) for s in found.stages.values() for each in s.weak.values()]
+    spread = [weak_prior_variation(each) for s in reproduction.stages.values() for each in s.weak.values()]
     words = "no record that starts at rest"
     if ratios:
         words = f"{ruling.counts}; errors of p = {LAST_P} over p = {FIRST_P}: {min(ratios):.4g} to {max(ratios):.4g}"
@@ -391,9 +391,9 @@ def beats(error: float, seeds: Iterable[float]) -> bool:
     return math.isfinite(error) and error < statistics.median(seeds)
 
 
-def optimizers(found: Reproduction) -> Outcome:
+def optimizers(reproduction: Reproduction) -> Outcome:
     """Return whether multi-innovation has a smaller error than the other optimizers."""
-    contests = found.panel.contests
+    contests = reproduction.panel.contests
     if not contests:
         return None
     cases = [
@@ -417,62 +417,62 @@ def optimizers(found: Reproduction) -> Outcome:
     }
 
 
-def manual(found: Reproduction) -> Outcome:
+def manual(reproduction: Reproduction) -> Outcome:
     """Return whether p = 7 is closer to the run than the manual's model; only as far as the arms agree."""
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
-    return _of_trials(found.panel.trials, lambda t: t.nr < t.manual, of_the_machine=found.simulated), {
-        "errors": _by_prior(found, lambda t: (t.manual, t.nr)),
+    return _of_trials(reproduction.panel.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
+        "errors": _by_prior(reproduction, lambda t: (t.manual, t.nr)),
         "stated": by_angle(both, 4),
     }
 
 
-def fractional_orders(found: Reproduction) -> Outcome:
+def fractional_orders(reproduction: Reproduction) -> Outcome:
     """Return whether fractional orders earn their place; only as far as the arms agree."""
-    freed = found.panel.order_comparisons
-    known = [(f, o, earns) for f in freed for o in f.free_nr if (earns := f.earns(o)) is not None]
-    cases = [case(earns, the_arm=f.arm, the_angle=symbol(o)) for f, o, earns in known]
+    freed = reproduction.panel.order_comparisons
+    verdicts = [(f, o, earns) for f in freed for o in f.free_nr if (earns := f.earns(o)) is not None]
+    cases = [case(earns, the_arm=f.arm, the_angle=symbol(o)) for f, o, earns in verdicts]
     both = (f"{f.arm}: {by_angle({o: (f.integer_nr[o], f.free_nr[o]) for o in f.free_nr})}" for f in freed)
-    return combine_cases(cases, of_the_machine=found.simulated), {
-        "unknown": sum(len(f.free_nr) for f in freed) - len(known),
+    return combine_cases(cases, of_the_machine=reproduction.simulated), {
+        "unknown": sum(len(f.free_nr) for f in freed) - len(verdicts),
         "errors": "; ".join(both),
         "orders": "; ".join(f"{f.arm}, stage {f.stage}: {f.fractional_text}" for f in freed),
     }
 
 
-def close_orders(found: Reproduction) -> Outcome:
+def close_orders(reproduction: Reproduction) -> Outcome:
     """Return whether models with the printed orders describe the arm."""
-    near = {o: s.printed_orders.estimation for s, o in found.angles}
+    near = {o: s.printed_orders.estimation for s, o in reproduction.angles}
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
     holding = {o: out < MAX_ERROR_RATIO * eq and out < MAX_EXPLAINING_NR for o, (eq, out) in nr.items()}
-    return _of_angles(holding, of_the_machine=found.simulated), {
+    return _of_angles(holding, of_the_machine=reproduction.simulated), {
         "errors": by_angle(nr),
         "stated": _printed_text(lambda row: row.nr, near, digits=4),
     }
 
 
-def published_form(found: Reproduction) -> Outcome:
+def published_form(reproduction: Reproduction) -> Outcome:
     """Return whether the published form finds the orders of an arm with links that move with their hubs."""
-    if not found.simulated:
+    if not reproduction.simulated:
         return None
     cases: list[Case] = []
     away: list[str] = []
     fits: dict[str, list[float]] = {}
     omitted, count = "", 0
-    for number, stage in found.stages.items():
+    for number, stage in reproduction.stages.items():
         both = [stage.candidates[n] for n in ("output error", "published, output error")]
         result = both[1].result
         if result is None or not are_usable(*both):
             omitted += f"; stage {number} is no case, because one of its fits must not be used"
             continue
         fits |= {o: [c.estimation.output_error[o].fit for c in both] for o in stage.outputs}
-        before = len(away)
+        count_before = len(away)
         for name, value in result.orders.items():
             # The one order that the published form alone leaves free is fixed in the other.
-            known, error = found.truth[number].get(name, 2.0), result.standard_errors[name]
-            if not (math.isfinite(error) and abs(value - known) <= MAX_STANDARD_ERRORS * error):
-                away.append(f"{symbol(name)} {value:.4g} ± {error:.2g} ({known:g})")
+            truth, error = reproduction.truth[number].get(name, 2.0), result.standard_errors[name]
+            if not (math.isfinite(error) and abs(value - truth) <= MAX_STANDARD_ERRORS * error):
+                away.append(f"{symbol(name)} {value:.4g} ± {error:.2g} ({truth:g})")
         count += len(result.orders)
-        cases.append(case(len(away) == before, the_stage=str(number)))
+        cases.append(case(len(away) == count_before, the_stage=str(number)))
     texts = {"listed": ", ".join(away) or "none", "fits": by_angle(fits, 4), "omitted": omitted}
     return combine_cases(cases), {"away": len(away), "count": count, **texts}
 
@@ -480,21 +480,21 @@ def published_form(found: Reproduction) -> Outcome:
 def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
     """Coefficients of (22)-(25) from Table 3, from the effective parameters, and as printed in the integer rows."""
     sets = [{1: PARAMETER_SETS[n][1], 2: PARAMETER_SETS[n][2]} for n in ("table-3", "effective")]
-    found = {}
+    coefficients = {}
     for output, row in printed.INTEGER_ROWS.items():
         stage = printed.stage_of(output)
         table, effective = (parameters[stage].coefficients(stage) for parameters in sets)
         for letter, value in row.coefficients.items():
             name = printed.parameter_name(letter, output)
-            found[name] = (table[name], effective[name], value)
-    return found
+            coefficients[name] = (table[name], effective[name], value)
+    return coefficients
 
 
-def dropped_derivative(found: Reproduction) -> Outcome:
+def dropped_derivative(reproduction: Reproduction) -> Outcome:
     """Return whether (19) and (21) may drop the derivative of the current."""
     orders = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
-    parts = [stage.derived for stage in found.stages.values()]
+    parts = [stage.derived for stage in reproduction.stages.values()]
     return combine_cases([case(abs(v) < 1e-9, the_stage=str(n)) for n, v in dropped.items()]), {
         "printed_orders": format_list(dropped.values(), 2),
         "orders": format_list(p.order for p in parts),
@@ -576,9 +576,9 @@ CLAIM_CHECKS: tuple[Callable[[Reproduction], Outcome], ...] = (
 )
 
 
-def make_check(check: Callable[[Reproduction], Outcome], found: Reproduction) -> Check | None:
+def make_check(check: Callable[[Reproduction], Outcome], reproduction: Reproduction) -> Check | None:
     """Return the check of one claim; None if there are no numbers for it."""
-    outcome = check(found)
+    outcome = check(reproduction)
     if outcome is None:
         return None
     fields = {"counts": outcome[0].counts} | _RULE_NUMBERS | outcome[1]
@@ -586,6 +586,6 @@ def make_check(check: Callable[[Reproduction], Outcome], found: Reproduction) ->
     return Check(ruling=outcome[0], **{name: text.format(**fields) for name, text in texts.items()})
 
 
-def checks(found: Reproduction) -> list[Check]:
+def checks(reproduction: Reproduction) -> list[Check]:
     """Compare the claims of the paper, and its errors, with computed numbers."""
-    return [made for check in CLAIM_CHECKS if (made := make_check(check, found)) is not None]
+    return [result for check in CLAIM_CHECKS if (result := make_check(check, reproduction)) is not None]

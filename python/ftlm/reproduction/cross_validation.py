@@ -162,14 +162,14 @@ class Deflection:
 
     def gains(self, kind: str) -> dict[tuple[str, str], float]:
         """Gain in fit over integer orders by (estimation run, validation run) [percentage points]."""
-        found = {}
+        gains = {}
         for run, whole in self.fits[INTEGER_KIND].items():
             other = self.fits[kind].get(run)
-            for judged in whole.comparisons:
-                if judged != run:
-                    alone, free = whole.fit(judged), -math.inf if other is None else other.fit(judged)
-                    found[run, judged] = 0.0 if alone == free else free - alone
-        return found
+            for other_run in whole.comparisons:
+                if other_run != run:
+                    alone, free = whole.fit(other_run), -math.inf if other is None else other.fit(other_run)
+                    gains[run, other_run] = 0.0 if alone == free else free - alone
+        return gains
 
     def worse(self, kind: str) -> list[str]:
         """Runs on which a fit is worse than that of integer orders, which its structure contains."""
@@ -191,13 +191,13 @@ class Deflection:
 
     def verdict(self, kind: str) -> Verdict:
         """Verdict of one kind, from its gains and intervals."""
-        told, whole_fits, fits = self.intervals(kind), self.fits[INTEGER_KIND], self.fits[kind]
+        intervals, whole_fits, fits = self.intervals(kind), self.fits[INTEGER_KIND], self.fits[kind]
         worse = self.worse(kind)
         bad = [run for each in (fits, whole_fits) for run, f in each.items() if is_degenerate(f.result)]
         degenerate = list(dict.fromkeys(bad))
         complete = not worse and not degenerate and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
-        whole = {name: WHOLE_ORDERS[letter_of(name)] for name in told}
-        earns = improves_prediction(list(self.gains(kind).values()), told, whole) if complete else None
+        whole = {name: WHOLE_ORDERS[letter_of(name)] for name in intervals}
+        earns = improves_prediction(list(self.gains(kind).values()), intervals, whole) if complete else None
 
         def fit(each: Mapping[str, RunFit], run: str, other: str) -> str:
             return percent(each[run].fit(other)) if run in each else "no fit"
@@ -208,10 +208,10 @@ class Deflection:
         )
         orders = "; ".join(
             f"{symbol(name)} " + ", ".join(f"{_range(low, high)} on {run}" for run, (low, high) in each.items())
-            for name, each in told.items()
+            for name, each in intervals.items()
         )
         words = f"Fit of validation runs, percent: {pairs}. 95 % intervals: {orders}."
-        if not all(have_common_value(each.values()) for each in told.values()):
+        if not all(have_common_value(each.values()) for each in intervals.values()):
             words += " The runs contradict each other."
         if worse:
             words += f" On {', '.join(worse)} it fits worse than the whole orders that it contains: no optimum found."
@@ -284,7 +284,7 @@ def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool
     of the other deflection, an observer's gain (``rate``). Initial terms are Caputo's. A history would give fractional
     orders more parameters on the validation run than integer ones.
     """
-    made = flexible_link(
+    structure = flexible_link(
         stage=stage,
         hub=False,
         cross_stage="inertial" if both else False,
@@ -294,7 +294,7 @@ def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool
         laws=("orders", "coefficients", "velocities"),
         offset="constant",
     )
-    return replace(made, initial="caputo")
+    return replace(structure, initial="caputo")
 
 
 def dead_channel_notes(runs: Sequence[Run], stages: Sequence[StageNumber]) -> list[str]:
@@ -354,12 +354,12 @@ def cross_validate_orders(
         raise DataError(f"runs {join_names(r.name for r in runs)} do not all have names of their own; rename a file")
     stages = stages_in(runs)
     notes: list[str] = []
-    used = []
+    runs_used = []
     for run in runs:
         every = -(-run.length // MOST_ROWS)
         if every > 1:
             notes.append(f"of run {run.name} one of {every} rows is used, {every * run.step:.4g} s apart")
-        used.append(decimate_run(run, every) if every > 1 else run)
+        runs_used.append(decimate_run(run, every) if every > 1 else run)
     deflections = {}
     both = len(stages) == 2
     notes += dead_channel_notes(runs, stages)
@@ -368,19 +368,21 @@ def cross_validate_orders(
         each = sum(
             output_error_cost(run.length, len(s.order_names) + len(s.coefficient_names))
             for s in structures
-            for run in used
+            for run in runs_used
         )
         fits = len(FREE_ORDERS_BY_KIND) * (2 if both else 1) * each
         progress.expect("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
     for stage in stages:
-        found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, log, progress)
+        deflection = _deflection(
+            link_structure(stage, both=both, filtered=filtered), "", runs_used, threads, log, progress
+        )
         if both:
             less = link_structure(stage, both=True, filtered=filtered, rate=False)
-            found = replace(
-                found, without_rate=_deflection(less, f", {WITHOUT_RATE_LABEL}", used, threads, log, progress)
+            deflection = replace(
+                deflection, without_rate=_deflection(less, f", {WITHOUT_RATE_LABEL}", runs_used, threads, log, progress)
             )
-        deflections[found.output] = found
-    return OrderCrossValidation(tuple(used), deflections, filtered, tuple(notes))
+        deflections[deflection.output] = deflection
+    return OrderCrossValidation(tuple(runs_used), deflections, filtered, tuple(notes))
 
 
 def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
@@ -391,20 +393,20 @@ def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
     DataError
         There is none.
     """
-    found = [n for n in STAGE_NUMBERS if all(f"theta{n}{k}" in run.signals for run in runs for k in (1, 2))]
-    if not found:
+    stages = [n for n in STAGE_NUMBERS if all(f"theta{n}{k}" in run.signals for run in runs for k in (1, 2))]
+    if not stages:
         have = "; ".join(f"{run.name}: {', '.join(run.signals)}" for run in runs)
         raise DataError(
             f"no stage of the arm has both of its angles in all runs ({have}); needed are theta11 and theta12, or "
             f"theta21 and theta22: name their columns with {parameter('columns')}, or "
             f"{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
         )
-    return found
+    return stages
 
 
 def _deflection(
     structure: Structure,
-    told: str,
+    suffix: str,
     runs: Sequence[Run],
     threads: int | None,
     log: Callable[[str], None],
@@ -417,11 +419,11 @@ def _deflection(
     failed = {}
     for kind, free in FREE_ORDERS_BY_KIND.items():
         letters = {n: letter_of(n) for n in structure.order_names}
-        held = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
+        fixed_orders = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
         for run in runs:
-            log(f"{output}{told}: {kind}, fitted to {run.name}")
+            log(f"{output}{suffix}: {kind}, fitted to {run.name}")
             try:
-                result = identify(run, structure.with_orders(held), threads=threads, progress=progress)
+                result = identify(run, structure.with_orders(fixed_orders), threads=threads, progress=progress)
                 fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in runs})
             except FtlmError as error:
                 if kind == INTEGER_KIND:
@@ -440,9 +442,9 @@ def verdict_sentence(output: str, verdict: Verdict) -> str:
     return f"{symbol(output)}: {what} {yes if verdict.earns else no}."
 
 
-def _structures(found: OrderCrossValidation) -> list[tuple[str, Deflection]]:
+def _structures(result: OrderCrossValidation) -> list[tuple[str, Deflection]]:
     """Return every structure with its heading; those without the rate follow those with it."""
-    both = [(o, suffix, d) for o, full in found.deflections.items() for suffix, d in _with_and_without(full)]
+    both = [(o, suffix, d) for o, full in result.deflections.items() for suffix, d in _with_and_without(full)]
     return [(f"{symbol(o)}{suffix}", d) for o, suffix, d in both]
 
 
@@ -455,54 +457,54 @@ def _verdict(output: str, verdict: Verdict) -> Markup:
     return template.format(verdict_sentence(output, verdict), verdict.words)
 
 
-def validation_charts(found: OrderCrossValidation, deflection: Deflection) -> list[LineChart]:
+def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> list[LineChart]:
     """Charts of a deflection and its simulations by both structures on the run after the estimation run."""
     charts, output = [], deflection.output
-    names = [run.name or "" for run in found.runs]
-    for run, judged in zip(names, names[1:] + names[:1], strict=True):
-        at = deflection.fits[INTEGER_KIND][run].comparisons[judged]
+    names = [run.name or "" for run in result.runs]
+    for run, other_run in zip(names, names[1:] + names[:1], strict=True):
+        at = deflection.fits[INTEGER_KIND][run].comparisons[other_run]
         lines, words = [("measured", at.measured[output][0])], []
         for kind in (INTEGER_KIND, CHARTED_KIND):
-            fitted = deflection.fits[kind].get(run)
-            if fitted is None:
+            fit = deflection.fits[kind].get(run)
+            if fit is None:
                 words.append(f"{kind}: no fit")
                 continue
-            lines.append((kind, fitted.comparisons[judged].simulated[output][0]))
-            words.append(f"{kind} {percent(fitted.fit(judged))} % with {fitted.numbers} numbers")
+            lines.append((kind, fit.comparisons[other_run].simulated[output][0]))
+            words.append(f"{kind} {percent(fit.fit(other_run))} % with {fit.numbers} numbers")
         caption = "; ".join(words)
         options = {"points": LINE_POINTS, "width": SMALL_WIDTH_PX}
-        title = f"{symbol(output)} on {judged}, fitted to {run}"
+        title = f"{symbol(output)} on {other_run}, fitted to {run}"
         charts.append(
             angle_chart(pulse_times(at), lines, output, title, f"{caption[0].upper()}{caption[1:]}.", **options)
         )
     return charts
 
 
-def rate_effect_table(found: OrderCrossValidation) -> Table | None:
+def rate_effect_table(result: OrderCrossValidation) -> Table | None:
     """Table of the verdicts without and with the rate of the other deflection."""
     rows = {
         symbol(output): [
             [kind, *(VERDICT_CELLS[d.verdict(kind).earns] for d in (full.without_rate, full))]
             for kind in VERDICT_SUBJECTS
         ]
-        for output, full in found.deflections.items()
+        for output, full in result.deflections.items()
         if full.without_rate is not None
     }
     return make_table("rate_effect", rows) if rows else None
 
 
-def fits_table(found: OrderCrossValidation) -> Table:
+def fits_table(result: OrderCrossValidation) -> Table:
     """Table of the fits of every structure on all runs, with its orders."""
-    pairs = [(run.name, other.name) for run in found.runs for other in found.runs]
+    pairs = [(run.name, other.name) for run in result.runs for other in result.runs]
     rows: dict[str, list[list[Cell]]] = {}
-    for heading, deflection in _structures(found):
+    for heading, deflection in _structures(result):
         rows[heading] = []
         for kind, each in deflection.fits.items():
             numbers = next((Exact(f.numbers) for f in each.values()), None)
-            shown = [percent(each[run].fit(other)) if run in each else None for run, other in pairs]
+            percentages = [percent(each[run].fit(other)) if run in each else None for run, other in pairs]
             cells = [
                 v if v is None or run == other else Markup("<strong>{}</strong>").format(v)
-                for v, (run, other) in zip(shown, pairs, strict=True)
+                for v, (run, other) in zip(percentages, pairs, strict=True)
             ]
             rows[heading].append([kind, numbers, *cells])
     heads = [f"{run}, fitted" if run == other else f"{run} → {other}" for run, other in pairs]
@@ -514,10 +516,10 @@ def estimates_table(deflection: Deflection, suffix: str = "") -> Table:
     rows: dict[str, list[list[Cell]]] = {
         f"{kind}, fitted to {run}": [
             [symbol_html(name), value, *(v if math.isfinite(v) else format_bound(v) for v in ends)]
-            for name, (value, *ends) in fitted.estimates.items()
+            for name, (value, *ends) in fit.estimates.items()
         ]
         for kind, each in deflection.fits.items()
-        for run, fitted in each.items()
+        for run, fit in each.items()
     }
     return make_table("cross_estimates", rows, output=f"{symbol(deflection.output)}{suffix}")
 
@@ -529,8 +531,8 @@ def _deflection_section(full: Deflection) -> Section:
     }
     failed = [f"{kind}, {run}{suffix}: {words}" for suffix, d in parts for (kind, run), words in d.failed.items()]
     whole, free = full.fits[INTEGER_KIND], full.fits[CHARTED_KIND]
-    run, fitted = next(iter({**whole, **free}.items()))
-    models = next(iter(whole.values())).result.model, fitted.result.model
+    run, fit = next(iter({**whole, **free}.items()))
+    models = next(iter(whole.values())).result.model, fit.result.model
     return Section(
         symbol(full.output),
         [
@@ -542,36 +544,36 @@ def _deflection_section(full: Deflection) -> Section:
     )
 
 
-def _method_section(found: OrderCrossValidation) -> Section:
-    rows = ([r.name, r.length, Exact(round(r.step, 9)), r.duration] for r in found.runs)
-    filtered = " Both deflections passed the 2 Hz low-pass of the arm's stock model." if found.filtered else ""
+def _method_section(result: OrderCrossValidation) -> Section:
+    rows = ([r.name, r.length, Exact(round(r.step, 9)), r.duration] for r in result.runs)
+    filtered = " Both deflections passed the 2 Hz low-pass of the arm's stock model." if result.filtered else ""
     fields = {"filtered": filtered, "min_gain": MIN_FIT_GAIN}
-    return make_section("cross_validation", *found.notes, fields=fields, tables=[make_table("cross_runs", rows)])
+    return make_section("cross_validation", *result.notes, fields=fields, tables=[make_table("cross_runs", rows)])
 
 
-def cross_validation_page(found: OrderCrossValidation, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write charts, verdicts and numbers as one HTML page.
 
     Parameters
     ----------
-    found
+    result
         From :func:`cross_validate_orders`.
     path, force
         See :meth:`ftlm.Identification.report`.
     """
     check_free(path, force=force)
-    each = {kind: [_verdict(o, d.verdict(kind)) for o, d in found.deflections.items()] for kind in VERDICT_SUBJECTS}
+    each = {kind: [_verdict(o, d.verdict(kind)) for o, d in result.deflections.items()] for kind in VERDICT_SUBJECTS}
     first = each.pop(CHARTED_KIND)
-    charts = [chart for d in found.deflections.values() for chart in validation_charts(found, d)]
-    places = rate_effect_table(found)
+    charts = [chart for d in result.deflections.values() for chart in validation_charts(result, d)]
+    places = rate_effect_table(result)
     alone = [verdict for pair in zip(*each.values(), strict=True) for verdict in pair]
     sections = [
         Section("On runs that were not fitted to", first, figures=charts, small=True),
-        Section("One order at a time", alone, tables=[*([] if places is None else [places]), fits_table(found)]),
-        *(_deflection_section(d) for d in found.deflections.values()),
-        _method_section(found),
+        Section("One order at a time", alone, tables=[*([] if places is None else [places]), fits_table(result)]),
+        *(_deflection_section(d) for d in result.deflections.values()),
+        _method_section(result),
     ]
-    names = ", ".join(run.name or "" for run in found.runs)
+    names = ", ".join(run.name or "" for run in result.runs)
     lead = (
         f"Deflections of a flexible arm in runs {names}: each model is fitted to one run and simulated on another, "
         "with integer orders and with fractional ones in the same terms."
@@ -579,26 +581,26 @@ def cross_validation_page(found: OrderCrossValidation, path: str | os.PathLike[s
     return write_page(path, title="Integer against fractional orders", sections=sections, lead=lead, force=force)
 
 
-def cross_validation_text(found: OrderCrossValidation) -> str:
+def cross_validation_text(result: OrderCrossValidation) -> str:
     """Summary of verdicts and fits for a terminal."""
     lines: list[str] = []
-    for output, full in found.deflections.items():
+    for output, full in result.deflections.items():
         for verdict in full.verdicts:
             lines += [verdict_sentence(output, verdict), f"    {verdict.words}"]
-    for output, full in found.deflections.items():
+    for output, full in result.deflections.items():
         if full.without_rate is not None:
             lines += ["", f"{symbol(output)}, {WITHOUT_RATE_LABEL}:"]
             lines += [f"    {verdict_sentence(output, verdict)}" for verdict in full.without_rate.verdicts]
-    names = [run.name or "" for run in found.runs]
-    for heading, deflection in _structures(found):
+    names = [run.name or "" for run in result.runs]
+    for heading, deflection in _structures(result):
         lines += ["", f"{heading}: fit of the free run in percent, fitted to the first, judged on the second"]
         lines.append(" " * 24 + "numbers".rjust(8) + "".join(f"{a} → {b}".rjust(18) for a in names for b in names))
         lines += [_line(kind, deflection, names) for kind in FREE_ORDERS_BY_KIND]
-    return "\n".join([*lines, *(f"note: {n}" for n in found.notes)])
+    return "\n".join([*lines, *(f"note: {n}" for n in result.notes)])
 
 
 def _line(kind: str, deflection: Deflection, names: Sequence[str]) -> str:
     each = deflection.fits[kind]
     numbers = next((str(f.numbers) for f in each.values()), "–")
-    shown = [percent(each[a].fit(b)) if a in each else "no fit" for a in names for b in names]
-    return kind.ljust(24) + numbers.rjust(8) + "".join(text.rjust(18) for text in shown)
+    percentages = [percent(each[a].fit(b)) if a in each else "no fit" for a in names for b in names]
+    return kind.ljust(24) + numbers.rjust(8) + "".join(text.rjust(18) for text in percentages)

@@ -122,10 +122,10 @@ _LABEL_WIDTH, _TEXT_WIDTHS = 17, (5,) * 4 + (9,) * 4 + (8, 8, 7) * 2
 def paper_table_text(rows: Sequence[PaperRow]) -> str:
     """Return the same table as text of 120 columns; numbers lose digits in narrow columns."""
     heads = [*map(symbol, (*ORDER_LETTERS, *COEFFICIENT_LETTERS)), *("error", "RMSE", "NR") * 2]
-    left, right = sum(_TEXT_WIDTHS[:8]) + _LABEL_WIDTH, sum(_TEXT_WIDTHS[8:11])
+    indent, right = sum(_TEXT_WIDTHS[:8]) + _LABEL_WIDTH, sum(_TEXT_WIDTHS[8:11])
     groups = (f" {words} ".center(right - 1, "-").rjust(right) for words in ("equation error", "free run"))
     lines = [
-        " " * left + "".join(groups),
+        " " * indent + "".join(groups),
         "model".ljust(_LABEL_WIDTH) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
     ]
     table, infinite = paper_table(rows), False
@@ -311,8 +311,8 @@ def demo_text(demo: Demo) -> str:
     lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
     for label in SHOWN_MODELS:
         fits = [fit for models in demo.models.values() for fit in models[label].fits]
-        shown = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
-        lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(shown)))
+        texts = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
+        lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(texts)))
     lines += ["", "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well."]
     joint = [results["output error"] for results in demo.results.values()]
     lines += finding_lines([w for r in joint for w in r.findings], how="-v")
@@ -403,14 +403,14 @@ def _stage_section(demo: Demo, stage: int) -> Section:
     for output in best.model.outputs:
         title = f"Error (45) of {symbol(output)} after each step of the recursion"
         charts.append(convergence_chart(demo.traces[output], title, log_x=False))
-    shown, left = first_findings(best.findings)
+    first, rest = first_findings(best.findings)
     others = grouped_findings({n: r for n, r in results.items() if n != "output error"})
     searches = {f"{n}, {o}": s for n, r in results.items() for o, s in r.searches.items()}
     return Section(
         f"Stage {stage}",
         [*joint_equations(best.model), TABLE_NOTE],
-        warnings=shown,
-        more=[*left, *others],
+        warnings=first,
+        more=[*rest, *others],
         tables=[
             *behavior_tables(best.model),
             estimates_table(best, demo.truth[stage]),

@@ -49,28 +49,28 @@ def fit_chart(
 ) -> LineChart:
     """Chart of an angle and its simulations by some models, without far excursions."""
     first = models[0][1]
-    measured, time = first.measured[output][0], pulse_times(first)
-    middle = float(np.mean(measured))
-    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(measured - middle)))
-    lines, gone = [(reference_label(simulated=simulated), measured)], []
+    reference, time = first.measured[output][0], pulse_times(first)
+    middle = float(np.mean(reference))
+    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(reference - middle)))
+    lines, remarks = [(reference_label(simulated=simulated), reference)], []
     for label, comparison in models:
         response = comparison.simulated[output][0]
         with np.errstate(invalid="ignore"):
             response = np.where(np.abs(response - middle) <= limit, response, np.nan)
-        left = np.flatnonzero(np.isnan(response))
-        if left.size:
-            gone.append(f"{label} leaves the drawing after {time[left[0]]:.2g} s")
-        if left.size < response.size:
+        out_of_range = np.flatnonzero(np.isnan(response))
+        if out_of_range.size:
+            remarks.append(f"{label} leaves the drawing after {time[out_of_range[0]]:.2g} s")
+        if out_of_range.size < response.size:
             lines.append((label, response))
-    words = " ".join(part for part in (caption, "; ".join(gone) + "." if gone else "") if part)
+    words = " ".join(part for part in (caption, "; ".join(remarks) + "." if remarks else "") if part)
     return angle_chart(time, lines, output, title, words)
 
 
-def printed_model_charts(found: Reproduction) -> list[Figure]:
+def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
     """Charts of the printed hub models under the paper's current, beside an angle of the implied standard deviation."""
     charts: list[Figure] = []
-    for output in dict.fromkeys(r.output for r in found.ran if r.output.endswith("1")):
-        rows = [r for r in found.ran if r.output == output]
+    for output in dict.fromkeys(r.output for r in reproduction.ran if r.output.endswith("1")):
+        rows = [r for r in reproduction.ran if r.output == output]
         last = rows[-1]
         caption = (
             f"The printed equations of Table {3 + int(output[-2])} from the current alone, and the simulated arm, "
@@ -87,10 +87,10 @@ def share_picture(ruling: ClaimVerdict) -> Markup:
     """Bar of the share of cases in which a claim holds, for every level of the deciding factor."""
     levels = ruling.levels or (("", ruling.cases, ruling.holding_cases),)
     height = 10 * len(levels) - 2
-    words = "; ".join(f"{level + ': ' if level else ''}{held} of {count}" for level, count, held in levels)
+    words = "; ".join(f"{level + ': ' if level else ''}{holding} of {count}" for level, count, holding in levels)
     out = [Markup('<svg class="share" viewBox="0 0 88 {}" role="img" aria-label="holds in {}">').format(height, words)]
-    for k, (_, count, held) in enumerate(levels):
-        filled = 88 * held / max(count, 1)
+    for k, (_, count, holding) in enumerate(levels):
+        filled = 88 * holding / max(count, 1)
         out.append(Markup('<rect class="held" x="0" y="{}" width="{:.1f}" height="8"/>').format(10 * k, filled))
         out.append(Markup('<rect x=".5" y="{}" width="87" height="7"/>').format(10 * k + 0.5))
     return Markup("").join([*out, Markup("</svg>")])
@@ -99,14 +99,14 @@ def share_picture(ruling: ClaimVerdict) -> Markup:
 def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> LineChart:
     """Chart of the error (45) over the steps of the recursion, one line per p."""
     end = max(float(t.error[-1]) for t in traces.values())
-    drawn, gaps = [], False
+    labeled_traces, gaps = [], False
     for p, trace in traces.items():
         with np.errstate(invalid="ignore"):
             near = np.where(trace.error <= MAX_ERROR_RATIO * end, trace.error, np.nan)
         near = near if np.isfinite(near).any() else trace.error
         gaps = gaps or bool(np.isnan(near).any())
-        drawn.append((f"p = {p}", replace(trace, error=near)))
-    figure = trace_chart(drawn, title=title, log_x=log_x)
+        labeled_traces.append((f"p = {p}", replace(trace, error=near)))
+    figure = trace_chart(labeled_traces, title=title, log_x=log_x)
     words = f"Errors above {MAX_ERROR_RATIO:g} times the last ones are not drawn."
     return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
 
@@ -146,7 +146,7 @@ def _beside_integer(stage: Stage) -> dict[str, Candidate]:
     manual = "integer, Euler" if stage.traces else "integer, exact"
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
     labels = {"integer, manual": manual, last: last, "output error": "output error"}
-    return {shown: stage.candidates[label] for shown, label in labels.items()}
+    return {heading: stage.candidates[label] for heading, label in labels.items()}
 
 
 def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
@@ -170,25 +170,27 @@ def _place(figure: int, output: str) -> str:
     return f"{figure}({'abcd'[printed.ANGLE_NAMES.index(output)]})"
 
 
-def sine_figures(found: Reproduction) -> list[Figure]:
+def sine_figures(reproduction: Reproduction) -> list[Figure]:
     """Figure 10."""
     return [
         figure
-        for stage, output in found.angles
+        for stage, output in reproduction.angles
         for figure in _fits_chart(
-            _beside_integer(stage), output, _place(10, output), sine=True, simulated=found.simulated
+            _beside_integer(stage), output, _place(10, output), sine=True, simulated=reproduction.simulated
         )
     ]
 
 
-def rival_figures(found: Reproduction) -> list[Figure]:
+def rival_figures(reproduction: Reproduction) -> list[Figure]:
     """Figure 11, on the validation run, or on the estimation run without one."""
     names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
     figures = []
-    for output, rival in found.rivals.items():
+    for output, rival in reproduction.rivals.items():
         models = {names.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
         has_validation = rival.models["genetic"].validation is not None
-        figures += _fits_chart(models, output, _place(11, output), sine=has_validation, simulated=found.simulated)
+        figures += _fits_chart(
+            models, output, _place(11, output), sine=has_validation, simulated=reproduction.simulated
+        )
     return figures
 
 

@@ -295,16 +295,16 @@ class _Angle:
         self.y = angles[output]
         self.m = self.y.size
         self.haar_y = haar_transform(self.y)
-        self._kept: dict[tuple[str, float], tuple[Floats, Floats]] = {}
+        self._transforms: dict[tuple[str, float], tuple[Floats, Floats]] = {}
 
     def integral(self, signal: str, order: float) -> tuple[Floats, Floats]:
         """Fractional integral I^order of a signal, in time and in Haar coordinates."""
         key = signal, round(order, 6)
-        if key not in self._kept:
+        if key not in self._transforms:
             kernel = block_pulse_kernel(order, self.m, step=self.step)
             series = _core.series_multiply(kernel, self.signals[signal], self.m)
-            self._kept[key] = series, haar_transform(series)
-        return self._kept[key]
+            self._transforms[key] = series, haar_transform(series)
+        return self._transforms[key]
 
     def places(self, terms: str) -> tuple[str, str, str, str]:
         """Signal in each of the terms a, b, d, g."""
@@ -357,7 +357,7 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
         Angles; by default all four.
     """
     run, scales = papers_record()
-    found = {}
+    readings = {}
     for output in outputs:
         stage = stage_of(output)
         structure = flexible_link(stage=stage, form="published", coupling="measured", laws=(), sensor_filter="stock")
@@ -370,11 +370,11 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
             behind = _core.series_multiply(filter_series, behind, PULSE_COUNT)
         # The implied deviation is that of the angle as it was logged.
         behind = behind * float(np.std(plain_angles[deflection])) / float(np.std(behind))
-        seen = {False: plain_angles, True: {hub: plain_angles[hub], deflection: behind}}
+        angles_by_filter = {False: plain_angles, True: {hub: plain_angles[hub], deflection: behind}}
         current = own.of(f"I{stage}")
-        angles = {filtered: _Angle(series, current, output, own.step) for filtered, series in seen.items()}
-        found[output] = _nearest(output, angles, scales[output])
-    return found
+        angles = {filtered: _Angle(series, current, output, own.step) for filtered, series in angles_by_filter.items()}
+        readings[output] = _nearest(output, angles, scales[output])
+    return readings
 
 
 def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
@@ -383,7 +383,7 @@ def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrin
     Only deflections are also filtered by the sensor filter.
     """
     table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][1].orders
-    tried: list[tuple[float, Interpretation, dict[int, Row]]] = []
+    candidates: list[tuple[float, Interpretation, dict[int, Row]]] = []
     for filtered, terms in product((False, True) if output.endswith("2") else (False,), TERM_INTERPRETATIONS):
         angle = angles[filtered]
         time, haar = angle.regressors(terms, orders)
@@ -397,9 +397,9 @@ def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrin
                     p: Row(dict(zip(COEFFICIENT_LETTERS, (signs * x[k]).tolist(), strict=True)), figures[p])
                     for p, x in solved.items()
                 }
-                tried.append((_log_distance(rows, table), Interpretation(terms, filtered, flipped, prior), rows))
-    away, reading, rows = min(tried, key=lambda one: one[0])
-    at_one = min(distance for distance, each, _ in tried if each.prior == 1.0)
+                candidates.append((_log_distance(rows, table), Interpretation(terms, filtered, flipped, prior), rows))
+    away, reading, rows = min(candidates, key=lambda one: one[0])
+    at_one = min(distance for distance, each, _ in candidates if each.prior == 1.0)
     ranks = _rank_orders(angles[reading.filtered], reading, orders)
     return AsPrinted(output, reading, rows, math.exp(away), math.exp(at_one), *ranks, scale)
 
@@ -495,8 +495,8 @@ def printed_model(stage: StageNumber, p: int) -> Model:
     """Model of both printed equations of a stage with the current as input."""
     orders, coefficients = printed_numbers(stage, p)
     structure = flexible_link(stage=stage, form="published", coupling="simulated", laws=())
-    known = structure.with_orders(orders).with_coefficients(coefficients)
-    return Model(known, orders=orders, m=PULSE_COUNT)
+    identified = structure.with_orders(orders).with_coefficients(coefficients)
+    return Model(identified, orders=orders, m=PULSE_COUNT)
 
 
 def one_angle(output: str, p: int) -> Model:
@@ -514,7 +514,7 @@ def papers_current(stage: StageNumber) -> Run:
 
 def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[PrintedModelRun]:
     """Simulate every printed fractional model of a stage, and identify each from its own response."""
-    drive, found = papers_current(stage), []
+    drive, runs = papers_current(stage), []
     scaled, _ = papers_record()
     structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
     for p in INNOVATION_LENGTHS:
@@ -523,7 +523,7 @@ def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[P
         for output in model.outputs:
             response = free.simulated[output][0]
             single = compare_means(one_angle(output, p), drive.select([f"I{stage}", output]))
-            found.append(
+            runs.append(
                 PrintedModelRun(
                     output,
                     p,
@@ -537,7 +537,7 @@ def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[P
                     *_reidentify(own, structure.equation(output), orders, p, threads),
                 )
             )
-    return found
+    return runs
 
 
 def _reidentify(
@@ -549,12 +549,12 @@ def _reidentify(
     wide = {n: v if n.startswith("alpha") else [w for w in near[n] if w < 2.0] for n, v in own.items()}
 
     def best(axes: dict[str, list[float]]) -> dict[float, Model]:
-        found = {}
+        models = {}
         for prior in PRIOR_COVARIANCES:
             with suppress(FtlmError):  # no candidate has a finite error
                 grid = OrderGrid(increment=SEARCH_INCREMENT, orders=axes)
-                found[prior] = best_orders(run, single, grid, p, prior, m=PULSE_COUNT, threads=threads).model
-        return found
+                models[prior] = best_orders(run, single, grid, p, prior, m=PULSE_COUNT, threads=threads).model
+        return models
 
     searched = best(wide) if p == INNOVATION_LENGTHS[-1] else {}
     return (

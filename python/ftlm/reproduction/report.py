@@ -91,8 +91,8 @@ def make_table(
         Values of the placeholders in its title and note.
     """
     texts = read_texts("page")["tables"][key]
-    known = {**COLUMN_HEADS, **(heads or {})}
-    columns = [head for name in texts["columns"] for head in known.get(name, (name,))]
+    heads_by_name = {**COLUMN_HEADS, **(heads or {})}
+    columns = [head for name in texts["columns"] for head in heads_by_name.get(name, (name,))]
     title, note = (texts.get(name, "").format(printed_note=PRINTED_NOTE, **fields) for name in ("title", "note"))
     options = {name: texts[name] for name in ("groups", "wrap", "stacked") if name in texts}
     if isinstance(rows, Mapping):
@@ -110,8 +110,8 @@ def make_section(key: str, *paragraphs: str, fields: Mapping[str, Any] | None = 
         texts = {
             n: v.format(**fields) if isinstance(v, str) else [p.format(**fields) for p in v] for n, v in texts.items()
         }
-    given = {"fold": texts["fold"]} if "fold" in texts else {}
-    return Section(texts["heading"], [*texts.get("paragraphs", ()), *paragraphs], **given, **content)
+    options = {"fold": texts["fold"]} if "fold" in texts else {}
+    return Section(texts["heading"], [*texts.get("paragraphs", ()), *paragraphs], **options, **content)
 
 
 def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, float]]:
@@ -161,8 +161,8 @@ def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
     """Orders, and coefficients at least as large as their standard errors, of one equation."""
     orders, coefficients = letters_of(candidate.model, output)
     errors = {} if candidate.result is None else candidate.result.standard_errors
-    known = {n: v for n, v in coefficients.items() if not errors.get(parameter_name(n, output), 0.0) > abs(v)}
-    return number_cells(orders, known)
+    identifiable = {n: v for n, v in coefficients.items() if not errors.get(parameter_name(n, output), 0.0) > abs(v)}
+    return number_cells(orders, identifiable)
 
 
 def model_table(stage: Stage) -> Table:
@@ -219,16 +219,16 @@ def parameter_tables() -> list[Table]:
         stem = letter_of(name)
         stage, *place = map(int, name[len(stem) :])
         effective = None
-        if (known := fields.get(stem.rstrip("_"))) is not None:
-            effective = Exact(getattr(PARAMETER_SETS["effective"][stage], known[place[0] - 1 if place else 0]))
-        shown = Markup("<i>{}</i><sub>{}</sub>").format(name[0], name.partition("_")[2])
-        rows.append([shown, Exact(value), unit, effective, value / effective if effective else None])
+        if (fields_by_stem := fields.get(stem.rstrip("_"))) is not None:
+            effective = Exact(getattr(PARAMETER_SETS["effective"][stage], fields_by_stem[place[0] - 1 if place else 0]))
+        name_html = Markup("<i>{}</i><sub>{}</sub>").format(name[0], name.partition("_")[2])
+        rows.append([name_html, Exact(value), unit, effective, value / effective if effective else None])
     coefficients = table_3_coefficients().items()
     ratios = ([symbol_html(n), t + 0.0, e + 0.0, p, t / p, e / p] for n, (t, e, p) in coefficients)
     return [make_table("parameters", rows), make_table("coefficients", ratios)]
 
 
-def saturation_table(found: Reproduction) -> Table:
+def saturation_table(reproduction: Reproduction) -> Table:
     """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
 
     def rows(stage: Stage, output: str) -> Iterator[list[Cell]]:
@@ -239,15 +239,15 @@ def saturation_table(found: Reproduction) -> Table:
         for p, model in of_p.items():
             alike = "yes" if letters_of(model, output)[0] == last else "no"
             weak = stage.weak[output][p][name] if stage.weak else None
-            stated = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
-            yield [f"p = {p}", model.coefficients[name], alike, weak, stated, x * p / (p + c)]
+            printed_value = printed.FRACTIONAL_ROWS[output][p].coefficients["a"]
+            yield [f"p = {p}", model.coefficients[name], alike, weak, printed_value, x * p / (p + c)]
 
-    return make_table("saturation", {output: rows(stage, output) for stage, output in found.angles})
+    return make_table("saturation", {output: rows(stage, output) for stage, output in reproduction.angles})
 
 
-def optimizer_tables(found: Reproduction) -> list[Table]:
+def optimizer_tables(reproduction: Reproduction) -> list[Table]:
     """Tables 6 and 7 at equal budgets, and the error (45) of each optimizer and seed."""
-    rivals = found.rivals
+    rivals = reproduction.rivals
     seeds = list(dict.fromkeys(seed for rival in rivals.values() for seed in rival.optimizers["genetic"].errors))
     best: list[list[Cell]] = []
     for output, rival in rivals.items():
@@ -280,56 +280,56 @@ def optimizer_tables(found: Reproduction) -> list[Table]:
     ]
 
 
-def printed_reading_table(found: Reproduction, stage: Stage) -> Table:
+def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
     """Table 4 or 5 as the paper computed it: recomputed, printed, and their ratio."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
-        for p, row in found.as_printed[output].rows.items():
-            stated = printed.FRACTIONAL_ROWS[output][p]
+        for p, row in reproduction.as_printed[output].rows.items():
+            printed_row = printed.FRACTIONAL_ROWS[output][p]
             ours = [*map(row.coefficients.get, COEFFICIENT_LETTERS), *criteria_cells(row.equation)]
-            theirs = [*map(stated.coefficients.get, COEFFICIENT_LETTERS), *stated.criteria]
+            theirs = [*map(printed_row.coefficients.get, COEFFICIENT_LETTERS), *printed_row.criteria]
             pairs = zip(ours, theirs, strict=True)
             ratios = [number(float(a) / b, 3) if a is not None and b else None for a, b in pairs]
             yield [f"p = {p}", *ours]
             yield [printed_head(f"p = {p}"), *theirs]
             yield ["ours / printed", *ratios]
 
-    made = {symbol(o): found.as_printed[o] for o in stage.outputs}
+    tables = {symbol(o): reproduction.as_printed[o] for o in stage.outputs}
     return make_table(
         "as_printed",
         {o: rows(o) for o in stage.outputs},
         table=3 + stage.number,
         settings="; ".join(
-            f"{o}: {t.reading} ({printed.TERM_INTERPRETATIONS[t.reading.terms]})" for o, t in made.items()
+            f"{o}: {t.reading} ({printed.TERM_INTERPRETATIONS[t.reading.terms]})" for o, t in tables.items()
         ),
-        scales=", ".join(f"{o} by {t.scale:.3g}" for o, t in made.items()),
+        scales=", ".join(f"{o} by {t.scale:.3g}" for o, t in tables.items()),
     )
 
 
-def printed_runs_table(found: Reproduction) -> Table:
+def printed_runs_table(reproduction: Reproduction) -> Table:
     """Table of the printed models under the paper's own current."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
-        for r in found.ran:
+        for r in reproduction.ran:
             if r.output == output:
                 back = [r.returned_coefficients.get(k, {}).get(parameter_name("a", output)) for k in PRIOR_COVARIANCES]
                 deviations = r.angle_deviation, r.single_equation_deviation, r.implied_deviation, r.deviation_ratio
-                stated = printed.FRACTIONAL_ROWS[output][r.p].coefficients["a"]
-                yield [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, stated, *back]
+                printed_value = printed.FRACTIONAL_ROWS[output][r.p].coefficients["a"]
+                yield [f"p = {r.p}", Exact(r.stability.unstable_poles), *deviations, printed_value, *back]
 
-    return make_table("printed_models", {o: rows(o) for o in dict.fromkeys(r.output for r in found.ran)})
+    return make_table("printed_models", {o: rows(o) for o in dict.fromkeys(r.output for r in reproduction.ran)})
 
 
-def case_tables(found: Reproduction) -> list[Table]:
+def case_tables(reproduction: Reproduction) -> list[Table]:
     """Tables of error and steps by p, arm, K0 and angle, first record of each arm, and of integer and free orders."""
     rows: dict[tuple[str, str, float], list[Cell]] = {}
-    for t in found.panel.trials:
+    for t in reproduction.panel.trials:
         steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
         head = f"{t.arm}, {symbol(t.output)}, K₀ = {prior_text(t.prior)}"
         rows.setdefault((t.arm, t.output, t.prior), [head, *t.errors.values(), *steps, t.nr, t.manual])
     orders = (
         [f"{f.arm}, {symbol(o)}", f.integer_nr[o], f.free_nr[o], f.fractional_text]
-        for f in found.panel.order_comparisons
+        for f in reproduction.panel.order_comparisons
         for o in f.free_nr
     )
     return [make_table("trials", rows.values(), weak_prior=WEAK_PRIOR), make_table("order_comparisons", orders)]
@@ -347,7 +347,7 @@ def joint_equations(model: Model) -> list[str]:
     return [words, *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations)]
 
 
-def _verdict_section(found: Reproduction) -> Section:
+def _verdict_section(reproduction: Reproduction) -> Section:
     """Section with one line per check, and the cases in a collapsed part."""
     rows: list[list[Cell]] = [
         [
@@ -356,37 +356,37 @@ def _verdict_section(found: Reproduction) -> Section:
             figures.share_picture(c.ruling),
             typeset(c.brief),
         ]
-        for c in found.checks
+        for c in reproduction.checks
     ]
-    numbers = ([typeset(text) for text in (c.claim, c.computed, c.printed, c.rule)] for c in found.checks)
+    numbers = ([typeset(text) for text in (c.claim, c.computed, c.printed, c.rule)] for c in reproduction.checks)
     missing = "No second run was given: nothing is validated, Figure 10 is left out."
     return make_section(
         "verdicts",
         tables=[make_table("verdicts", rows)],
-        warnings=[missing] * (found.sine is None),
-        folded_tables=[make_table("claims", numbers), *case_tables(found)],
+        warnings=[missing] * (reproduction.sine is None),
+        folded_tables=[make_table("claims", numbers), *case_tables(reproduction)],
     )
 
 
-def _stage_section(found: Reproduction, stage: Stage) -> Section:
+def _stage_section(reproduction: Reproduction, stage: Stage) -> Section:
     number, joint = stage.number, stage.candidates["output error"]
-    shown = [model_table(stage), estimates_table(joint.result, found.truth.get(number, {})), fits_table(stage)]
+    tables = [model_table(stage), estimates_table(joint.result, reproduction.truth.get(number, {})), fits_table(stage)]
     warned = [w.partition(": ") for w in grouped_findings({label: c.result for label, c in stage.candidates.items()})]
     if warned:
         rows = ([Markup("{}").format(models), typeset(words)] for models, _, words in warned)
-        shown.append(make_table("warnings", rows, stage=number))
+        tables.append(make_table("warnings", rows, stage=number))
     return make_section(
         "stage",
         *joint_equations(joint.model),
         fields={"stage": number, "table": 3 + number, "warnings": ", warnings" if warned else ""},
-        figures=figures.stage_figures(stage, simulated=found.simulated),
-        folded_tables=shown,
+        figures=figures.stage_figures(stage, simulated=reproduction.simulated),
+        folded_tables=tables,
     )
 
 
-def _sections(found: Reproduction) -> list[Section]:
+def _sections(reproduction: Reproduction) -> list[Section]:
     """All sections in their order; those without content are left out."""
-    simulated, stages = found.simulated, list(found.stages.values())
+    simulated, stages = reproduction.simulated, list(reproduction.stages.values())
     near = [
         figures.fit_chart(
             [("printed orders", s.printed_orders.estimation)],
@@ -408,88 +408,98 @@ def _sections(found: Reproduction) -> list[Section]:
         for n, each in landscapes.items()
     ]
     joint = [s.candidates["output error"].model for s in stages]
-    bode = [c for m in joint for c in bode_charts(m, response_frequencies(m, found.square.step, found.square.duration))]
-    ran = [f"Standard deviations implied by RMSE / NR over those of the models: {deviation_text(found)}."]
+    bode = [
+        c
+        for m in joint
+        for c in bode_charts(m, response_frequencies(m, reproduction.square.step, reproduction.square.duration))
+    ]
+    sentences = [f"Standard deviations implied by RMSE / NR over those of the models: {deviation_text(reproduction)}."]
     every = [
-        _verdict_section(found),
+        _verdict_section(reproduction),
         make_section(
             "printed_models",
-            *(ran if found.ran else ()),
-            figures=figures.printed_model_charts(found),
-            folded_tables=[printed_runs_table(found)],
+            *(sentences if reproduction.ran else ()),
+            figures=figures.printed_model_charts(reproduction),
+            folded_tables=[printed_runs_table(reproduction)],
         ),
-        make_section("as_printed", folded_tables=[printed_reading_table(found, stage) for stage in stages]),
-        *(_stage_section(found, stage) for stage in stages),
+        make_section("as_printed", folded_tables=[printed_reading_table(reproduction, stage) for stage in stages]),
+        *(_stage_section(reproduction, stage) for stage in stages),
     ]
-    if found.sine is not None:
-        every.append(make_section("sine", figures=figures.sine_figures(found)))
-    if found.rivals:
-        shown = figures.rival_figures(found)
-        every.append(make_section("optimizers", figures=shown, folded_tables=optimizer_tables(found)))
+    if reproduction.sine is not None:
+        every.append(make_section("sine", figures=figures.sine_figures(reproduction)))
+    if reproduction.rivals:
+        charts = figures.rival_figures(reproduction)
+        every.append(make_section("optimizers", figures=charts, folded_tables=optimizer_tables(reproduction)))
     derived = [figures.derivative_chart(s.derived, simulated=simulated) for s in stages]
     return [
         *every,
-        make_section("innovation_length", figures=weak, small=True, folded_tables=[saturation_table(found)]),
+        make_section("innovation_length", figures=weak, small=True, folded_tables=[saturation_table(reproduction)]),
         make_section("close_orders", figures=near),
         make_section("dropped_derivative", figures=derived),
         make_section("landscape", *correlated, figures=[*landscapes.values()], small=True),
         make_section("frequency_response", figures=bode, small=True),
         make_section("parameters", folded_tables=parameter_tables()),
         make_section("description", figures=[figures.flow_chart()], folded_tables=description_tables()),
-        _runs_section(found),
+        _runs_section(reproduction),
     ]
 
 
-def _runs_section(found: Reproduction) -> Section:
+def _runs_section(reproduction: Reproduction) -> Section:
     rows: list[list[Cell]] = []
-    for run in found.runs:
+    for run in reproduction.runs:
         currents = (f"{symbol(n)} ±{np.max(np.abs(run[n])):.3g} {run.units[n]}" for n in run.inputs)
         rows.append([run.name, run.length, Exact(run.step), run.duration, ", ".join(currents)])
     fields = {
-        "m": next(iter(found.stages.values())).candidates["p = 7"].estimation.m,
-        "increment": found.order_grid.increment,
-        "alpha": found.order_grid.alpha,
+        "m": next(iter(reproduction.stages.values())).candidates["p = 7"].estimation.m,
+        "increment": reproduction.order_grid.increment,
+        "alpha": reproduction.order_grid.alpha,
         "trace_every": TRACE_EVERY,
         "coarse_increment": COARSE_INCREMENT,
         "refined_candidates": REFINED_CANDIDATES,
     }
-    return make_section("runs", *found.notes, fields=fields, tables=[make_table("runs", rows)])
+    return make_section("runs", *reproduction.notes, fields=fields, tables=[make_table("runs", rows)])
 
 
-def reproduction_page(found: Reproduction, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write the reproduction as one HTML page; see :meth:`ftlm.Reproduction.page`."""
     check_free(path, force=force)
-    names = " and ".join(f"“{run.name}”" for run in found.runs)
+    names = " and ".join(f"“{run.name}”" for run in reproduction.runs)
     origin = (
-        "a simulated arm whose links move with their hubs, truth known," if found.simulated else f"the runs {names},"
+        "a simulated arm whose links move with their hubs, truth known,"
+        if reproduction.simulated
+        else f"the runs {names},"
     )
-    strongest = f"The printed models, run under the paper's current: {found.checks[0].brief}. " if found.ran else ""
+    strongest = (
+        f"The printed models, run under the paper's current: {reproduction.checks[0].brief}. "
+        if reproduction.ran
+        else ""
+    )
     lead = (
         f"Section 5 of the paper, recomputed on {origin} beside what the paper prints. {typeset(strongest)}Numbers in "
         f"rows marked “printed” are the paper's; every other number, figure and verdict on this page is computed. "
         f"{PAPER_REFERENCE}."
     )
-    return write_page(path, title="The paper reproduced", sections=_sections(found), lead=lead, force=force)
+    return write_page(path, title="The paper reproduced", sections=_sections(reproduction), lead=lead, force=force)
 
 
 def fits_text(models: Mapping[str, Candidate], label: int, widths: Sequence[int]) -> list[str]:
     """Fits of the free runs in percent as text, one line per model, in columns of these widths."""
     lines = []
     for name, candidate in models.items():
-        shown = ("–" if math.isnan(fit) else f"{fit:.2f}" for fit in candidate.fits)
-        lines.append(name.ljust(label) + "".join(text.rjust(w) for text, w in zip(shown, widths, strict=True)))
+        texts = ("–" if math.isnan(fit) else f"{fit:.2f}" for fit in candidate.fits)
+        lines.append(name.ljust(label) + "".join(text.rjust(w) for text, w in zip(texts, widths, strict=True)))
     return lines
 
 
-def reproduction_text(found: Reproduction) -> str:
+def reproduction_text(reproduction: Reproduction) -> str:
     """Summary for a terminal: checks, and fits."""
     lines = []
-    for check in found.checks:
+    for check in reproduction.checks:
         lines += [f"{check.verdict.upper()}: {check.claim}", f"    {check.brief}"]
-    for stage in found.stages.values():
+    for stage in reproduction.stages.values():
         lines += ["", f"Stage {stage.number}: fit of the free run in percent, driven as identified"]
         lines.append(" " * 26 + "".join(f"{o + run:>16}" for o in stage.outputs for run in (" square", " sine")))
         lines += fits_text(stage.candidates, 26, [16] * 4)
         best = stage.candidates["output error"].model
         lines += [f"  {format_equation(e, best.structure.describe_inputs('.6g'))}" for e in best.equations]
-    return "\n".join([*lines, *(f"note: {n}" for n in found.notes)])
+    return "\n".join([*lines, *(f"note: {n}" for n in reproduction.notes)])

@@ -339,16 +339,16 @@ def run_jobs(
         with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
             under_way = [pool.submit(done_by, job) for job in jobs]
             try:
-                done: set[Future[StageOutcome]] = set()
+                finished: set[Future[StageOutcome]] = set()
                 # A wait without an end would not be interrupted by Ctrl-C everywhere.
-                while len(done) < len(jobs) and not any(f.exception() for f in done):
-                    done, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
+                while len(finished) < len(jobs) and not any(f.exception() for f in finished):
+                    finished, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
             finally:
                 stop.set()
                 for future in under_way:
                     future.cancel()
             # After a failure the other jobs end in KeyboardInterrupt, which says nothing.
-            ended = [f.result() for f in under_way if f in done]
+            ended = [f.result() for f in under_way if f in finished]
     whole.end()
     return ended
 
@@ -361,9 +361,9 @@ def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
     DataError
         No complete stage, or a sine run without a signal of one.
     """
-    wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGE_NUMBERS}
-    found = [n for n, names in wanted.items() if all(s in square.signals for s in names)]
-    if not found:
+    signals_by_stage = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGE_NUMBERS}
+    stages = [n for n, names in signals_by_stage.items() if all(s in square.signals for s in names)]
+    if not stages:
         listed = ", ".join(square.signals)
         raise DataError(
             f"run {square.name!r} has signals {listed}; a stage of the arm needs I1, theta11 and theta12, or I2, "
@@ -372,10 +372,10 @@ def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
             f"{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
         )
     if sine is not None:
-        lacking = [s for n in found for s in wanted[n] if s not in sine.signals]
+        lacking = [s for n in stages for s in signals_by_stage[n] if s not in sine.signals]
         if lacking:
             raise DataError(
                 f"the sine run, {sine.name!r}, lacks {', '.join(lacking)}, which the square run, {square.name!r}, has; "
                 "both runs need the same names"
             )
-    return found
+    return stages

@@ -170,8 +170,8 @@ def decimate_run(run: Run, every: int) -> Run:
     data = {}
     for name in run.signals:
         samples = run[name][: rows * every].reshape(rows, every)
-        held = name in run.inputs and run.intersample[name] == "zoh"
-        data[name] = samples.mean(axis=1) if held else samples[:, 0]
+        is_hold = name in run.inputs and run.intersample[name] == "zoh"
+        data[name] = samples.mean(axis=1) if is_hold else samples[:, 0]
     return Run.from_arrays(
         step=run.step * every,
         inputs={n: data[n] for n in run.inputs},

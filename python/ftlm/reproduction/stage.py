@@ -79,10 +79,10 @@ RIVALS_OMITTED = "Tables 6 and 7 and Figure 11 are left out: {}"
 
 def published_structure(stage: StageNumber, **changes: Any) -> Structure:
     """Return the paper's (22)-(25) of a stage, every equation by itself, with zero initial conditions."""
-    made = flexible_link(
+    structure = flexible_link(
         stage=stage, form="published", coupling="measured", laws=(), parameters="effective", offset="none"
     )
-    return replace(made, **{"initial": "rest", **changes})
+    return replace(structure, **{"initial": "rest", **changes})
 
 
 def integer_orders(structure: Structure) -> Structure:
@@ -179,12 +179,14 @@ class DroppedDerivative:
     @property
     def correlations(self) -> dict[str, float]:
         """Correlation of the deflection with the current: measured, (14)-(15), published; NaN at rest."""
-        found = {}
+        correlations = {}
         for name in ("measured", "derived", "published"):
             parts = [v - np.mean(v) for v in (getattr(self, name), self.current)]
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                found[name] = float(np.dot(*parts) / np.sqrt(np.dot(parts[0], parts[0]) * np.dot(parts[1], parts[1])))
-        return found
+                correlations[name] = float(
+                    np.dot(*parts) / np.sqrt(np.dot(parts[0], parts[0]) * np.dot(parts[1], parts[1]))
+                )
+        return correlations
 
 
 @dataclass(frozen=True)
@@ -251,7 +253,7 @@ def compare_optimizers(
     run: Run,
     single: Structure,
     order_grid: OrderGrid,
-    asked: GeneticAlgorithm | None = None,
+    optimizer: GeneticAlgorithm | None = None,
     *,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -268,7 +270,7 @@ def compare_optimizers(
         Structure with one equation.
     order_grid
         Order grid of multi-innovation; its ends bound the orders of the optimizers.
-    asked
+    optimizer
         Settings of the genetic algorithm given by the user; the order grid and the number of evaluations are replaced.
     threads, progress
         See :func:`ftlm.search_orders`.
@@ -283,7 +285,7 @@ def compare_optimizers(
     work: dict[str, Any] = {"threads": threads, "progress": progress}
     searches = {k: best_orders(run, blind, order_grid, INNOVATION_LENGTHS[-1], k, **work) for k in PRIOR_COVARIANCES}
     count = searches[PRIOR_COVARIANCES[0]].candidates
-    settings = asked or GeneticAlgorithm(seeds=seeds_for(count))
+    settings = optimizer or GeneticAlgorithm(seeds=seeds_for(count))
     budget = settings.evaluations or max(count, 2 * settings.population)
     settings = replace(settings, order_grid=order_grid, evaluations=budget)
     records = prepare([run], blind, None, power_of_two=True)
@@ -427,17 +429,17 @@ def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
 
 def euler_means(model: Model, run: Run, m: int) -> dict[str, Floats]:
     """Pulse means of a model's response by explicit Euler, as in the paper; infinite if it overflows."""
-    found = {}
+    means = {}
     for name, samples in explicit_euler(model, run).items():
         with np.errstate(over="ignore", invalid="ignore"):
-            found[name] = pulse_means(samples, m) if np.all(np.isfinite(samples)) else np.full(m, np.inf)
-    return found
+            means[name] = pulse_means(samples, m) if np.all(np.isfinite(samples)) else np.full(m, np.inf)
+    return means
 
 
 def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int | None) -> list[Trial]:
     """Run multi-innovation on both angles of a stage, with all p and both values of K0."""
     structure, grid = published_structure(stage), OrderGrid(increment=PANEL_STEP, alpha=GRID_ALPHA)
-    run, found = square.select(list(structure.signals)), []
+    run, trials = square.select(list(structure.signals)), []
     m = default_m([run], power_of_two=True)
     manual = euler_means(link_model(stage=stage, form="published"), run, m)
     for output in structure.outputs:
@@ -450,20 +452,20 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
             steps = {p: convergence_step(t, end) for p, t in traces.items()}
             nr = compare_means(last, run).output_error[output].nr
             errors = {p: s.score for p, s in best.items()}
-            found.append(Trial(arm, seed, output, prior, errors, steps, nr, manual_nr))
-    return found
+            trials.append(Trial(arm, seed, output, prior, errors, steps, nr, manual_nr))
+    return trials
 
 
 def traces_of(
     run: Run, single: Structure, models: Mapping[int, Model], prior: float, every: int
 ) -> dict[int, MultiInnovationTrace]:
     """Convergence of one equation with every p, at the orders of the model of that p."""
-    found = {}
+    traces = {}
     for p, model in models.items():
-        known = single.with_orders({n: model.orders[n] for n in single.order_names})
+        structure = single.with_orders({n: model.orders[n] for n in single.order_names})
         options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, "row_basis": "haar"}
-        found[p] = multi_innovation_trace(run, known, every=every, **options)
-    return found
+        traces[p] = multi_innovation_trace(run, structure, every=every, **options)
+    return traces
 
 
 def compare_orders(
@@ -494,21 +496,25 @@ def compare_orders(
             for item in (integer_orders(structure), structure)
         ]
     models = [replace(fit.model, m=default_m([own], power_of_two=True)) for fit in fits]
-    seen, judged = ([compare_means(model, each) for model in models] for each in (own, other))
-    return _order_comparison(arm, stage, seen, judged, fits)
+    estimation, validation_data = ([compare_means(model, each) for model in models] for each in (own, other))
+    return _order_comparison(arm, stage, estimation, validation_data, fits)
 
 
 def _order_comparison(
     arm: str,
     stage: int,
-    seen: Sequence[Comparison],
+    estimation: Sequence[Comparison],
     validation: Sequence[Comparison | None],
     fits: Sequence[Identification],
 ) -> OrderComparison:
     """Return the comparison of integer and free orders, in this order."""
-    nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in seen)
-    before, after = ({} if c is None else c.fit for c in validation)
-    gains = {o: after[o] - before[o] for o in nr if o in before and math.isfinite(after[o] - before[o])}
+    nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in estimation)
+    fits_before, fits_after = ({} if c is None else c.fit for c in validation)
+    gains = {
+        o: fits_after[o] - fits_before[o]
+        for o in nr
+        if o in fits_before and math.isfinite(fits_after[o] - fits_before[o])
+    }
     orders = {n: (v, *fits[1].intervals[n]) for n, v in fits[1].orders.items()}
     return OrderComparison(arm, stage, nr, free_nr, orders, gains, any(map(is_degenerate, fits)))
 
@@ -516,8 +522,8 @@ def _order_comparison(
 def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
     """Return the cases of one run and its stage results; trials only for runs that start at rest."""
     both = [stage.candidates[n] for n in ("integer, identified", "output error")]
-    seen, validation, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
-    freed = (_order_comparison(arm, stage.number, seen, validation, fits),)
+    estimation, validation, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
+    freed = (_order_comparison(arm, stage.number, estimation, validation, fits),)
     trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else ()
     return Panel(tuple(trials), tuple(Contest.of(arm, o, rival) for o, rival in stage.rivals.items()), freed)
 
@@ -556,8 +562,8 @@ def simulated_panel(
         work: dict[str, Any] = {"threads": threads, "progress": progress}
         for output in structure.outputs if has_contests else ():
             begin("rivals")
-            made = compare_optimizers(own, structure.equation(output), order_grid, genetic, **work)
-            contests.append(Contest.of(arm, output, made))
+            contest = compare_optimizers(own, structure.equation(output), order_grid, genetic, **work)
+            contests.append(Contest.of(arm, output, contest))
         begin("freed")
         freed.append(compare_orders(stage, run, arm, **work, validation=validation))
     return Panel(tuple(trials), tuple(contests), tuple(freed))
@@ -681,14 +687,14 @@ class StageWork:
     def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
         """Return the same model simulated by explicit Euler, as in the paper."""
 
-        def by_euler(run: Run, known: Comparison) -> Comparison:
-            means = euler_means(exact.model, run, known.m)
+        def by_euler(run: Run, comparison: Comparison) -> Comparison:
+            means = euler_means(exact.model, run, comparison.m)
             if self.preset.common_pulses:
-                errors = {n: metrics(known.measured[n][0], mean) for n, mean in means.items()}
+                errors = {n: metrics(comparison.measured[n][0], mean) for n, mean in means.items()}
             else:
                 errors = {n: metrics(run[n], samples) for n, samples in explicit_euler(exact.model, run).items()}
-            simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, known.equation_error, errors)]
-            return replace(known, simulated=simulated, output_error=errors, per_run=parts, findings=())
+            simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, comparison.equation_error, errors)]
+            return replace(comparison, simulated=simulated, output_error=errors, per_run=parts, findings=())
 
         on, off = by_euler(self.on, exact.estimation), None
         alone = {self.on.name: on.output_error}
@@ -703,15 +709,15 @@ class StageWork:
             f"p = {p}": ("multi-innovation", {"innovation_length": p, "prior_covariance": PRIOR_COVARIANCES[0]})
             for p in INNOVATION_LENGTHS
         }
-        found, grid = {}, self.preset.order_grid
+        candidates, grid = {}, self.preset.order_grid
         for label, (coefficients, options) in (kinds | {"least squares": ("least-squares", {})}).items():
             self.begin(f"orders on the lattice, {label}", "search")
             if self.preset.common_pulses:
-                found[label] = self.search_candidate(label, grid, coefficients=coefficients, **options)
+                candidates[label] = self.search_candidate(label, grid, coefficients=coefficients, **options)
             else:
                 method = method_with_options(coefficients, {"order_grid": grid, "top": self.preset.top, **options})
-                found[label] = self.identify_candidate(label, self.on, self.measured, method)
-        return found
+                candidates[label] = self.identify_candidate(label, self.on, self.measured, method)
+        return candidates
 
     def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
         """Return the best orders of each equation by itself, without the statistics of an identification."""
@@ -723,10 +729,10 @@ class StageWork:
             best = self._best_orders(single, own, {**SEARCH_OPTIONS, **options})
             orders |= best.orders
             coefficients |= best.coefficients
-        known = self.measured.with_orders(orders).with_coefficients(coefficients)
-        units = {n: u for n, u in self.on.units.items() if n in known.signals}
+        structure = self.measured.with_orders(orders).with_coefficients(coefficients)
+        units = {n: u for n, u in self.on.units.items() if n in structure.signals}
         about = {"origin": label, "run": self.on.name}
-        return self.candidate(label, Model(known, orders=orders, units=units, about=about))
+        return self.candidate(label, Model(structure, orders=orders, units=units, about=about))
 
     def _best_orders(self, single: Structure, own: OrderGrid, options: Mapping[str, Any]) -> SearchResult:
         """Return the best candidate of an order grid.
@@ -816,37 +822,39 @@ class StageWork:
         if self.preset.rivals_increment is None:
             return {}
         grid = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
-        found = {}
+        rivals = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
             self.begin(f"the rivals on {output}", "rivals")
             try:
-                made = compare_optimizers(self.on, single, grid, genetic, threads=self.threads, progress=self.progress)
+                contest = compare_optimizers(
+                    self.on, single, grid, genetic, threads=self.threads, progress=self.progress
+                )
             except ModelError as error:
                 self.notes.append(RIVALS_OMITTED.format(error))
                 return {}
-            best = dict(zip(MULTI_INNOVATION_LABELS, made.order_grid.values(), strict=True))
-            ends: list[tuple[str, GeneticRun | SearchResult]] = [*made.optimizers.items(), *best.items()]
+            best = dict(zip(MULTI_INNOVATION_LABELS, contest.order_grid.values(), strict=True))
+            ends: list[tuple[str, GeneticRun | SearchResult]] = [*contest.optimizers.items(), *best.items()]
             models = {
                 name: Model(single.with_orders(end.orders).with_coefficients(end.coefficients), orders=dict(end.orders))
                 for name, end in ends
             }
-            found[output] = replace(made, models={n: self.candidate(n, model) for n, model in models.items()})
-        return found
+            rivals[output] = replace(contest, models={n: self.candidate(n, model) for n, model in models.items()})
+        return rivals
 
     def in_published_form(self, model: Model) -> Model:
         """Insert the parameters of (14)-(15) into (22)-(25), which drop a derivative of the current."""
         h, d = self.number * 2 - 1, self.number * 2
-        known = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
-        known |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
-        known |= {f"{c}{d}": -known[f"{c}{h}"] for c in "bg"}
-        known |= {f"{c}{d}": known[f"{c}{d}"] - known[f"{c}{h}"] for c in "ad"}
+        values = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
+        values |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
+        values |= {f"{c}{d}": -values[f"{c}{h}"] for c in "bg"}
+        values |= {f"{c}{d}": values[f"{c}{d}"] - values[f"{c}{h}"] for c in "ad"}
         highest = {e.output: e.order.constant for e in model.equations}
         other = link_model(
             stage=self.number,
             form="published",
             orders={**model.orders, f"alpha{d}": highest[self.measured.outputs[1]]},
-            coefficients=known,
+            coefficients=values,
             coupling=model.structure.coupling,
         )
         return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
@@ -854,10 +862,10 @@ class StageWork:
     def published_values(self, model: Model) -> dict[str, float]:
         """Values of the free parameters of (22)-(25) under their laws for a model of (14)-(15)."""
         other = self.in_published_form(model)
-        known = {**other.orders, **other.coefficients}
+        values = {**other.orders, **other.coefficients}
         h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
         free = FreeProblem.of(replace(self.published, initial="rest")).names
-        return {n: v for n, v in known.items() if n in free} | {f"r{self.number}": -known[d] / known[h]}
+        return {n: v for n, v in values.items() if n in free} | {f"r{self.number}": -values[d] / values[h]}
 
     def dropped_derivative(self, model: Model) -> DroppedDerivative:
         """Compare the deflection by (14)-(15) with that by (22)-(25) at equal parameters."""

@@ -67,19 +67,19 @@ class TotalProgress:
     ----------
     seconds
         Processor time of all work.
-    told
+    listener
         See :class:`ftlm.progress.ShareTracker`.
     """
 
-    def __init__(self, seconds: float, told: Callable[[int, int], None] | None) -> None:
-        self._seconds, self._course, self._lock = max(seconds, 1e-9), ShareTracker(told), threading.Lock()
-        self._done: dict[object, float] = {}
+    def __init__(self, seconds: float, listener: Callable[[int, int], None] | None) -> None:
+        self._seconds, self._course, self._lock = max(seconds, 1e-9), ShareTracker(listener), threading.Lock()
+        self._seconds_by_worker: dict[object, float] = {}
 
     def report(self, worker: object, seconds: float) -> None:
         """Report the processor time of all work that a worker has done [s]."""
         with self._lock:
-            self._done[worker] = seconds
-            self._course.advance_to(sum(self._done.values()) / self._seconds)
+            self._seconds_by_worker[worker] = seconds
+            self._course.advance_to(sum(self._seconds_by_worker.values()) / self._seconds)
 
     def end(self) -> None:
         """Report that all work is finished, including skipped steps."""
@@ -107,10 +107,10 @@ class WorkerProgress(Stoppable):
         self._before, self._step, self._within = self._before + self._step, seconds, 0.0
         self._whole.report(self, self._before)
 
-    def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
+    def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
         """Report progress within the step; a restarted count continues at half of the remainder."""
-        super().__call__(done, total, pruned)
-        share = done / max(total, 1)
+        super().__call__(count, total, pruned)
+        share = count / max(total, 1)
         if share < self._within:
             self._step *= 0.5
             self._before += self._step

@@ -136,7 +136,7 @@ class ArmParameters:
 
     @classmethod
     @check_arguments
-    def of(cls, given: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
+    def of(cls, source: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
         """Return a named parameter set, the set of a TOML file, or the argument itself.
 
         Raises
@@ -146,39 +146,39 @@ class ArmParameters:
         DataError
             A file that cannot be read, or an invalid key or value in it.
         """
-        if isinstance(given, ArmParameters):
-            return given
-        if isinstance(given, str) and given in PARAMETER_SETS:
-            return PARAMETER_SETS[given]
-        if not isinstance(given, (str, os.PathLike)):
+        if isinstance(source, ArmParameters):
+            return source
+        if isinstance(source, str) and source in PARAMETER_SETS:
+            return PARAMETER_SETS[source]
+        if not isinstance(source, (str, os.PathLike)):
             raise ModelError(
-                f"parameters is a {type(given).__name__}; use {join_names(PARAMETER_SETS)}, or a TOML file's path"
+                f"parameters is a {type(source).__name__}; use {join_names(PARAMETER_SETS)}, or a TOML file's path"
             )
-        if not os.fspath(given).endswith(".toml"):
+        if not os.fspath(source).endswith(".toml"):
             raise ModelError(
-                f"{setting('parameters')} {short_repr(os.fspath(given))} is not "
-                f"known{nearest(given, PARAMETER_SETS)}; use {join_names(PARAMETER_SETS)}, or a file whose name ends "
+                f"{setting('parameters')} {short_repr(os.fspath(source))} is not "
+                f"known{nearest(source, PARAMETER_SETS)}; use {join_names(PARAMETER_SETS)}, or a file whose name ends "
                 "with .toml"
             )
-        return cls._from_toml(Path(given))
+        return cls._from_toml(Path(source))
 
     @classmethod
     def _from_toml(cls, path: Path) -> ArmParameters:
-        told = _values_of(
+        values = _values_of(
             read_toml(path, "parameters of the arm", "a file of numbers by name, such as coupling = 0.5", _ArmFile)
         )
-        base = told.pop("base", "effective")
+        base = values.pop("base", "effective")
         if base not in PARAMETER_SETS:
             raise DataError(
                 f"{path.name}: base = {short_repr(base)} is not known{nearest(base, PARAMETER_SETS)}; use "
                 f"{join_names(PARAMETER_SETS)}"
             )
         start = PARAMETER_SETS[base]
-        stages = {name: _values_of(told.pop(name, _StageFile())) for name in ("stage1", "stage2")}
-        for where, table in (("the file", told), *stages.items()):
+        stages = {name: _values_of(values.pop(name, _StageFile())) for name in ("stage1", "stage2")}
+        for where, table in (("the file", values), *stages.items()):
             _check_values(path, where, table)
         merged = {name: replace(getattr(start, name), **table) for name, table in stages.items()}
-        return replace(start, **{**told, **merged, "name": path.name[:100]})
+        return replace(start, **{**values, **merged, "name": path.name[:100]})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the parameters as a JSON-compatible dictionary."""
@@ -248,8 +248,8 @@ class ArmParameters:
             coefficients |= stage.coefficients(j, self.form)
             if friction:
                 coefficients[f"fc{j}"] = stage.g * stage.coulomb
-        known = {n: v for n, v in orders.items() if n in structure.order_names}
-        return Model(structure.with_orders(known).with_coefficients(coefficients), orders=known)
+        order_values = {n: v for n, v in orders.items() if n in structure.order_names}
+        return Model(structure.with_orders(order_values).with_coefficients(coefficients), orders=order_values)
 
     @check_arguments
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:

@@ -99,9 +99,9 @@ class Excitation:
         return currents
 
     def _amplitudes(self) -> tuple[float, float]:
-        given = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
-        pair = [a for a in map(finite_number, given) if a is not None and a >= 0]
-        if len(given) != 2 or len(pair) != 2:
+        amplitudes = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
+        pair = [a for a in map(finite_number, amplitudes) if a is not None and a >= 0]
+        if len(amplitudes) != 2 or len(pair) != 2:
             raise ModelError(
                 f"{setting('amplitude')} {short_repr(self.amplitude)} is not a current in A, or a pair of them"
             )
@@ -151,8 +151,8 @@ class Excitation:
     def _random(self, t: Floats, rate: float, period: float, motor: int) -> Floats:
         rng = np.random.default_rng([self.seed, motor])
         if self.shape == "prbs":
-            held = np.floor((t + 0.5 / rate) / period).astype(np.int64)
-            return rng.choice([-1.0, 1.0], size=int(held[-1]) + 1)[held]
+            intervals = np.floor((t + 0.5 / rate) / period).astype(np.int64)
+            return rng.choice([-1.0, 1.0], size=int(intervals[-1]) + 1)[intervals]
         low, high = self._band(rate)
         lines = np.arange(math.ceil(low * period - 1e-9), math.floor(high * period + 1e-9) + 1)
         lines = lines[(lines > 0) & (2 * lines <= round(period * rate))]
@@ -182,9 +182,9 @@ class Excitation:
         if self.file is None:
             raise ModelError(f"{setting('input')} 'csv' needs a file; give it as {parameter('file')}")
         names = column_names(self.file)
-        there = [name for name in CURRENT_SIGNALS if names is not None and name in names]
+        names_present = [name for name in CURRENT_SIGNALS if names is not None and name in names]
         # A run written by ftlm is loaded whole; from any other file only the currents are read.
-        run = load(self.file) if names is None else load(self.file, outputs=there) if there else None
+        run = load(self.file) if names is None else load(self.file, outputs=names_present) if names_present else None
         if run is None or not any(name in run for name in CURRENT_SIGNALS):
             raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
         rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
@@ -197,8 +197,8 @@ class Excitation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the signal as a JSON-compatible dictionary."""
-        told = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
-        return {k: _to_json_value(v) for k, v in told.items() if v is not None}
+        values = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
+        return {k: _to_json_value(v) for k, v in values.items() if v is not None}
 
 
 def finite_number(value: object) -> float | None:

@@ -120,27 +120,27 @@ def control(
         )
     controller = _of_both_joints(controller)
     rate = _rate_of(controller, rate)
-    given = _numbers(reference)
+    path = _numbers(reference)
     if duration is None:
-        if given.ndim == 1:
+        if path.ndim == 1:
             raise ModelError(
                 f"a reference that is held needs {parameter('duration')} [s]; or give it as rows, one per sample"
             )
-        duration = (len(given) - 1) / rate
+        duration = (len(path) - 1) / rate
     duration, limit, rate = check_times(duration, limit, rate)
     seed = check_seed(seed)
-    told: dict[str, Any] = {"controller": _describe_controller(controller)}
+    description: dict[str, Any] = {"controller": _describe_controller(controller)}
 
     def loop(board: Board) -> ControllerSource:
         own = getattr(board, "parameters", None)
         travel = own.travel if isinstance(own, ArmParameters) else DEFAULT_TRAVEL_RAD
-        rows = _rows(given, round(duration * rate) + 1, rate, travel)
+        rows = _rows(path, round(duration * rate) + 1, rate, travel)
         reset = getattr(controller, "reset", None)
         if callable(reset):
             reset()
         return ControllerSource(controller, rows, rate, getattr(board, "clock", time.perf_counter))
 
-    asked = Experiment(
+    experiment = Experiment(
         rig,
         duration,
         limit,
@@ -159,7 +159,7 @@ def control(
         live,
         progress,
     )
-    return asked.record_run(loop, {"control": told})
+    return experiment.record_run(loop, {"control": description})
 
 
 def _of_both_joints(controller: Controller) -> Controller:
@@ -271,11 +271,11 @@ def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]
     if len(answer) != 2:
         return nothing, f"returned {len(answer)} values, not both currents [A]"
     values = []
-    for motor, (given, most) in enumerate(zip(answer, limits, strict=True), start=1):
-        if isinstance(given, (bool, np.bool_)) or not isinstance(given, (int, float, np.integer, np.floating)):
-            return nothing, f"returned a {type(given).__name__} for motor {motor}, not a current [A]"
+    for motor, (current, most) in enumerate(zip(answer, limits, strict=True), start=1):
+        if isinstance(current, (bool, np.bool_)) or not isinstance(current, (int, float, np.integer, np.floating)):
+            return nothing, f"returned a {type(current).__name__} for motor {motor}, not a current [A]"
         try:
-            value = float(given)
+            value = float(current)
         except OverflowError:
             value = math.inf
         if not math.isfinite(value):
@@ -301,9 +301,9 @@ def _numbers(reference: ArrayLike) -> Floats:
     return np.array(raw, dtype=np.float64)
 
 
-def _rows(given: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
+def _rows(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
     """Expand the reference to one row per sample; raise if it exceeds the arm's travel."""
-    reference = np.tile(given, (rows, 1)) if given.ndim == 1 else given
+    reference = np.tile(values, (rows, 1)) if values.ndim == 1 else values
     if len(reference) != rows:
         raise DataError(
             f"reference has {len(reference)} rows, and a run of {(rows - 1) / rate:g} s at {rate:g} Hz has {rows}; "
@@ -330,12 +330,12 @@ def _rows(given: Floats, rows: int, rate: float, travel: tuple[float, float]) ->
 def _describe_controller(controller: Controller) -> dict[str, Any]:
     """Return the description of a controller for the metadata of a run."""
     name = getattr(controller, "__name__", type(controller).__name__)
-    told: dict[str, Any] = {"name": str(name)[:100]}
+    description: dict[str, Any] = {"name": str(name)[:100]}
     describe = getattr(controller, "to_dict", None)
     if callable(describe):
-        told |= {"settings": describe()}
+        description |= {"settings": describe()}
     try:
-        size = len(json.dumps(told, allow_nan=False))
+        size = len(json.dumps(description, allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError(
             f"what to_dict() of the controller returns is not valid JSON ({error_text(error, 200)}); correct it"
@@ -346,4 +346,4 @@ def _describe_controller(controller: Controller) -> dict[str, Any]:
             f"{MAX_CONTROLLER_JSON_CHARACTERS} that a run says "
             "of its controller; leave out what no reader needs"
         )
-    return told
+    return description

@@ -244,7 +244,7 @@ class QuanserBoard:
                 lambda: hil.write_digital(
                     ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_ON if on else ENABLE_STATES_OFF
                 ),
-                done=not on,
+                is_end=not on,
             )
 
     def write(self, volts: tuple[float, float]) -> None:
@@ -252,7 +252,7 @@ class QuanserBoard:
         if self._hil is None:
             return
         with self.gate.lock, self._translate_errors("writing"):
-            self._run_unless_expired(lambda: self._write(volts), done=volts == (0.0, 0.0))
+            self._run_unless_expired(lambda: self._write(volts), is_end=volts == (0.0, 0.0))
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
         """Sample with outputs at 0 V."""
@@ -358,15 +358,15 @@ class QuanserBoard:
                 self._volts[:] = volts
                 self._hil.write_analog(ANALOG_OUT, len(ANALOG_OUT), self._volts)
 
-    def _run_unless_expired(self, act: Callable[[], None], *, done: bool) -> None:
-        """Perform an action; ignore its error if the watchdog has expired and has already `done` it.
+    def _run_unless_expired(self, act: Callable[[], None], *, is_end: bool) -> None:
+        """Perform an action; ignore its error if the watchdog has expired and has already `is_end` it.
 
         The board stays locked, because clearing the watchdog would restore the previous outputs.
         """
         try:
             act()
         except self._error:
-            if not (done and self._has_expired()):
+            if not (is_end and self._has_expired()):
                 raise
 
     def _has_expired(self) -> bool:
@@ -387,10 +387,10 @@ class QuanserBoard:
         words = ERROR_MESSAGES.get(code) if isinstance(code, int) else None
         if words is None:
             try:
-                said = str(error.get_error_message())  # type: ignore[attr-defined]
+                message = str(error.get_error_message())  # type: ignore[attr-defined]
             except Exception:  # the message needs the vendor's runtime
-                said = str(error)
-            words = f"{said or 'no message'} (error {code})"
+                message = str(error)
+            words = f"{message or 'no message'} (error {code})"
         return RigFault(f"Q8-USB, {what}: {words}")
 
 

@@ -32,9 +32,9 @@ from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is
 COLUMN_UNITS = {name: "A" if name.startswith("I") else "rad" for name in RIG_COLUMNS}
 
 
-def units_of(told: tuple[str, ...] = ()) -> dict[str, str]:
+def units_of(extra_columns: tuple[str, ...] = ()) -> dict[str, str]:
     """Return the units of the columns of a run; additional signals are angles [rad]."""
-    return COLUMN_UNITS | dict.fromkeys(told, "rad")
+    return COLUMN_UNITS | dict.fromkeys(extra_columns, "rad")
 
 
 def partial_path(target: Path) -> Path:
@@ -51,28 +51,28 @@ class PartialRecording:
         Final file; None writes nothing to disk.
     name, step, about
         Name, step [s] and metadata of the run.
-    told
+    extra_columns
         Names of additional inputs, appended to the rig's columns in every row.
     """
 
     def __init__(
-        self, target: Path | None, name: str, step: float, about: dict[str, Any], told: tuple[str, ...] = ()
+        self, target: Path | None, name: str, step: float, about: dict[str, Any], extra_columns: tuple[str, ...] = ()
     ) -> None:
         self.path = None if target is None else partial_path(target)
         self._step, self._rows = step, 0
-        self._columns = (*RIG_COLUMNS, *told)
+        self._columns = (*RIG_COLUMNS, *extra_columns)
         #: Number of complete rows on disk.
         self.kept = 0
         self._descriptor: int | None = None
         self._opened = False
-        inputs = (*CURRENT_SIGNALS, *told)
+        inputs = (*CURRENT_SIGNALS, *extra_columns)
         self._header = Header(
             name,
             step,
             0.0,
             inputs,
             tuple(RIG_COLUMNS[2:]),
-            units_of(told),
+            units_of(extra_columns),
             dict.fromkeys(inputs, "zoh"),
             ("the recording did not end: the program died, or the disk was full",),
             about | {"faults": ["the recording did not end"]},
@@ -309,7 +309,7 @@ def record(
     duration, limit, rate = check_times(duration, limit, rate)
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
     commands = excitation.commands(rate, duration)
-    asked = Experiment(
+    experiment = Experiment(
         rig,
         duration,
         limit,
@@ -328,7 +328,7 @@ def record(
         live,
         progress,
     )
-    return asked.record_run(lambda board: FixedCommands(commands), {"input": excitation.to_dict()})
+    return experiment.record_run(lambda board: FixedCommands(commands), {"input": excitation.to_dict()})
 
 
 class CommandSource(Protocol):
@@ -370,7 +370,7 @@ class Experiment:
     live: Streaming | None
     progress: Callable[[int, int], None] | None
 
-    def record_run(self, source_on: Callable[[Board], CommandSource], told: dict[str, Any]) -> Run:
+    def record_run(self, source_on: Callable[[Board], CommandSource], more_details: dict[str, Any]) -> Run:
         """Run the experiment with a command source and return the recorded run."""
         # Flags that let an arm move must be bool; truthy values are rejected.
         for name, flag in (("real_time", self.real_time), ("arm", self.arm), ("force", self.force)):
@@ -384,7 +384,7 @@ class Experiment:
             raise ModelError(
                 f"{setting('sensor_filter')} {short_repr(self.sensor_filter)} is not known; use 'stock' or None"
             )
-        board, known = _board(
+        board, details = _board(
             self.rig,
             self.parameters,
             self.seed,
@@ -414,8 +414,8 @@ class Experiment:
             "real_time": paced,
             "watchdog": self.watchdog,
             "sensor_filter": self.sensor_filter,
-            **told,
-            **known,
+            **more_details,
+            **details,
         }
         link = Rig(
             board,
@@ -571,19 +571,21 @@ class _Recorder:
     def _columns(self, blocks: list[Floats], start: int) -> Floats:
         """Return the columns of the run for blocks of rows that begin at row `start`."""
         rows = np.concatenate([np.empty((0, len(RIG_COLUMNS) + 1)), *blocks])[:, : len(RIG_COLUMNS)]
-        told = [values[start : start + len(rows), None] for values in self.source.extra_signals.values()]
-        return np.hstack([rows, *told])
+        extra_values = [values[start : start + len(rows), None] for values in self.source.extra_signals.values()]
+        return np.hstack([rows, *extra_values])
 
     def finish(self, name: str, about: dict[str, Any], faults: list[str], step: float) -> Run | None:
         """Return the run; None if fewer than three rows were recorded."""
-        told = tuple(self.source.extra_signals)
+        extra_names = tuple(self.source.extra_signals)
         rows = self._columns(self.taken, 0)
         if len(rows) < 3:
             return None
-        data = {column: rows[:, k] for k, column in enumerate((*RIG_COLUMNS, *told))}
+        data = {column: rows[:, k] for k, column in enumerate((*RIG_COLUMNS, *extra_names))}
         facts = tuple(f"the rig stopped the run after {(len(rows) - 1) * step:.6g} s: {f}" for f in faults)
-        signals = {n: data[n] for n in (*CURRENT_SIGNALS, *told)}, {n: data[n] for n in RIG_COLUMNS[2:]}
-        arguments = RunArguments(*signals, step=step, units=units_of(told), name=name, notes=facts, metadata=about)
+        signals = {n: data[n] for n in (*CURRENT_SIGNALS, *extra_names)}, {n: data[n] for n in RIG_COLUMNS[2:]}
+        arguments = RunArguments(
+            *signals, step=step, units=units_of(extra_names), name=name, notes=facts, metadata=about
+        )
         return Run._from_checked(**arguments.checked_fields())
 
 
@@ -629,11 +631,11 @@ def _check_target(target: Path, *, force: bool) -> None:
     if target.suffix.lower() == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
     check_free(target, force=force, words=RUN_MESSAGES)
-    left = partial_path(target)
+    partial = partial_path(target)
     # Rows would be written to the target of a dangling link.
-    if os.path.lexists(left) and not force:
+    if os.path.lexists(partial) and not force:
         raise DataError(
-            f"{str(left)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
+            f"{str(partial)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
             f"overwrite it with {parameter('force', True)}"
         )
 

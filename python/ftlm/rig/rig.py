@@ -191,7 +191,7 @@ class SignalHandlers:
         self._board = board
         self._before: dict[int, Any] = {}
         self._waiting: int | None = None
-        self._watched = self._kept = self._deferring = False
+        self._watched = self._is_persistent = self._deferring = False
 
     def install(self) -> None:
         """Replace the current handlers; a Ctrl-C that the program ignores stays ignored."""
@@ -212,19 +212,19 @@ class SignalHandlers:
 
     def keep(self) -> None:
         """Install the handlers until :meth:`release`; signals after the first one, or after shutdown, are deferred."""
-        self._kept = True
+        self._is_persistent = True
         self.install()
 
     def restore(self) -> None:
         """Restore all previous handlers, or defer further signals until :meth:`release`."""
-        if self._kept:
+        if self._is_persistent:
             self._deferring = True
         else:
             self._restore()
 
     def release(self) -> None:
         """Restore all previous handlers; :meth:`deliver` raises what was deferred."""
-        self._kept, self._deferring = False, True
+        self._is_persistent, self._deferring = False, True
         self._restore()
         self._deferring = False
 
@@ -252,14 +252,14 @@ class SignalHandlers:
         if not self._before or threading.current_thread() is not threading.main_thread():
             return
         mask = getattr(signal, "pthread_sigmask", None)
-        kept = None if mask is None else mask(signal.SIG_BLOCK, self._before)
+        mask_before = None if mask is None else mask(signal.SIG_BLOCK, self._before)
         try:
             for number, handler in self._before.items():
                 signal.signal(number, handler)
             self._before = {}
         finally:
             if mask is not None:
-                mask(signal.SIG_SETMASK, kept)
+                mask(signal.SIG_SETMASK, mask_before)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         at = frame
@@ -268,14 +268,14 @@ class SignalHandlers:
         if self._deferring or at is not None:
             self._waiting = number
             return
-        before = self._before.get(number)
+        handler = self._before.get(number)
         try:
-            if number == signal.SIGINT and callable(before):
-                before(number, frame)
+            if number == signal.SIGINT and callable(handler):
+                handler(number, frame)
             else:
                 _end(number)
         except BaseException:
-            self._deferring = self._kept
+            self._deferring = self._is_persistent
             if self._board is not None:
                 self._board.gate.close(describe_signal(number))
             raise
@@ -453,9 +453,9 @@ def shut_down(board: Board) -> list[str]:
     let_expire = getattr(board, "let_expire", None)
     expired = False
     if not (zero and off) and let_expire is not None:
-        seen: list[bool] = []
-        _try_step("waiting for the watchdog", lambda: seen.append(let_expire()), troubles)
-        expired = any(seen)
+        results: list[bool] = []
+        _try_step("waiting for the watchdog", lambda: results.append(let_expire()), troubles)
+        expired = any(results)
         if expired:
             troubles.append("the watchdog was let expire instead, which puts 0 V out")
     if not (zero or off or expired):

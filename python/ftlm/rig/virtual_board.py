@@ -314,8 +314,8 @@ def _checked_injection(fault: object) -> tuple[str, int, float, float]:
     count, meaning = _FAULT_CHANNELS.get(name, 1), FAULT_INJECTIONS[name]
     where, when, value = whole_number(channel), finite_number(time_s), finite_number(number)
     if where is None or not 0 <= where < count:
-        there = "has the channel 0 only" if count == 1 else f"has the channels 0 to {count - 1}"
-        raise ModelError(f"inject has {name!r} on channel {short_repr(channel)}; the fault {there}")
+        channels_text = "has the channel 0 only" if count == 1 else f"has the channels 0 to {count - 1}"
+        raise ModelError(f"inject has {name!r} on channel {short_repr(channel)}; the fault {channels_text}")
     if when is None or not 0 <= when <= MAX_RUN_DURATION_S:
         raise ModelError(
             f"inject has {name!r} at {short_repr(time_s)} s; give a time of the run, from 0 to {MAX_RUN_DURATION_S:g} s"

@@ -117,9 +117,9 @@ def watch(path: str, *, keep: bool) -> None:
         while not page.get("closed"):
             timeout = page.get("timeout")
             now = time.monotonic()
-            seen = page.get("beat")
-            if seen != beat or not armed:
-                beat, last = seen, now
+            beat_now = page.get("beat")
+            if beat_now != beat or not armed:
+                beat, last = beat_now, now
                 page.set("last_beat", now)
             armed = timeout > 0
             if armed and now - last > timeout:

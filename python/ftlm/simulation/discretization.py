@@ -246,16 +246,16 @@ def apply_input_nonlinearity(run: Run, structure: Structure, name: str | None = 
     return run.with_input_nonlinearities(limits) if limits else run
 
 
-def check_derivative_orders(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
+def check_derivative_orders(run: Run, structure: Structure, order_values: Mapping[str, float] | None = None) -> None:
     """Raise ModelError for derivatives of a run's signals that its samples do not determine.
 
     The order of another signal is below that of the equation plus 1, and for a zero-order-hold input at most that of
-    the equation, because its jumps have no derivative. ``known`` maps free orders with a single value to it.
+    the equation, because its jumps have no derivative. ``order_values`` maps free orders with a single value to it.
     """
     for item in structure.equations:
-        alpha = item.order.substitute(known or {})
+        alpha = item.order.substitute(order_values or {})
         for term in item.terms:
-            order = term.order.substitute(known or {})
+            order = term.order.substitute(order_values or {})
             if alpha.names or order.names or order.constant <= alpha.constant + ORDER_RESOLUTION:
                 continue
             if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
@@ -336,10 +336,10 @@ def _check_missing(run: Run, structure: Structure) -> None:
     }
     lacking = next((name for name in missing if name in drivers), None)
     if lacking is not None:
-        gone = missing[lacking]
+        mask = missing[lacking]
         raise DataError(
-            f"signal {lacking!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
-            f"{int(np.flatnonzero(gone)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
+            f"signal {lacking!r} of run {run.name!r} holds no value in {int(mask.sum())} rows, first row "
+            f"{int(np.flatnonzero(mask)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
             f"rows yourself, avoid them with {parameter('window')}, or use {parameter('coupling', 'simulated')}"
         )
     if structure.all_filtered and any(name in missing for name in outputs):
@@ -353,10 +353,10 @@ def _check_missing(run: Run, structure: Structure) -> None:
 def check_no_missing(runs: Sequence[Run], what: str) -> None:
     """Raise DataError for missing samples if an analysis cannot exclude them."""
     for run in runs:
-        for name, gone in run.missing_samples.items():
+        for name, is_missing in run.missing_samples.items():
             raise DataError(
-                f"output {name!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
-                f"{int(np.flatnonzero(gone)[0])}: {what} cannot leave them out; use "
+                f"output {name!r} of run {run.name!r} holds no value in {int(is_missing.sum())} rows, first row "
+                f"{int(np.flatnonzero(is_missing)[0])}: {what} cannot leave them out; use "
                 f"{parameter('method', 'output-error')} (identify), a part without gaps, or fill them yourself"
             )
 

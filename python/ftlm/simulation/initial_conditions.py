@@ -130,11 +130,11 @@ _EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, 
 def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     """Return the evidence that the plant rested before the run, or None if it may have been in motion."""
     run = run.unmasked_run or run
-    found = _EVIDENCE_BY_RUN.setdefault(run, {})
+    evidence = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
-    if key not in found:
-        found[key] = _rest_evidence(run, structure) or _slow_start_evidence(run, structure)
-    return found[key]
+    if key not in evidence:
+        evidence[key] = _rest_evidence(run, structure) or _slow_start_evidence(run, structure)
+    return evidence[key]
 
 
 def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
@@ -154,13 +154,13 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
         levels = {}
         visible = any(run[n][0] != 0.0 for n in inputs)
         # A command that is held and changed again and again may have been so before: quiet rows must be long then.
-        held = visible and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
+        has_held_input = visible and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
         for name in outputs:
             noise = noise_at_start(run[name])
             rows = _without_outliers(drop_missing(run[name][:quiet]), noise)
             if rows.size < START_SETTINGS.quiet_rows or not _is_at_rest(rows, noise):
                 return None
-            if held and noise * run.length / _slope_weight(rows.size) > START_SETTINGS.drift_share * float(
+            if has_held_input and noise * run.length / _slope_weight(rows.size) > START_SETTINGS.drift_share * float(
                 np.nanstd(run[name])
             ):
                 return None
@@ -241,11 +241,11 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
     automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
     if not structure.is_linear or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
         return structure
-    found = [rest_evidence(run, structure) for run in runs]
-    known = [f for f in found if f is not None]
-    constant = structure.offset == "constant" and any(f.rows == 0 for f in known)
-    offset = "level" if constant or any(f.shows_level for f in known) else structure.offset
-    initial = "rest" if automatic and len(known) == len(found) else structure.initial
+    evidence = [rest_evidence(run, structure) for run in runs]
+    available = [f for f in evidence if f is not None]
+    constant = structure.offset == "constant" and any(f.rows == 0 for f in available)
+    offset = "level" if constant or any(f.shows_level for f in available) else structure.offset
+    initial = "rest" if automatic and len(available) == len(evidence) else structure.initial
     return replace(structure, initial=initial, offset=offset)
 
 
@@ -259,12 +259,12 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
     outputs = [n for n in structure.signals if n in run.outputs]
     levels = {n: float(drop_missing(run[n])[0]) for n in outputs} if evidence is None else evidence.levels
     inputs = {} if evidence is None else {n: v for n, v in evidence.inputs.items() if n not in limited}
-    moved = {n: v for n, v in {**levels, **inputs}.items() if v != 0.0}
-    if not moved:
+    levels_nonzero = {n: v for n, v in {**levels, **inputs}.items() if v != 0.0}
+    if not levels_nonzero:
         return run, levels
-    samples = {n: run[n] - v for n, v in moved.items()}
+    samples = {n: run[n] - v for n, v in levels_nonzero.items()}
     read = run.sample_times
-    own = None if read is None else {n: read.data[n] - v for n, v in moved.items()}
+    own = None if read is None else {n: read.data[n] - v for n, v in levels_nonzero.items()}
     shifted = run.with_samples(samples, own)
     if run.unmasked_run is not None:
         shifted = shifted.with_unmasked_run(deviations(run.unmasked_run, structure)[0])
@@ -341,9 +341,9 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
     """
     excess = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
-        there = ~np.isnan(one)
-        if float(np.sqrt(np.mean(one[there] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
-            excess += huber_excess(one[there], other[there])
+        is_finite = ~np.isnan(one)
+        if float(np.sqrt(np.mean(one[is_finite] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
+            excess += huber_excess(one[is_finite], other[is_finite])
     return excess
 
 
@@ -351,18 +351,18 @@ def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequenc
     """Misfit between two fits, or a fraction of the excess in the sum of squares if that is larger."""
     squares = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
-        there = ~np.isnan(one)
-        floor, above = float(np.mean(other[there] ** 2)), float(np.sum(one[there] ** 2 - other[there] ** 2))
-        if math.sqrt(float(np.mean(one[there] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
+        is_finite = ~np.isnan(one)
+        floor, above = float(np.mean(other[is_finite] ** 2)), float(np.sum(one[is_finite] ** 2 - other[is_finite] ** 2))
+        if math.sqrt(float(np.mean(one[is_finite] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
             squares += above / floor if floor > 0.0 else math.inf
     return max(misfit(few, many, sizes), SQUARES_WEIGHT * squares)
 
 
-def output_residuals(measured: Floats, simulated: Floats) -> Floats:
+def output_residuals(measurement: Floats, simulated: Floats) -> Floats:
     """Difference of measured and simulated samples; infinite if the simulation is, NaN at missing samples."""
     with np.errstate(invalid="ignore"):
-        rows: Floats = measured - simulated
-    rows[~np.isnan(measured) & ~np.isfinite(rows)] = np.inf
+        rows: Floats = measurement - simulated
+    rows[~np.isnan(measurement) & ~np.isfinite(rows)] = np.inf
     return rows
 
 
@@ -374,9 +374,11 @@ def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Flo
     """
     score, total = 0.0, 0
     for own, other in zip(residuals, reference, strict=True):
-        there, known = drop_missing(own), drop_missing(other)
-        total += there.size
-        score += there.size / variance_inflation(known) * math.log(max(float(np.mean(there**2)), 1e-300))
+        differences, difference = drop_missing(own), drop_missing(other)
+        total += differences.size
+        score += (
+            differences.size / variance_inflation(difference) * math.log(max(float(np.mean(differences**2)), 1e-300))
+        )
     return score + math.log(max(total, 1)) * terms
 
 

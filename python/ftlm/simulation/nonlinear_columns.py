@@ -52,8 +52,8 @@ def append_columns(run: Run, structure: Structure, means: Floats, step: float, *
             values[signal, order] = unknown
         else:
             values[signal, order] = differentiate(rows[signal], order, step, smooth=smooth) if order else rows[signal]
-    found = [np.asarray(item.evaluate(values), dtype=np.float64) for item in columns.values()]
-    return np.vstack([means, *(np.where(np.isfinite(row), row, np.nan) for row in found)])
+    row_values = [np.asarray(item.evaluate(values), dtype=np.float64) for item in columns.values()]
+    return np.vstack([means, *(np.where(np.isfinite(row), row, np.nan) for row in row_values)])
 
 
 def _is_held(run: Run, signal: str, order: float) -> bool:
@@ -80,10 +80,10 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
                 f"{name} does not hold for signals behind a sensor filter; use {parameter('method', 'output-error')}, "
                 "or leave the filter out"
             )
-        held = next(((signal, order) for signal, order in item.channels if _is_held(run, signal, order)), None)
-        if held is not None:
+        pair = next(((signal, order) for signal, order in item.channels if _is_held(run, signal, order)), None)
+        if pair is not None:
             raise ModelError(
-                f"{name} has the derivative of order {held[1]:g} of {held[0]}, and run {run.name!r} holds {held[0]} "
+                f"{name} has the derivative of order {pair[1]:g} of {pair[0]}, and run {run.name!r} holds {pair[0]} "
                 f"between its samples: its jumps have no derivative; say {parameter('intersample', 'foh')} if it moves "
                 "in between"
             )

@@ -87,13 +87,15 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: 
     Those of the states of a sensor filter are -1, -2 and so on.
     """
     alpha = item.order.constant
-    found = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}
+    exponents = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}
     if initial != "caputo":
-        return sorted(found | ({round(e, 9) for e in initial} if not isinstance(initial, str) else set()))
-    left: set[float] = set()
+        return sorted(exponents | ({round(e, 9) for e in initial} if not isinstance(initial, str) else set()))
+    offsets: set[float] = set()
     for lowest, order in [(0.0, alpha), *((alpha - t.order.constant, t.order.constant) for t in item.terms)]:
-        left |= {round(lowest + i, 9) for i in range(math.ceil(order - ORDER_TOLERANCE))}
-    return sorted(found | {e for e in left if e == 0.0 or all(abs(e - o) > OFFSET_POWER_TOLERANCE for o in found)})
+        offsets |= {round(lowest + i, 9) for i in range(math.ceil(order - ORDER_TOLERANCE))}
+    return sorted(
+        exponents | {e for e in offsets if e == 0.0 or all(abs(e - o) > OFFSET_POWER_TOLERANCE for o in exponents)}
+    )
 
 
 def nonuniform_sample_times(model: Model, run: Run) -> Floats | None:
@@ -137,10 +139,10 @@ def simulate_samples(
     At the sample times of the grid, or at given times [s].
     """
     core, terms = output_simulation(model, run, initial, times, every)
-    samples, found = core.samples(every, terms, stop_flag())
+    samples, initial_terms = core.samples(every, terms, stop_flag())
     if initial is not None or model.structure.offset != "level":
-        return samples, named_terms(model, found)
-    return add_levels(model, deviations(run, model.structure)[1], samples, named_terms(model, found))
+        return samples, named_terms(model, initial_terms)
+    return add_levels(model, deviations(run, model.structure)[1], samples, named_terms(model, initial_terms))
 
 
 def add_levels(
@@ -177,7 +179,7 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
         return long
     short = replace(model, structure=replace(model.structure, initial="caputo"))
     try:
-        measured = measured_samples(model, run, FIRST_REFINEMENT)
+        outputs = measured_samples(model, run, FIRST_REFINEMENT)
         times = nonuniform_sample_times(model, run)
         (few, ours), (many, theirs) = (
             simulate_samples(each, run, FIRST_REFINEMENT, None, times) for each in (short, long)
@@ -186,8 +188,8 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
         # The coarse grid makes the equations unsolvable; finer ones need not.
         return long
     terms = sum(map(len, ours.values())), sum(map(len, theirs.values()))
-    residuals = [*output_residuals(measured, few)], [*output_residuals(measured, many)]
-    sizes = np.nanstd(measured, axis=1).tolist()
+    residuals = [*output_residuals(outputs, few)], [*output_residuals(outputs, many)]
+    sizes = np.nanstd(outputs, axis=1).tolist()
     return long if needs_history(model.structure, *residuals, sizes, terms) else short
 
 
@@ -247,20 +249,20 @@ class StartResiduals:
 
 def is_in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
     """Whether the residuals of a model from rest, on all runs together, require a history."""
-    left = []
+    residuals = []
     for run in runs:
         if (one := _start_residuals(structure, run)) is None:
             return False
-        left.append(one)
-    return _requires_history(left)
+        residuals.append(one)
+    return _requires_history(residuals)
 
 
-def _requires_history(left: Sequence[StartResiduals]) -> bool:
+def _requires_history(residuals: Sequence[StartResiduals]) -> bool:
     """Whether all runs together require a history."""
-    terms = sum(one.terms for one in left)
-    excess = sum(misfit([*one.rest], [*one.history], one.sizes.tolist()) for one in left)
+    terms = sum(one.terms for one in residuals)
+    excess = sum(misfit([*one.rest], [*one.history], one.sizes.tolist()) for one in residuals)
     # Noise that is coloured is followed by slow terms in any run.
-    spread = max([1.0, *(variance_inflation(drop_missing(past)) for one in left for past in one.history)])
+    spread = max([1.0, *(variance_inflation(drop_missing(past)) for one in residuals for past in one.history)])
     return terms > 0 and excess / spread > chi_squared(terms, REST_TEST_LEVEL)
 
 
@@ -272,13 +274,15 @@ def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
     for start in ("rest", history(run, structure)):
         model = Model(replace(structure, initial=start))
         try:
-            samples, found = simulate_samples(model, run, FIRST_REFINEMENT, None, nonuniform_sample_times(model, run))
+            samples, initial_terms = simulate_samples(
+                model, run, FIRST_REFINEMENT, None, nonuniform_sample_times(model, run)
+            )
         except FtlmError:
             return None
         if not np.all(np.isfinite(samples)):
             return None
         ends.append(output_residuals(measured_samples(model, run, FIRST_REFINEMENT), samples))
-        terms = sum(map(len, found.values()))
+        terms = sum(map(len, initial_terms.values()))
     return StartResiduals(ends[0], ends[1], terms, np.nanstd([run[o] for o in structure.outputs], axis=1))
 
 
@@ -292,14 +296,18 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
         for run in runs
         if rest_evidence(run, structure) is None and resolve_initial_conditions(run, structure) == "rest"
     )
-    return [name for name, left in looked if left is not None and _is_reportable(left) and _requires_history([left])]
+    return [
+        name
+        for name, residuals in looked
+        if residuals is not None and _is_reportable(residuals) and _requires_history([residuals])
+    ]
 
 
-def _is_reportable(left: StartResiduals) -> bool:
+def _is_reportable(residuals: StartResiduals) -> bool:
     """Whether a model explains a run with a history, and not from rest, by enough for a report."""
     # An overflow is infinite, and nothing is reported where both are.
     with np.errstate(over="ignore", invalid="ignore"):
-        ends = [end / left.sizes[:, None] for end in (left.rest, left.history)]
+        ends = [end / residuals.sizes[:, None] for end in (residuals.rest, residuals.history)]
         rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) for end in ends)
         large = (past <= MAX_RESIDUAL_RATIO * rest) & (rest - past >= MIN_RESIDUAL_DROP)
     return bool(np.any(large & (past <= MAX_HISTORY_RESIDUAL) & (rest <= MAX_REST_RESIDUAL)))

@@ -86,21 +86,21 @@ def fit_history(
 
     driven = respond(None)
     columns = [respond(name) - driven for name in names]
-    measured = measured_samples(model, run, FIRST_REFINEMENT)
+    measurements = measured_samples(model, run, FIRST_REFINEMENT)
     if past is None or not all(np.all(np.isfinite(rows)) for rows in (driven, *columns)):
         return None
-    known = ~np.isnan(measured)
-    weights = 1.0 / np.maximum(np.nanstd(measured, axis=1), np.finfo(np.float64).tiny)[:, None]
-    target, forced = ((weights * rows)[known] for rows in (measured - driven, driven))
-    responses = np.stack([(weights * rows)[known] for rows in columns], axis=1)
+    is_finite = ~np.isnan(measurements)
+    weights = 1.0 / np.maximum(np.nanstd(measurements, axis=1), np.finfo(np.float64).tiny)[:, None]
+    target, forced = ((weights * rows)[is_finite] for rows in (measurements - driven, driven))
+    responses = np.stack([(weights * rows)[is_finite] for rows in columns], axis=1)
     norms = column_norms(responses)
     responses, names = (
         responses[:, norms > 0.0] / norms[norms > 0.0],
         [n for n, v in zip(names, norms, strict=True) if v],
     )
     # Files and simulations know a history as powers of time.
-    left, spread, right = thin_svd(responses)
-    kept = spread > RESPONSE_TOLERANCE * spread.max(initial=0.0)
+    u, spread, right = thin_svd(responses)
+    is_significant = spread > RESPONSE_TOLERANCE * spread.max(initial=0.0)
     fixed = [k for k, (i, e) in enumerate(names) if (i, e) in free or e == LEVEL_EXPONENT]
     basis = orthonormal(responses[:, fixed], RESPONSE_TOLERANCE)
     target_left, forced_left = (
@@ -111,9 +111,11 @@ def fit_history(
     mixed = []
     for group in past:
         start = float(np.sum((weights[None] * group[:, :, :1]) ** 2))
-        octaves = np.stack([(weights * rows)[known] for rows in group], axis=1)
-        along = np.stack([projections(left[:, kept], octave) for octave in octaves.T], axis=1)
-        mixed.append((right[kept].T / spread[kept]) @ along * math.sqrt(size / start if start > 0.0 else 0.0))
+        octaves = np.stack([(weights * rows)[is_finite] for rows in group], axis=1)
+        along = np.stack([projections(u[:, is_significant], octave) for octave in octaves.T], axis=1)
+        mixed.append(
+            (right[is_significant].T / spread[is_significant]) @ along * math.sqrt(size / start if start > 0.0 else 0.0)
+        )
     mixing = np.concatenate(mixed, axis=1)
     shapes = linear_combinations(responses, mixing)
     shapes -= linear_combinations(basis, np.einsum("ij,ik->jk", basis, shapes))
@@ -122,10 +124,10 @@ def fit_history(
         responses[:, fixed], target - linear_combinations(responses, values), RESPONSE_TOLERANCE
     )
     values /= norms[norms > 0.0]
-    found: list[list[tuple[float, float]]] = [[] for _ in outputs]
+    history: list[list[tuple[float, float]]] = [[] for _ in outputs]
     for (i, exponent), value in zip(names, values.tolist(), strict=True):
-        found[i].append((exponent, value))
-    return False, found, False
+        history[i].append((exponent, value))
+    return False, history, False
 
 
 def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
@@ -134,9 +136,9 @@ def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
     The standard deviation of the prior has the largest likelihood. The rest of the signal is
     noise, with the variance of its sums.
     """
-    left, spread, right = thin_svd(shapes)
-    along = projections(left, target)
-    noise = target - linear_combinations(left, along)
+    u, spread, right = thin_svd(shapes)
+    along = projections(u, target)
+    noise = target - linear_combinations(u, along)
     variance = float(np.mean(noise**2)) * variance_inflation(noise)
     if not variance > 0.0:
         return right.T @ np.divide(along, spread, out=np.zeros_like(along), where=spread > 0.0)
@@ -161,7 +163,7 @@ def _past_responses(model: Model, run: Run, times: Floats, max_m: int) -> list[F
     octaves = [0, *(1 << k for k in range((PAST_LENGTHS * rows - 1).bit_length())), PAST_LENGTHS * rows]
     rest = {o: np.zeros(length) for o in outputs}
     longer = Run.from_arrays(step=run.step, inputs={forcing: np.ones(length)}, outputs=rest)
-    found = []
+    responses = []
     for forced in outputs:
         equations = []
         for item in model.equations:
@@ -189,6 +191,6 @@ def _past_responses(model: Model, run: Run, times: Floats, max_m: int) -> list[F
         if not np.all(np.isfinite(steps)):
             return None
         at = times / run.step
-        after = [np.stack([np.interp(at + k, np.arange(length), row) for row in steps]) for k in octaves]
-        found.append(np.stack([new - old for old, new in itertools.pairwise(after)]))
-    return found
+        series_of_octaves = [np.stack([np.interp(at + k, np.arange(length), row) for row in steps]) for k in octaves]
+        responses.append(np.stack([new - old for old, new in itertools.pairwise(series_of_octaves)]))
+    return responses

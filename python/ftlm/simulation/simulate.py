@@ -198,12 +198,12 @@ def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
             if term.column == item.output and i < math.ceil(order - 1e-9):
                 share = float(term.fixed or 0.0) * math.gamma(i + 1.0) / math.gamma(power + 1.0)
                 needed[power] = needed.get(power, 0.0) - share * value
-    lacking = [e for e in needed if e != round(e) and not any(abs(e - given) < 1e-6 for given in terms)]
+    lacking = [e for e in needed if e != round(e) and not any(abs(e - exponent) < 1e-6 for exponent in terms)]
     if lacking:
-        shown = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(needed.items()))
+        text = ", ".join(f"{e:g}: {v:.6g}" for e, v in sorted(needed.items()))
         raise ModelError(
             f"initial terms of {item.output}: powers of t {', '.join(map(str, sorted(values)))}, and the equation has "
-            f"a term of fractional order: initial values by Caputo's definition are {{{shown}}} in the "
+            f"a term of fractional order: initial values by Caputo's definition are {{{text}}} in the "
             f"equation that is integrated; give all of these, or t^{lacking[0]:g} as 0 if only the powers are meant"
         )
 

@@ -61,17 +61,17 @@ def simulate_refined(
     model = replace(model, structure=resolve_start([run], model.structure))
     if model.structure.offset != "level":
         return _simulate_refined(model, run, None, tolerance, max_m, on_grid)
-    moved, levels = deviations(run, model.structure)
-    found = None
+    shifted, levels = deviations(run, model.structure)
+    result = None
     if model.structure.initial == "auto":
         # A run that may have been in motion may as well have rested at its level.
         rest = replace(model, structure=replace(model.structure, initial="rest"))
-        found = _simulate_refined(rest, moved, None, tolerance, max_m, on_grid)
-    if found is None or not _has_white_residuals(model, moved, found):
-        free = _simulate_refined(model, moved, None, tolerance, max_m, on_grid)
-        found = free if found is None or not _explains_as_well(model, moved, found, free) else found
-    outputs, terms = add_levels(model, levels, found.outputs, found.initial)
-    return replace(found, outputs=outputs, initial=terms)
+        result = _simulate_refined(rest, shifted, None, tolerance, max_m, on_grid)
+    if result is None or not _has_white_residuals(model, shifted, result):
+        free = _simulate_refined(model, shifted, None, tolerance, max_m, on_grid)
+        result = free if result is None or not _explains_as_well(model, shifted, result, free) else result
+    outputs, terms = add_levels(model, levels, result.outputs, result.initial)
+    return replace(result, outputs=outputs, initial=terms)
 
 
 def _residuals(model: Model, run: Run, simulated: OutputSamples) -> list[Floats]:
@@ -115,13 +115,13 @@ def _simulate_refined(
     # Given to the core, initial terms are powers of time alone.
     levels = {o: dict(own).get(LEVEL_EXPONENT, 0.0) for o, own in zip(model.outputs, terms[1], strict=True)}
     powers = (terms[0], [[term for term in own if term[0] != LEVEL_EXPONENT] for own in terms[1]], terms[2])
-    (outputs, found), refinement, change = core.refine(
+    (outputs, initial_values), refinement, change = core.refine(
         powers, tolerance, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()
     )
     if not any(levels.values()):
-        return OutputSamples(outputs, named_terms(model, found), refinement, change)
-    fitted = {o: {**own, LEVEL_EXPONENT: 0.0} for o, own in named_terms(model, found).items()}
-    return OutputSamples(*add_levels(model, levels, outputs, fitted), refinement, change)
+        return OutputSamples(outputs, named_terms(model, initial_values), refinement, change)
+    initial_terms = {o: {**own, LEVEL_EXPONENT: 0.0} for o, own in named_terms(model, initial_values).items()}
+    return OutputSamples(*add_levels(model, levels, outputs, initial_terms), refinement, change)
 
 
 def exact_samples(

@@ -143,7 +143,7 @@ class Circuit:
         tokens = _TOKEN_PATTERN.findall(text)
         if "".join(tokens) != text:
             raise ModelError(f"circuit {self.text!r} is not understood; write it as in 'R0-p(R1,CPE1)-W1'")
-        seen: set[str] = set()
+        names: set[str] = set()
 
         def group(kind: str, parts: list[Node]) -> Node:
             return parts[0] if len(parts) == 1 else (kind, parts)
@@ -168,14 +168,14 @@ class Circuit:
                     raise ModelError(f"circuit {self.text!r}: a parenthesis is not closed; write p(R1,C1)")
                 return group("parallel", parts)
             if _letters(token) not in CIRCUIT_ELEMENTS:
-                known = ", ".join(f"{n} ({e.meaning})" for n, e in CIRCUIT_ELEMENTS.items())
+                elements = ", ".join(f"{n} ({e.meaning})" for n, e in CIRCUIT_ELEMENTS.items())
                 raise ModelError(
-                    f"circuit {self.text!r}: {token!r} is not an element; known: {known}, and p(…,…); an equation "
+                    f"circuit {self.text!r}: {token!r} is not an element; known: {elements}, and p(…,…); an equation "
                     "needs '='"
                 )
-            if token in seen:
+            if token in names:
                 raise ModelError(f"circuit {self.text!r}: two elements are {token}; number them, such as R0 and R1")
-            seen.add(token)
+            names.add(token)
             return _letters(token), token
 
         tree = series()

@@ -379,8 +379,8 @@ class Equation:
             A fixed input order that is not below a fixed alpha.
         """
         for item in self.terms:
-            known = not (self.order.names or item.order.names or set(item.signals) <= set(outputs))
-            if known and item.order.constant >= self.order.constant - 1e-9:
+            is_fixed = not (self.order.names or item.order.names or set(item.signals) <= set(outputs))
+            if is_fixed and item.order.constant >= self.order.constant - 1e-9:
                 terms = self.nonlinear_terms
                 follows, what = (f"the non-linear term {terms[0]}", "motion") if terms else ("friction", "velocity")
                 raise ModelError(

@@ -109,11 +109,11 @@ class Expression:
                 return values[self.signal, self.value]
             case "power":
                 return self.arguments[0]._evaluate(values) ** self._exponent
-        found = [argument._evaluate(values) for argument in self.arguments]
+        argument_values = [argument._evaluate(values) for argument in self.arguments]
         if self.operation in EXPRESSION_FUNCTIONS:
-            return EXPRESSION_FUNCTIONS[self.operation][0](found[0])
-        out = found[0]
-        for value in found[1:]:
+            return EXPRESSION_FUNCTIONS[self.operation][0](argument_values[0])
+        out = argument_values[0]
+        for value in argument_values[1:]:
             out = out + value if self.operation == "add" else out * value
         return out
 
@@ -124,9 +124,9 @@ class Expression:
     @check_arguments
     def gradient(self, values: Mapping[Channel, Floats | float]) -> dict[Channel, Any]:
         """Return the partial derivatives with respect to the channels, by channel; that of abs at 0 is 0."""
-        known = {c: np.asarray(v, dtype=np.float64) for c, v in values.items()}
+        samples = {c: np.asarray(v, dtype=np.float64) for c, v in values.items()}
         with np.errstate(all="ignore"):
-            return {c: self._derivative(c, known) for c in self.channels}
+            return {c: self._derivative(c, samples) for c in self.channels}
 
     def _derivative(self, channel: Channel, values: Mapping[Channel, Any]) -> Any:
         """Return the partial derivative with respect to one channel by the chain rule."""
@@ -135,16 +135,16 @@ class Expression:
         inner = [argument._derivative(channel, values) for argument in self.arguments]
         if self.operation in ("constant", "add"):
             return sum(inner)
-        found = [argument._evaluate(values) for argument in self.arguments]
+        argument_values = [argument._evaluate(values) for argument in self.arguments]
         if self.operation == "power":
             n = self._exponent
-            return n * found[0] ** (n - 1) * inner[0]
+            return n * argument_values[0] ** (n - 1) * inner[0]
         if self.operation in EXPRESSION_FUNCTIONS:
-            return EXPRESSION_FUNCTIONS[self.operation][1](found[0]) * inner[0]
+            return EXPRESSION_FUNCTIONS[self.operation][1](argument_values[0]) * inner[0]
         total: Any = 0.0
         for i, slope in enumerate(inner):
             product = slope
-            for j, value in enumerate(found):
+            for j, value in enumerate(argument_values):
                 product = product if i == j else product * value
             total = total + product
         return total
@@ -224,22 +224,22 @@ def channel(signal: str, order: float = 0.0) -> Expression:
 def add(*terms: Expression) -> Expression:
     """Return a sum in normal form: flat, with one constant at the end."""
     parts = [part for term in terms for part in (term.arguments if term.operation == "add" else (term,))]
-    known = sum(part.value for part in parts if part.operation == "constant")
+    total = sum(part.value for part in parts if part.operation == "constant")
     parts = [part for part in parts if part.operation != "constant"]
-    if known or not parts:
-        parts.append(constant(known))
+    if total or not parts:
+        parts.append(constant(total))
     return parts[0] if len(parts) == 1 else Expression("add", tuple(parts))
 
 
 def multiply(*factors: Expression) -> Expression:
     """Return a product in normal form: flat, with one constant factor at the head."""
     parts = [part for factor in factors for part in (factor.arguments if factor.operation == "multiply" else (factor,))]
-    known = math.prod(part.value for part in parts if part.operation == "constant")
+    product = math.prod(part.value for part in parts if part.operation == "constant")
     parts = [part for part in parts if part.operation != "constant"]
-    if known == 0.0 or not parts:
-        return constant(known)
-    if known != 1.0:
-        parts.insert(0, constant(known))
+    if product == 0.0 or not parts:
+        return constant(product)
+    if product != 1.0:
+        parts.insert(0, constant(product))
     return parts[0] if len(parts) == 1 else Expression("multiply", tuple(parts))
 
 

@@ -145,8 +145,8 @@ class EquationParser:
 
     # -------------------------------------------------------------------------------------------------- tokens
 
-    def _peek(self, ahead: int = 0) -> tuple[str, str, int]:
-        index = self._position + ahead
+    def _peek(self, offset: int = 0) -> tuple[str, str, int]:
+        index = self._position + offset
         return self._tokens[index] if index < len(self._tokens) else ("end", "the end", len(self.text))
 
     def _take(self) -> tuple[str, str, int]:
@@ -160,29 +160,29 @@ class EquationParser:
 
     def _accept(self, symbol: str) -> bool:
         """Take the next token if it is this symbol."""
-        found = self._peek()[:2] == ("symbol", symbol)
-        self._position += found
-        return found
+        is_match = self._peek()[:2] == ("symbol", symbol)
+        self._position += is_match
+        return is_match
 
-    def _expect(self, symbol: str, wanted: str | None = None) -> None:
+    def _expect(self, symbol: str, expectation: str | None = None) -> None:
         if self._peek()[1] != symbol:
-            raise self._syntax_error(wanted or f"'{symbol}'")
+            raise self._syntax_error(expectation or f"'{symbol}'")
         self._take()
 
     def _error(self, message: str) -> ModelError:
         return ModelError(f"equation {self.text!r}: {message}")
 
-    def _syntax_error(self, wanted: str) -> ModelError:
+    def _syntax_error(self, expectation: str) -> ModelError:
         kind, value, at = self._peek()
         if kind == "symbol" and value in ",:'":
             return self._error(f"{value!r} at character {at + 1} has no meaning there")
-        if value == "D" or (wanted == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
+        if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
             return self._error(
-                f"expected {wanted} at character {at + 1}, found {value!r}; D is the derivative in an equation: give a "
+                f"expected {expectation} at character {at + 1}, found {value!r}; D is the derivative in an equation: give a "
                 "signal of this name another one, for column D by -y y=D, or by outputs={'y': 'D'} in Python"
             )
         return self._error(
-            f"expected {wanted} at character {at + 1}, found {value!r}; "
+            f"expected {expectation} at character {at + 1}, found {value!r}; "
             "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
         )
 
@@ -193,7 +193,7 @@ class EquationParser:
         if self._is_transfer():
             self._transfer()
             return self
-        self.left = self._sum(left=True)
+        self.left = self._sum(is_lhs=True)
         self._expect("=")
         if self._sees("0", "the end"):
             self._take()
@@ -205,22 +205,22 @@ class EquationParser:
 
     def parse_expression(self) -> Expression:
         """Parse the whole text as the expression of a non-linear term."""
-        found = self._expression()
+        terms = self._expression()
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-', '*' or the end")
-        return found
+        return terms
 
-    def _sum(self, *, left: bool = False, closed: bool = False) -> list[ParsedTerm]:
+    def _sum(self, *, is_lhs: bool = False, closed: bool = False) -> list[ParsedTerm]:
         """Parse a sum up to a token that does not continue it."""
-        found: list[ParsedTerm] = []
+        terms: list[ParsedTerm] = []
         while True:
             sign = self._signs()
             if self._is_offset():
-                self._take_offset(sign, left=left)
-            elif closed or not (self._take_printed_offset() or self._take_friction(-sign if left else sign)):
-                found += self._item(sign)
+                self._take_offset(sign, is_lhs=is_lhs)
+            elif closed or not (self._take_printed_offset() or self._take_friction(-sign if is_lhs else sign)):
+                terms += self._item(sign)
             if self._peek()[1] not in "+-" or self._peek()[0] != "symbol":
-                return found
+                return terms
 
     def _signs(self) -> float:
         sign = 1.0
@@ -308,8 +308,8 @@ class EquationParser:
 
     def _is_offset(self) -> bool:
         """Whether the next term is an unknown constant; raise for a known one."""
-        (kind, value, at), (after, symbol, _) = self._peek(), self._peek(1)
-        if not (after == "end" or (after == "symbol" and symbol in "+-=")):
+        (kind, value, at), (kind_after, symbol, _) = self._peek(), self._peek(1)
+        if not (kind_after == "end" or (kind_after == "symbol" and symbol in "+-=")):
             return False
         if kind == "number":
             raise self._error(
@@ -318,11 +318,11 @@ class EquationParser:
             )
         return kind == "name" and _OFFSET_PATTERN.fullmatch(value) is not None
 
-    def _take_offset(self, sign: float, *, left: bool) -> None:
+    def _take_offset(self, sign: float, *, is_lhs: bool) -> None:
         _, value, at = self._peek()
-        if self.offset or sign < 0 or left:
+        if self.offset or sign < 0 or is_lhs:
             reason = "stands there twice" if self.offset else "has a sign, but an unknown constant has its own"
-            reason = "stands on the left-hand side" if left else reason
+            reason = "stands on the left-hand side" if is_lhs else reason
             raise self._error(
                 f"the offset {value!r} at character {at + 1} {reason}; write '+ c' once, on the right-hand side"
             )
@@ -344,15 +344,15 @@ class EquationParser:
 
     # ------------------------------------------------------------------------------------------ non-linear terms
 
-    def _closing_distance(self, ahead: int = 0) -> int:
+    def _closing_distance(self, offset: int = 0) -> int:
         """Return the distance to the token behind the parenthesis that closes the next one."""
         depth = 0
         while True:
-            kind, value, _ = self._peek(ahead)
+            kind, value, _ = self._peek(offset)
             depth += (value == "(") - (value == ")")
-            ahead += 1
+            offset += 1
             if not depth or kind == "end":
-                return ahead
+                return offset
 
     def _is_curved(self, end: int) -> bool:
         """Whether a power or a function is among the tokens up to a distance."""
@@ -417,10 +417,10 @@ class EquationParser:
 
     def _operator(self) -> Order | None:
         """Parse ``D``, ``D^order`` or ``d/dt`` before a signal or parentheses; None for other text."""
-        found = self._leibniz()
-        if found is not None and not found[1]:
-            self._position += found[2]
-            return found[0]
+        operator = self._leibniz()
+        if operator is not None and not operator[1]:
+            self._position += operator[2]
+            return operator[0]
         if self._peek()[:2] != ("name", "D"):
             return None
         self._take()
@@ -432,7 +432,7 @@ class EquationParser:
         self._depth += 1
         if self._depth > MAX_DEPTH:
             raise self._error(f"parentheses are nested more than {MAX_DEPTH} times; write the term without some")
-        found = self._expression()
+        terms = self._expression()
         if self._peek()[0] == "name":
             at = self._peek()[2]
             raise self._error(
@@ -441,7 +441,7 @@ class EquationParser:
             )
         self._expect(")")
         self._depth -= 1
-        return found
+        return terms
 
     def _expression(self) -> Expression:
         """Parse a sum of products of numbers, signals and functions, without free parameters."""
@@ -507,9 +507,9 @@ class EquationParser:
         """Parse a function of an expression."""
         _, name, at = self._take()
         if name not in EXPRESSION_FUNCTIONS:
-            known = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
+            reason = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
             friction = "; friction is '- fc*sign(D y)', and drag '- w abs(D y)*D y'" if name == "sign" else ""
-            raise self._error(f"{name}(…) at character {at + 1}: {known}{friction}")
+            raise self._error(f"{name}(…) at character {at + 1}: {reason}{friction}")
         try:
             return apply(name, self._group())
         except ModelError as error:
@@ -521,9 +521,9 @@ class EquationParser:
 
     def _derivative(self) -> tuple[Order | None, str]:
         """Parse a signal or its derivative; the order is None without one."""
-        found = self._leibniz()
-        if found is not None:
-            order, signal, tokens = found
+        operator = self._leibniz()
+        if operator is not None:
+            order, signal, tokens = operator
             self._position += tokens
             return order, signal or self._signal()
         if self._peek()[:2] == ("name", "D"):
@@ -537,30 +537,30 @@ class EquationParser:
 
     def _leibniz(self) -> tuple[Order, str, int] | None:
         """Return order, signal and number of tokens of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
-        ahead, order = 0, 1
+        distance, order = 0, 1
         kind, value, _ = self._peek()
         if kind != "name" or not value.startswith("d"):
             return None
         signal = value[1:]
         if not signal and self._peek(1)[1] == "^" and self._peek(2)[1].isdigit():
-            ahead, order = 2, int(self._peek(2)[1])
+            distance, order = 2, int(self._peek(2)[1])
             if self._peek(3)[0] == "name":
-                ahead, signal = 3, self._peek(3)[1]
+                distance, signal = 3, self._peek(3)[1]
         elif re.fullmatch(r"\d+\D.*", signal):
             digits = re.match(r"\d+", signal)
             assert digits is not None
             order, signal = int(digits[0]), signal[digits.end() :]
-        if self._peek(ahead + 1)[1] != "/":
+        if self._peek(distance + 1)[1] != "/":
             return None
-        bottom = self._peek(ahead + 2)[1]
-        ahead += 3
-        if bottom == "dt" and self._peek(ahead)[1] == "^" and self._peek(ahead + 1)[1] == str(order):
-            ahead += 2
+        bottom = self._peek(distance + 2)[1]
+        distance += 3
+        if bottom == "dt" and self._peek(distance)[1] == "^" and self._peek(distance + 1)[1] == str(order):
+            distance += 2
         elif bottom != ("dt" if order == 1 else f"dt{order}"):
             return None
         if signal:
             self.plain.add(signal)
-        return Order(float(order)), signal, ahead
+        return Order(float(order)), signal, distance
 
     def _signal(self) -> str:
         """Parse a signal, at time t or delayed, or an input behind a saturation or a dead zone."""
@@ -577,9 +577,9 @@ class EquationParser:
             self._time_argument(value)
             return value
         self._take()
-        before = set(self.plain)
+        plain_before = set(self.plain)
         signal = self._signal()
-        self.plain = before | (self.plain - {signal})
+        self.plain = plain_before | (self.plain - {signal})
         if law == "dead_zone" and (signal, "saturation") in self.limits:
             raise self._error(f"a dead zone acts before a saturation: write sat(dead({signal}, …), …)")
         self._expect(",", "',' and the limit, as in sat(u, 0.94)")
@@ -622,12 +622,12 @@ class EquationParser:
             )
         return self._value("a delay [s], or LEAST:LARGEST where it is estimated")
 
-    def _value(self, wanted: str) -> Value:
+    def _value(self, expectation: str) -> Value:
         """Parse a number, or an interval in which one is estimated."""
         ends = []
         while True:
             if self._peek()[0] != "number":
-                raise self._syntax_error(wanted)
+                raise self._syntax_error(expectation)
             ends.append(float(self._take()[1]))
             if len(ends) == 2 or not self._accept(":"):
                 return ends[0] if len(ends) == 1 else (ends[0], ends[1])
@@ -664,20 +664,20 @@ class EquationParser:
 
     def _take_friction(self, sign: float) -> bool:
         """Parse ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; False for any other term."""
-        ahead, number, name = 0, 1.0, None
-        if self._peek(ahead)[0] == "number":
-            number = float(self._peek(ahead)[1])
-            ahead += 1 + (self._peek(ahead + 1)[1] == "*")
-        if self._peek(ahead)[0] == "name" and self._peek(ahead)[1] not in ("D", "sign", "exp"):
-            name = self._peek(ahead)[1]
-            ahead += 1 + (self._peek(ahead + 1)[1] == "*")
-        if self._peek(ahead)[1] not in ("sign", "exp") or self._peek(ahead + 1)[1] != "(":
+        distance, number, name = 0, 1.0, None
+        if self._peek(distance)[0] == "number":
+            number = float(self._peek(distance)[1])
+            distance += 1 + (self._peek(distance + 1)[1] == "*")
+        if self._peek(distance)[0] == "name" and self._peek(distance)[1] not in ("D", "sign", "exp"):
+            name = self._peek(distance)[1]
+            distance += 1 + (self._peek(distance + 1)[1] == "*")
+        if self._peek(distance)[1] not in ("sign", "exp") or self._peek(distance + 1)[1] != "(":
             return False
-        if self._peek(ahead)[1] == "exp":
-            after = self._closing_distance(ahead + 1)
-            if self._peek(after + (self._peek(after)[1] == "*"))[1] != "sign":
+        if self._peek(distance)[1] == "exp":
+            end_distance = self._closing_distance(distance + 1)
+            if self._peek(end_distance + (self._peek(end_distance)[1] == "*"))[1] != "sign":
                 return False
-        self._position += ahead
+        self._position += distance
         near = self._stribeck_factor() if self._sees("exp") else None
         if near is not None:
             self._accept("*")
@@ -726,10 +726,10 @@ class EquationParser:
             self._expect(symbol, f"'{symbol}', as in exp(-(D y/vs)^2)")
         return signal, float(value) if kind == "number" else value
 
-    def _velocity(self, wanted: str) -> str:
+    def _velocity(self, expectation: str) -> str:
         """Parse ``D y``."""
         if not self._sees("D") or self._peek(1)[0] != "name":
-            raise self._syntax_error(wanted)
+            raise self._syntax_error(expectation)
         self._take()
         return self._take()[1]
 
@@ -799,10 +799,10 @@ class EquationParser:
         top, bottom, divides, delay = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, 0.0
         while True:
             kind, value, _ = self._peek()
-            after = [self._peek(k)[1] for k in (1, 2, 3)]
-            if value in ("e", "exp") and after[0] in ("^", "("):
+            symbols = [self._peek(k)[1] for k in (1, 2, 3)]
+            if value in ("e", "exp") and symbols[0] in ("^", "("):
                 delay = self._exponential()
-            elif self._ends_ratio(kind, value, after, named=common is None):
+            elif self._ends_ratio(kind, value, symbols, is_named=common is None):
                 return top, bottom, delay
             elif divides:
                 bottom = self._times(bottom, self._factor())
@@ -813,11 +813,11 @@ class EquationParser:
                 self._accept("*")
 
     @staticmethod
-    def _ends_ratio(kind: str, value: str, after: list[str], *, named: bool) -> bool:
+    def _ends_ratio(kind: str, value: str, symbols: list[str], *, is_named: bool) -> bool:
         """Whether a token ends a transfer function: the name of its signal, or the end of the term without one."""
-        if not named:
+        if not is_named:
             return kind == "end" or (kind == "symbol" and value in "+-")
-        last = after[0] in ("the end", "+", "-") or after == ["(", "s", ")"]
+        last = symbols[0] in ("the end", "+", "-") or symbols == ["(", "s", ")"]
         return kind == "name" and value not in ("s", "sqrt") and last
 
     def _exponential(self) -> float:
@@ -839,7 +839,7 @@ class EquationParser:
 
     def _polynomial(self) -> SymbolicPolynomial:
         """Parse a sum of products of numbers, names and powers of s."""
-        found: SymbolicPolynomial = []
+        polynomial: SymbolicPolynomial = []
         while True:
             sign = self._signs()
             product = self._factor()
@@ -847,13 +847,15 @@ class EquationParser:
                 self._accept("*")
                 product = self._times(product, self._factor())
             for c, name, order in product:
-                same = next((k for k, (_, n, o) in enumerate(found) if (n, o) == (None, order) and name is None), None)
+                same = next(
+                    (k for k, (_, n, o) in enumerate(polynomial) if (n, o) == (None, order) and name is None), None
+                )
                 if same is None:
-                    found.append((sign * c, name, order))
+                    polynomial.append((sign * c, name, order))
                 else:
-                    found[same] = (found[same][0] + sign * c, None, order)
+                    polynomial[same] = (polynomial[same][0] + sign * c, None, order)
             if self._peek()[0] != "symbol" or self._peek()[1] not in "+-":
-                return [item for item in found if item[0] != 0.0] or UNIT_POLYNOMIAL
+                return [item for item in polynomial if item[0] != 0.0] or UNIT_POLYNOMIAL
 
     def _factor(self) -> SymbolicPolynomial:
         """Parse one factor of a transfer function."""
@@ -881,14 +883,14 @@ class EquationParser:
                 f"the power {value!r} of a polynomial at character {at + 1} is not a whole number from 1 to "
                 f"{MAX_POLYNOMIAL_POWER}; only these give a sum of powers of s"
             )
-        found = UNIT_POLYNOMIAL
+        product = UNIT_POLYNOMIAL
         for _ in range(int(value)):
-            found = self._times(found, inner)
-        return found
+            product = self._times(product, inner)
+        return product
 
     def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
         """Multiply two polynomials; equal powers with known coefficients are added."""
-        found: dict[tuple[str | None, Order], float] = {}
+        products: dict[tuple[str | None, Order], float] = {}
         out: SymbolicPolynomial = []
         for c1, n1, o1 in first:
             for c2, n2, o2 in second:
@@ -898,15 +900,15 @@ class EquationParser:
                     )
                 name, order = n1 or n2, add_orders(o1, o2)
                 if name is None:
-                    found[None, order] = found.get((None, order), 0.0) + c1 * c2
+                    products[None, order] = products.get((None, order), 0.0) + c1 * c2
                 else:
                     out.append((c1 * c2, name, order))
-        known: SymbolicPolynomial = [(c, n, o) for (n, o), c in found.items() if c != 0.0]
+        terms: SymbolicPolynomial = [(c, n, o) for (n, o), c in products.items() if c != 0.0]
         names = [name for _, name, _ in out]
         twice = next((a for a, b in pairwise(sorted(filter(None, names))) if a == b), None)
         if twice is not None:
             raise self._error(f"{twice} stands in several terms once multiplied out; give each term a name of its own")
-        return known + out
+        return terms + out
 
 
 def add_orders(first: Order, second: Order) -> Order:

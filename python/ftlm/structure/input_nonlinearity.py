@@ -142,11 +142,11 @@ def replace_nonlinearities(
     limits: Sequence[InputNonlinearity], law: NonlinearityKind, values: Mapping[str, Value]
 ) -> tuple[InputNonlinearity, ...]:
     """Replace the nonlinearities of one kind, by input."""
-    kept = [limit for limit in limits if limit.law != law or limit.signal not in values]
+    others = [limit for limit in limits if limit.law != law or limit.signal not in values]
     new = [
         InputNonlinearity(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()
     ]
-    return tuple(sort_nonlinearities([*kept, *new]))
+    return tuple(sort_nonlinearities([*others, *new]))
 
 
 def check_nonlinearities(

@@ -66,10 +66,10 @@ class Order:
             tree = ast.parse(str(text).strip(), mode="eval").body
             constant, weights = _affine(tree)
         except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
-            shown = f"{text!r}"
-            shown = shown if len(shown) <= 60 else f"{shown[:60]}…"
+            label = f"{text!r}"
+            label = label if len(label) <= 60 else f"{label[:60]}…"
             raise ModelError(
-                f"order {shown} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
+                f"order {label} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
             ) from error
         # The range of a plain number is checked by the equation.
         if weights and not all(map(math.isfinite, (constant, *weights.values()))):
@@ -128,19 +128,19 @@ def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
             factor = -1.0 if isinstance(sign, ast.USub) else 1.0
             constant, weights = _affine(operand)
             return factor * constant, {n: factor * w for n, w in weights.items()}
-        case ast.BinOp(left=left, op=ast.Add() | ast.Sub() as sign, right=right):
+        case ast.BinOp(left=lhs, op=ast.Add() | ast.Sub() as sign, right=right):
             factor = -1.0 if isinstance(sign, ast.Sub) else 1.0
-            c1, w1 = _affine(left)
+            c1, w1 = _affine(lhs)
             c2, w2 = _affine(right)
             return c1 + factor * c2, {n: w1.get(n, 0) + factor * w2.get(n, 0) for n in {**w1, **w2}}
-        case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            c1, w1 = _affine(left)
+        case ast.BinOp(left=lhs, op=ast.Mult(), right=right):
+            c1, w1 = _affine(lhs)
             c2, w2 = _affine(right)
             if w1 and w2:
                 raise ValueError("product of orders")
             return c1 * c2, {n: w * (c2 if w1 else c1) for n, w in {**w1, **w2}.items()}
-        case ast.BinOp(left=left, op=ast.Div(), right=ast.Constant(value=int() | float() as value)) if value:
-            constant, weights = _affine(left)
+        case ast.BinOp(left=lhs, op=ast.Div(), right=ast.Constant(value=int() | float() as value)) if value:
+            constant, weights = _affine(lhs)
             return constant / value, {n: w / value for n, w in weights.items()}
     raise ValueError("not affine")
 

@@ -135,23 +135,23 @@ def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
 
 def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None) -> Offset:
     """Return the offset: the argument if given, else the one that all equation texts share."""
-    said = [(item.output, found) for item, found in parsed if found]
+    pairs = [(item.output, has_offset) for item, has_offset in parsed if has_offset]
     if offset is not None:
-        if said and check_offset(offset) == "none":
+        if pairs and check_offset(offset) == "none":
             raise ModelError(
-                f"the equation of {said[0][0]} has an offset, but {parameter('offset', 'none')}; leave one of them out"
+                f"the equation of {pairs[0][0]} has an offset, but {parameter('offset', 'none')}; leave one of them out"
             )
         return check_offset(offset)
-    without = [item.output for item, found in parsed if not found]
-    if said and without:
+    without = [item.output for item, has_offset in parsed if not has_offset]
+    if pairs and without:
         raise ModelError(
-            f"the equation of {said[0][0]} has an offset, that of {without[0]} has none; each equation of a structure "
+            f"the equation of {pairs[0][0]} has an offset, that of {without[0]} has none; each equation of a structure "
             "has one or none has: write + c in each (its estimate says whether it is 0)"
         )
-    kinds = {found for _, found in said}
+    kinds = {has_offset for _, has_offset in pairs}
     if len(kinds) > 1:
         raise ModelError("one equation has a constant offset and another one that grows; write the same in each")
-    return check_offset(said[0][1] or "none") if said else "none"
+    return check_offset(pairs[0][1] or "none") if pairs else "none"
 
 
 def _equation_of(words: EquationParser) -> Equation:
@@ -200,11 +200,11 @@ def _equation_of(words: EquationParser) -> Equation:
 
 def _friction_of(words: EquationParser, output: str, leading: float) -> Friction | None:
     """Return the friction of an equation's output, divided by the factor of its highest derivative."""
-    for found in (words.friction, words.stribeck):
-        if found is not None and found[1] != output:
+    for pair in (words.friction, words.stribeck):
+        if pair is not None and pair[1] != output:
             raise ModelError(
                 f"equation {words.text!r}: friction opposes the velocity of the output of the equation, which is "
-                f"{output}, not {found[1]}; the sign of a measured velocity is the signal coulomb_{found[1]}"
+                f"{output}, not {pair[1]}; the sign of a measured velocity is the signal coulomb_{pair[1]}"
             )
     if words.friction is None:
         if words.stribeck is None:
@@ -221,13 +221,13 @@ def _friction_of(words: EquationParser, output: str, leading: float) -> Friction
 
 def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
     """Merge the input nonlinearities of all equations; each input must have the same one in every term."""
-    found: dict[tuple[str, str], Value] = {}
+    limits: dict[tuple[str, str], Value] = {}
     for words in parsed:
         for key, limit in words.limits.items():
-            if found.setdefault(key, limit) != limit:
+            if limits.setdefault(key, limit) != limit:
                 raise ModelError(f"{key[0]} has two limits of one kind in these equations; an actuator has one")
     bare = {signal for words in parsed for signal in words.plain}
-    both = next((signal for signal, _ in found if signal in bare), None)
+    both = next((signal for signal, _ in limits if signal in bare), None)
     if both is not None:
         raise ModelError(
             f"{both} stands there limited and as it is, but an actuator limits all that it drives; limit it in each "
@@ -235,22 +235,22 @@ def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlin
         )
     return tuple(
         sort_nonlinearities(
-            [InputNonlinearity(s, law, v) for law in NONLINEARITY_KINDS for (s, own), v in found.items() if own == law]
+            [InputNonlinearity(s, law, v) for law in NONLINEARITY_KINDS for (s, own), v in limits.items() if own == law]
         )
     )
 
 
-def _merge_delays(parsed: Sequence[EquationParser], given: Mapping[str, Value]) -> dict[str, Value]:
+def _merge_delays(parsed: Sequence[EquationParser], explicit_delays: Mapping[str, Value]) -> dict[str, Value]:
     """Merge the delays of all equation texts and those of the argument."""
-    found: dict[str, Value] = {}
+    delays: dict[str, Value] = {}
     for words in parsed:
         for signal, delay in words.delays.items():
-            if found.setdefault(signal, delay) != delay:
+            if delays.setdefault(signal, delay) != delay:
                 raise ModelError(
                     f"{signal} has two delays in these equations; give the input that comes later a name of its own"
                 )
-    late = {signal: delay for signal, delay in found.items() if delay != 0.0}
-    twice = next((signal for signal in given if signal in late), None)
+    late = {signal: delay for signal, delay in delays.items() if delay != 0.0}
+    twice = next((signal for signal in explicit_delays if signal in late), None)
     if twice is not None:
         raise ModelError(f"the delay of {twice} is in the equation and in {parameter('delay')}; leave one of them out")
-    return {**late, **given}
+    return {**late, **explicit_delays}

@@ -236,9 +236,9 @@ class Structure:
                 f"own with {parameter('coupling', 'simulated')}, or leave it out of the filter"
             )
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
-        held = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
-        if held:
-            raise ModelError(f"{words}, and a law ties its {held[0]} to other coefficients; leave one of the two out")
+        names = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
+        if names:
+            raise ModelError(f"{words}, and a law ties its {names[0]} to other coefficients; leave one of the two out")
         if isinstance(self.initial, History) or self.initial == "history":
             raise ModelError(
                 f"{words}: powers of t for an unknown past would give it velocities that it never had; use "
@@ -402,8 +402,8 @@ class Structure:
                 return term
             if not set(term.signals) & set(modelled):
                 return replace(term, order=Order())
-            called = str(term.name or term.coefficient)
-            name = (self.hints or Hints()).order_names_by_coefficient.get(called, f"nu_{output}_{k + 1}")
+            label = str(term.name or term.coefficient)
+            name = (self.hints or Hints()).order_names_by_coefficient.get(label, f"nu_{output}_{k + 1}")
             return replace(term, order=Order(0.0, ((name, 1.0),)))
 
         single = replace(own, terms=tuple(free_order(k, t) for k, t in enumerate(own.terms)))
@@ -454,17 +454,17 @@ class Structure:
         ModelError
             A name that is not an input, a delay that is not finite, or no interval.
         """
-        known, free = dict(self.delay), dict(self.free_delays)
+        fixed, free = dict(self.delay), dict(self.free_delays)
         for name, delay in delays.items():
-            known.pop(name, None)
+            fixed.pop(name, None)
             free.pop(name, None)
             if isinstance(delay, (tuple, list)):
                 if len(delay) != 2:
                     raise ModelError(f"delay of {name} = {delay!r} is neither a number nor (least, largest) [s]")
                 free[name] = (delay[0], delay[1])
             else:
-                known[name] = delay
-        return replace(self, delay=known, free_delays=free)
+                fixed[name] = delay
+        return replace(self, delay=fixed, free_delays=free)
 
     @check_arguments
     def with_limits(
@@ -511,8 +511,8 @@ class Structure:
 
     def without_input_nonlinearities(self) -> Structure:
         """Return the structure without free delays, saturations and dead zones."""
-        known = [limit for limit in self.limits if limit.free is None]
-        return replace(self, free_delays={}, input_nonlinearities=_or_unset(known))
+        fixed_limits = [limit for limit in self.limits if limit.free is None]
+        return replace(self, free_delays={}, input_nonlinearities=_or_unset(fixed_limits))
 
     @check_arguments
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
@@ -535,10 +535,10 @@ class Structure:
     @property
     def offset_in_words(self) -> str:
         """Text of the offset at the end of an equation; empty if there is none."""
-        taken = {*self.coefficient_names, *self.order_names, *self.signals}
-        name = next(n for n in ("c", *(f"c{k}" for k in range(len(taken) + 1))) if n not in taken)
-        asked = f" + ({name} if the runs ask for it)"
-        return {"none": "", "level": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)", "auto": asked}[
+        names = {*self.coefficient_names, *self.order_names, *self.signals}
+        name = next(n for n in ("c", *(f"c{k}" for k in range(len(names) + 1))) if n not in names)
+        auto_text = f" + ({name} if the runs ask for it)"
+        return {"none": "", "level": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)", "auto": auto_text}[
             self.offset
         ]
 
@@ -566,5 +566,5 @@ def restrict_filter(sensor: SensorFilter | None, signals: Sequence[str]) -> Sens
     """Restrict a sensor filter to some signals; None if none of them is filtered."""
     if sensor is None:
         return None
-    left = tuple(s for s in sensor.signals if s in signals)
-    return SensorFilter(left, sensor.numerator, sensor.denominator) if left else None
+    filtered_signals = tuple(s for s in sensor.signals if s in signals)
+    return SensorFilter(filtered_signals, sensor.numerator, sensor.denominator) if filtered_signals else None

@@ -152,10 +152,10 @@ class OutputProblem:
         those given delays that exclude 0.
         """
         inputs = [n for n in self.drivers if n in self.runs[0].inputs]
-        given = {n: d for n, d in self.delays.items() if n in inputs}
+        delays = {n: d for n, d in self.delays.items() if n in inputs}
         if not delayed:
-            return {n: d for n, d in given.items() if (d[0] if isinstance(d, tuple) else d) > 0.0}
-        return {**dict.fromkeys(inputs, (0.0, min(longest_delay(r.length, r.step) for r in self.runs))), **given}
+            return {n: d for n, d in delays.items() if (d[0] if isinstance(d, tuple) else d) > 0.0}
+        return {**dict.fromkeys(inputs, (0.0, min(longest_delay(r.length, r.step) for r in self.runs))), **delays}
 
 
 @dataclass(frozen=True)
@@ -202,8 +202,8 @@ class AutomaticSelection:
             # Under colored noise high orders overfit: the best form of each order is validated, whatever its BIC.
             leaders = _best_of_each_order(fits)
             near = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in leaders]
-            ahead = [f for f in fits if f.form in leaders]
-            best = self._validate([*ahead, *near[: VALIDATED_CANDIDATES - len(ahead)]])
+            leading = [f for f in fits if f.form in leaders]
+            best = self._validate([*leading, *near[: VALIDATED_CANDIDATES - len(leading)]])
             every = _rank([*fits, *self._fit_fractional_forms(fits, best)])
             least = min(f.bic for f in every if f.form is not None)
             fractional = [f for f in every if f.form is None and f.bic < least + MAX_FRACTIONAL_BIC_GAP]
@@ -218,14 +218,14 @@ class AutomaticSelection:
         self, items: Sequence[tuple[Structure, IntegerOrderForm | None, list[dict[str, float]]]]
     ) -> list[FittedForm]:
         joints = self.evaluator.map_candidates(lambda i: self.evaluator.fit_candidate(i[0], i[2], refine=False), items)
-        found = []
+        fits_of_form = []
         for (structure, form, _), joint in zip(items, joints, strict=True):
             if isinstance(joint, JointFit):
                 count = parameter_count(structure, joint, self.evaluator.folds)
-                found.append(FittedForm(structure, joint, form, count, residual_variance_inflation(joint)))
+                fits_of_form.append(FittedForm(structure, joint, form, count, residual_variance_inflation(joint)))
             else:
                 self.evaluator.trials.append(self.evaluator.validate(describe_structure(structure), structure, joint))
-        return _rank(found)
+        return _rank(fits_of_form)
 
     def _fit_integer_orders(self) -> list[FittedForm]:
         """Fit integer orders, and variants of the best; best first."""
@@ -245,10 +245,10 @@ class AutomaticSelection:
             for form in (replace(f, zeros=f.zeros - 1) for f in _best_of_each_order(fits) if f.zeros > 0)
             if form not in {f.form for f in fits}
         ]:
-            fitted = self._fit(fewer)
-            if not fitted:
+            integer_fits = self._fit(fewer)
+            if not integer_fits:
                 break
-            fits = _rank([*fits, *fitted])
+            fits = _rank([*fits, *integer_fits])
         return fits
 
     def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:
@@ -265,14 +265,14 @@ class AutomaticSelection:
         # There are residuals of the inner samples only.
         signals = {n: [compared_values(r, best.structure, n)[1:-1] for r in problem.runs] for n in problem.drivers}
         coefficients = best.joint.coefficients
-        found = []
+        names = []
         for number, name in problem.numbered_drivers:
             values = signals[name]
             test = feedback_test(residuals, values, [v for n, v in signals.items() if n != name])
             gain = -coefficients.get(f"a0{end}", -1.0) * coefficients[f"b{number}0{end}"]
             if test.has_feedback or (test.state == "undecided" and test.same_row * math.copysign(1.0, gain) < -1.0):
-                found.append(name)
-        return tuple(found)
+                names.append(name)
+        return tuple(names)
 
     def _fit_neighbors(self, fits: list[FittedForm]) -> list[FittedForm]:
         """Return the fits with the neighbors of the best forms added, best first.
@@ -280,14 +280,14 @@ class AutomaticSelection:
         A high order can approximate a property that is missing, such as a level or direct feedthrough. The search moves
         to neighbors that have it at a lower order while BIC decreases.
         """
-        done = {f.form for f in fits}
+        forms_before = {f.form for f in fits}
         new = [f.form for f in fits[:EXTENDED_CANDIDATES]]
         expanded: set[IntegerOrderForm | None] = {None}
         while new:
             expanded.update(new)
             near = [n for form in new if form for n in _neighbors(form) if self._is_admissible(n)]
-            more = [n for n in dict.fromkeys(near) if n not in done]
-            done.update(more)
+            more = [n for n in dict.fromkeys(near) if n not in forms_before]
+            forms_before.update(more)
             fits = _rank([*fits, *self._fit(more)])
             new = [f.form for f in fits if f.bic < fits[0].bic + MIN_BIC_DECREASE and f.form not in expanded]
         return fits
@@ -302,21 +302,21 @@ class AutomaticSelection:
 
         Fewer zeros cannot reduce the residuals, so they lower BIC by at most the penalty of the removed zeros.
         """
-        known = {f.form for f in fits}
-        full = _rank([*fits, *self._fit([f for f in forms if f not in known])])
+        forms_before = {f.form for f in fits}
+        full = _rank([*fits, *self._fit([f for f in forms if f not in forms_before])])
         least = min((f.bic for f in full), default=math.inf)
         fewer = [
             replace(form, zeros=m)
-            for form, fitted in ((f.form, f) for f in full)
+            for form, fit in ((f.form, f) for f in full)
             if form is not None and form in forms
             for m in range(form.order - 1)
-            if fitted.bic - (form.order - 1 - m) * self._penalty(fitted) < least
+            if fit.bic - (form.order - 1 - m) * self._penalty(fit) < least
         ]
         return _rank([*full, *self._fit(fewer)])
 
-    def _penalty(self, fitted: FittedForm) -> float:
+    def _penalty(self, fit: FittedForm) -> float:
         """Return the penalty in BIC of one zero of every driving signal."""
-        return len(self.problem.drivers) * math.log(fitted.joint.samples)
+        return len(self.problem.drivers) * math.log(fit.joint.samples)
 
     def _fit_delayed(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
         """Add fits of delayed forms; those above order 2 only if a delay lowers BIC of order 1 or 2."""
@@ -324,10 +324,10 @@ class AutomaticSelection:
             return fits
         delayed = [IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in range(1, MAX_ORDER)]
         fits = _rank([*fits, *self._fit(delayed[:2])])
-        known = {f.form: f.bic for f in fits if f.form is not None}
+        criteria = {f.form: f.bic for f in fits if f.form is not None}
         if not any(
-            bic < known.get(replace(form, delayed=False), math.inf) - MIN_BIC_DECREASE
-            for form, bic in known.items()
+            bic < criteria.get(replace(form, delayed=False), math.inf) - MIN_BIC_DECREASE
+            for form, bic in criteria.items()
             if form.delayed
         ):
             return fits
@@ -341,19 +341,19 @@ class AutomaticSelection:
         for form in ([speed] if changes_sign else []) + [replace(speed, order=2, friction="derivative")]:
             if fits and not has_white_residuals(fits[0].joint):
                 # Negative friction would drive the motion.
-                fitted = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
-                ranked = _rank([*fits, *fitted])
+                friction_fits = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
+                ranked = _rank([*fits, *friction_fits])
                 least = min(f.bic for f in ranked if f.form != form)
                 fits = ranked if ranked[0].bic < least - MIN_BIC_DECREASE else fits
         return fits
 
-    def _validate(self, ahead: Sequence[FittedForm]) -> FittedForm | None:
+    def _validate(self, candidates: Sequence[FittedForm]) -> FittedForm | None:
         """Validate fits; return the one with the best prediction."""
-        found = self.evaluator.map_candidates(
-            lambda f: self.evaluator.validate(describe_structure(f.structure), f.structure, f.joint), ahead
+        validations = self.evaluator.map_candidates(
+            lambda f: self.evaluator.validate(describe_structure(f.structure), f.structure, f.joint), candidates
         )
-        self.evaluator.trials += found
-        ranked = sorted(zip(found, ahead, strict=True), key=lambda pair: (pair[0].unstable, pair[0].score))
+        self.evaluator.trials += validations
+        ranked = sorted(zip(validations, candidates, strict=True), key=lambda pair: (pair[0].unstable, pair[0].score))
         return ranked[0][1] if ranked else None
 
     def _fit_fractional_forms(self, fits: Sequence[FittedForm], best: FittedForm | None) -> list[FittedForm]:
@@ -379,7 +379,7 @@ class AutomaticSelection:
             sides[highest, *direct, *driving] = INITIAL_FRACTIONAL_ORDERS[:2]
         if form.order == FRACTIONAL_DAMPING_ORDER:
             sides[f"D^2 {y}", damping, own, *driving] = (2.0,)
-        texts = {f"{left} = {' + '.join(right)}": orders for (left, *right), orders in sides.items()}
+        texts = {f"{lhs} = {' + '.join(right)}": orders for (lhs, *right), orders in sides.items()}
 
         def structure(text: str, *, delayed: bool = False) -> Structure:
             delay = self.problem.input_delays(delayed=delayed)
@@ -388,22 +388,27 @@ class AutomaticSelection:
         late = {} if best is None else {n: v for n, v in best.joint.values_by_name.items() if n.startswith("delay_")}
 
         def start(of: Structure, alpha: float) -> dict[str, float]:
-            known = {"a0": -(frequency**alpha), "a1": -0.3 * frequency ** (alpha - 0.5), "alpha": alpha, "mu": 0.5}
+            values_of_form = {
+                "a0": -(frequency**alpha),
+                "a1": -0.3 * frequency ** (alpha - 0.5),
+                "alpha": alpha,
+                "mu": 0.5,
+            }
             # The coefficients of the inputs are eliminated at every iterate.
             gains = dict.fromkeys(of.coefficient_names, frequency**alpha)
             delays = {i.name: late.get(i.name, i.bounds[0]) for i in of.free_inputs}
             names = (*of.order_names, *of.coefficient_names)
-            values = {**gains, **{n + end: v for n, v in known.items()}}
+            values = {**gains, **{n + end: v for n, v in values_of_form.items()}}
             return {n: v for n, v in values.items() if n in names} | delays
 
         items = [(structure(t), orders) for t, orders in texts.items()]
-        found = self._fit_structures([(s, None, [start(s, a) for a in orders]) for s, orders in items])
-        if form.delayed and found:
-            text = next(t for t in texts if structure(t) == found[0].structure)
+        candidates = self._fit_structures([(s, None, [start(s, a) for a in orders]) for s, orders in items])
+        if form.delayed and candidates:
+            text = next(t for t in texts if structure(t) == candidates[0].structure)
             delayed = structure(text, delayed=True)
-            begin = [{**late, **found[0].joint.values_by_name}, *(start(delayed, a) for a in texts[text])]
-            found += self._fit_structures([(delayed, None, begin)])
-        return _rank(found)
+            begin = [{**late, **candidates[0].joint.values_by_name}, *(start(delayed, a) for a in texts[text])]
+            candidates += self._fit_structures([(delayed, None, begin)])
+        return _rank(candidates)
 
 
 def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
@@ -415,20 +420,20 @@ def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
 
 def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
     """Return forms that differ in an integrator, direct feedthrough, an offset, or a canceled pole and zero."""
-    found = [
+    forms = [
         replace(form, integrator=not form.integrator),
         replace(form, zeros=form.order if form.zeros < form.order else form.order - 1),
         replace(form, offset="level" if form.offset == "none" else "none"),
     ]
     if form.friction != "none":
         # The simulation of friction needs inputs of lower order than the equation.
-        found[1:2] = [replace(form, zeros=form.order - 1), replace(form, delayed=not form.delayed)]
+        forms[1:2] = [replace(form, zeros=form.order - 1), replace(form, delayed=not form.delayed)]
     elif form.zeros > 0:
         lower = replace(form, order=form.order - 1, zeros=form.zeros - 1, integrator=False)
         # A canceled pole and zero at s = 0 are equivalent to a level, or with the initial terms to a drift.
-        found += [lower, *(replace(lower, offset=o) for o in ("level", "ramp"))]
-        found.append(replace(lower, integrator=form.integrator))
-    return [f for f in dict.fromkeys(found) if f.zeros >= 0 and f.order > int(f.integrator)]
+        forms += [lower, *(replace(lower, offset=o) for o in ("level", "ramp"))]
+        forms.append(replace(lower, integrator=form.integrator))
+    return [f for f in dict.fromkeys(forms) if f.zeros >= 0 and f.order > int(f.integrator)]
 
 
 def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:

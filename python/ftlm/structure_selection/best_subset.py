@@ -24,7 +24,7 @@ from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Folds, fi
 from ftlm.utils.validation import Floats
 
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 #: Minimum number of input terms for best-subset screening. Stepwise selection is as fast for fewer.
 MIN_INPUT_TERMS = 3
 #: Minimum number of samples of a subsampled run.
@@ -47,7 +47,7 @@ POINTS_PER_TASK = 16
 class TaskPool(Protocol):
     """Pool that maps a function over items, in their order."""
 
-    def map_items(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """Return the results for the items, in their order."""
 
 
@@ -152,13 +152,13 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
         return []
     runs = list(folds.runs)
     runs += [f.validation_run for f in folds.parts if not any(f.validation_run is r for r in runs)]
-    found: dict[str, ScreenedSubset] = {}
+    subsets: dict[str, ScreenedSubset] = {}
     for ground in base_models(inside, tuple(runs)):
         for one in score_subsets(ground, folds, pool):
             key = signature(inside.build(one.change.variant))
-            if key not in found or one.score < found[key].score:
-                found[key] = one
-    return sorted(found.values(), key=lambda s: (s.score, s.change.words))
+            if key not in subsets or one.score < subsets[key].score:
+                subsets[key] = one
+    return sorted(subsets.values(), key=lambda s: (s.score, s.change.words))
 
 
 def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[BaseModel]:
@@ -167,24 +167,24 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
     item = structure.equations[0]
     own = [t for t in item.terms if t.signal == item.output]
     tops = inside.integer_values(item.order.names[0]) if item.order.is_single else [item.order.constant]
-    seen: set[str] = set()
+    keys: set[str] = set()
     for top in (v for v in tops if v > 0):
         for places in itertools.product(*(_candidate_orders(inside, t, top) for t in own)):
-            there = [(t, p) for t, p in zip(own, places, strict=True) if p is not None]
-            if len({p for _, p in there}) < len(there) or (own and not there):
+            terms_present = [(t, p) for t, p in zip(own, places, strict=True) if p is not None]
+            if len({p for _, p in terms_present}) < len(terms_present) or (own and not terms_present):
                 continue
-            free = tuple((t.coefficient, p) for t, p in there if isinstance(t.coefficient, str))
+            free = tuple((t.coefficient, p) for t, p in terms_present if isinstance(t.coefficient, str))
             if len(free) > 2:
                 continue
-            whole = {t.order.names[0]: p for t, p in there if t.order.is_single}
+            whole = {t.order.names[0]: p for t, p in terms_present if t.order.is_single}
             whole |= {item.order.names[0]: top} if item.order.is_single else {}
             offsets = (False, True) if inside.offset_allowed else (False,)
             for offset in (True,) if structure.offset == "constant" else offsets:
                 variant = Variant(frozenset(n for n, _ in free), tuple(sorted(whole.items())), offset)
-                ground = _base_model(inside, variant, [(t, p) for t, p in there], top, free, runs)
+                ground = _base_model(inside, variant, [(t, p) for t, p in terms_present], top, free, runs)
                 key = "" if ground is None else signature(ground.structure)
-                if ground is not None and key not in seen:
-                    seen.add(key)
+                if ground is not None and key not in keys:
+                    keys.add(key)
                     yield ground
 
 
@@ -205,29 +205,29 @@ def _base_model(
 ) -> BaseModel | None:
     """Return a base model with every valid column; None if there is none, or if two terms share a coefficient."""
     item = inside.structure.equations[0]
-    known = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
-    kept = [replace(t, order=Order(p)) for t, p in own]
+    input_terms = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
+    terms_of_output = [replace(t, order=Order(p)) for t, p in own]
     columns: list[Column] = []
     terms: list[Term] = []
-    taken = {n for n, _ in free}
+    reserved_names = {n for n, _ in free}
     for term in item.terms:
         if term.signal == item.output or term.coefficient not in inside.droppable:
             continue
-        if term.coefficient in taken:
+        if term.coefficient in reserved_names:
             return None
         names = term.order.names
         for place in inside.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
             column = Column(str(term.coefficient), term.signal, place, tuple(names))
-            made = column.term(term, f"column{len(columns)}")
-            if _is_valid_input_set(inside.structure, [*kept, *known, made], top, runs):
+            column_term = column.term(term, f"column{len(columns)}")
+            if _is_valid_input_set(inside.structure, [*terms_of_output, *input_terms, column_term], top, runs):
                 columns.append(column)
-                terms.append(made)
+                terms.append(column_term)
     if not columns:
         return None
-    asked: Offset = (
+    offset: Offset = (
         inside.structure.offset if inside.structure.offset == "ramp" else "constant" if variant.offset else "none"
     )
-    structure = _with_terms(inside.structure, [*kept, *known, *terms], top, asked)
+    structure = _with_terms(inside.structure, [*terms_of_output, *input_terms, *terms], top, offset)
     return BaseModel(inside, variant, fix_initial_conditions(structure, runs), free, tuple(columns), runs)
 
 
@@ -248,8 +248,8 @@ def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset:
 def _is_valid_input_set(structure: Structure, terms: Sequence[Term], top: float, runs: Sequence[Run]) -> bool:
     """Whether these terms form an equation that the runs can simulate."""
     try:
-        made = fix_initial_conditions(_with_terms(structure, terms, top, "none"), runs)
-        Objective(FreeProblem.of(made), runs[:1], [1.0], decimation=_decimation(runs)).experiments  # noqa: B018
+        candidate = fix_initial_conditions(_with_terms(structure, terms, top, "none"), runs)
+        Objective(FreeProblem.of(candidate), runs[:1], [1.0], decimation=_decimation(runs)).experiments  # noqa: B018
     except FtlmError:
         return False
     return True
@@ -276,35 +276,35 @@ def score_subsets(
         return [_products(ground, problem, experiments, ends, places, p) for p in points]
 
     def all_of(points: Sequence[tuple[float, ...]]) -> list[tuple[tuple[float, ...], Floats]]:
-        asked = [p for p in points if ground.is_stable(p)]
-        chunks = [asked[k : k + POINTS_PER_TASK] for k in range(0, len(asked), POINTS_PER_TASK)]
-        made = [g for part in pool.map_items(one, chunks) for g in part]
-        return [(p, g) for p, g in zip(asked, made, strict=True) if g is not None]
+        stable = [p for p in points if ground.is_stable(p)]
+        chunks = [stable[k : k + POINTS_PER_TASK] for k in range(0, len(stable), POINTS_PER_TASK)]
+        grounds = [g for part in pool.map_items(one, chunks) for g in part]
+        return [(p, g) for p, g in zip(stable, grounds, strict=True) if g is not None]
 
-    there = all_of(list(ground.grid_points()) if points is None else points)
+    solutions = all_of(list(ground.grid_points()) if points is None else points)
     judge = SubsetScorer.of(
         ground, folds, [float(np.nanvar(r[ground.structure.outputs[0]])) for r in ground.runs], ends
     )
     spacing = (LOG_FREQUENCY_SPACING, math.log(DAMPING_FACTORS[1] / DAMPING_FACTORS[0]))
     for zoom in range(GRID_REFINEMENTS + 1):
-        if not there:
+        if not solutions:
             return []
-        products = Products([p for p, _ in there], np.array([g for _, g in there]))
-        found = judge.score_all(products)
+        products = Products([p for p, _ in solutions], np.array([g for _, g in solutions]))
+        scores = judge.score_all(products)
         if zoom == GRID_REFINEMENTS or points is not None or not ground.own:
             break
         spacing = (spacing[0] / 2, spacing[1] / 2)
-        known = {p for p, _ in there}
-        best = sorted(found, key=lambda s: found[s].score)[:REFINED_SUBSETS]
-        centres = dict.fromkeys(products.points[k] for s in best for k in found[s].points)
+        points_before = {p for p, _ in solutions}
+        best = sorted(scores, key=lambda s: scores[s].score)[:REFINED_SUBSETS]
+        centres = dict.fromkeys(products.points[k] for s in best for k in scores[s].points)
         near = (
             tuple(c + m * w for c, m, w in zip(centre, moves, spacing, strict=False))
             for centre in centres
             for moves in itertools.product((-1, 0, 1), repeat=len(centre))
         )
-        there += all_of([p for p in dict.fromkeys(near) if p not in known])
+        solutions += all_of([p for p in dict.fromkeys(near) if p not in points_before])
     out = []
-    for subset, verdict in found.items():
+    for subset, verdict in scores.items():
         change = _change(ground, subset)
         if change is not None:
             values = ground.coefficients(products.points[verdict.points[-1]])
@@ -338,10 +338,10 @@ def _products(
 
 def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
     """Return a subset as a change to a variant; None if it is invalid."""
-    chosen = [ground.columns[k] for k in subset]
-    whole = {**ground.variant.integer_order_values(), **{n: c.order for c in chosen for n in c.names}}
-    kept = ground.variant.coefficients | {c.coefficient for c in chosen}
-    variant = replace(ground.variant, coefficients=frozenset(kept)).with_integer_orders(whole)
+    columns = [ground.columns[k] for k in subset]
+    whole = {**ground.variant.integer_order_values(), **{n: c.order for c in columns for n in c.names}}
+    coefficients = ground.variant.coefficients | {c.coefficient for c in columns}
+    variant = replace(ground.variant, coefficients=frozenset(coefficients)).with_integer_orders(whole)
     if not ground.inside.is_valid(variant):
         return None
     return Change(describe_structure(ground.inside.build(variant)), variant)
@@ -384,11 +384,11 @@ class SubsetScorer:
         def place(run: Run) -> int:
             return next(k for k, r in enumerate(ground.runs) if r is run)
 
-        fitted = [tuple(place(r) for r in f.runs) for f in folds.parts]
+        fit_parts = [tuple(place(r) for r in f.runs) for f in folds.parts]
         sizes = np.array([v * (b - a) for v, (a, b) in zip(spread, itertools.pairwise(ends), strict=True)])
         return cls(
             ground.columns,
-            (*fitted, tuple(place(r) for r in folds.runs)),
+            (*fit_parts, tuple(place(r) for r in folds.runs)),
             tuple(place(f.validation_run) for f in folds.parts),
             sizes,
         )
@@ -400,17 +400,17 @@ class SubsetScorer:
         matrix, right, rest = cut[..., :-1, :-1], cut[..., :-1, -1], cut[..., -1, -1]
         scale = np.sqrt(np.maximum(np.einsum("...kk->...k", matrix), np.finfo(float).tiny))
         even = matrix / scale[..., None] / scale[..., None, :] + RELATIVE_RIDGE * np.eye(len(subset))
-        found = -np.linalg.solve(even, (right / scale)[..., None])[..., 0] / scale
-        left = rest + np.einsum("pfk,pfk->pf", found, right)
-        points = np.argmin(left, axis=0)
+        solutions = -np.linalg.solve(even, (right / scale)[..., None])[..., 0] / scale
+        remainders = rest + np.einsum("pfk,pfk->pf", solutions, right)
+        points = np.argmin(remainders, axis=0)
         scores = []
         for fold, run in enumerate(self.validation_runs):
-            at, c = points[fold], found[points[fold], fold]
+            at, c = points[fold], solutions[points[fold], fold]
             whole = products[at, run][keys][:, keys]
             with_one = np.append(c, 1.0)
             share = math.sqrt(max(float(with_one @ whole @ with_one), 0.0) / float(self.sizes[run]))
             scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
-        return SubsetScore(float(np.mean(scores)), tuple(points.tolist()), tuple(found[points[-1], -1].tolist()))
+        return SubsetScore(float(np.mean(scores)), tuple(points.tolist()), tuple(solutions[points[-1], -1].tolist()))
 
     def score_all(self, products: Products) -> dict[tuple[int, ...], SubsetScore]:
         """Score every subset; if there are too many, extend the best of each size."""
@@ -429,21 +429,21 @@ class SubsetScorer:
 
         if count <= MAX_EXHAUSTIVE_SUBSETS:
             judge(
-                tuple(sorted(k for k in chosen if k is not None))
-                for chosen in itertools.product(*([None, *c] for c in choices.values()))
-                if any(k is not None for k in chosen)
+                tuple(sorted(k for k in subset if k is not None))
+                for subset in itertools.product(*([None, *c] for c in choices.values()))
+                if any(k is not None for k in subset)
             )
             return out
         width = max(4, MAX_EXHAUSTIVE_SUBSETS // len(self.columns) ** 2)
-        ahead: list[tuple[int, ...]] = [()]
+        candidate_subsets: list[tuple[int, ...]] = [()]
         for _ in choices:
             wider = {
                 tuple(sorted((*subset, k)))
-                for subset in ahead
+                for subset in candidate_subsets
                 for places in choices.values()
                 if not set(places) & set(subset)
                 for k in places
             }
             judge(sorted(wider))
-            ahead = sorted(wider, key=lambda s: (out[s].score, s))[:width]
+            candidate_subsets = sorted(wider, key=lambda s: (out[s].score, s))[:width]
         return out

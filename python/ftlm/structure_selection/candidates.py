@@ -47,8 +47,8 @@ class Variant:
 
     def with_integer_orders(self, values: Mapping[str, float | None]) -> Variant:
         """Return the variant with some orders integer, or free where the value is None."""
-        known = {**self.integer_order_values(), **values}
-        return replace(self, integer_orders=tuple(sorted((n, v) for n, v in known.items() if v is not None)))
+        orders = {**self.integer_order_values(), **values}
+        return replace(self, integer_orders=tuple(sorted((n, v) for n, v in orders.items() if v is not None)))
 
 
 @dataclass(frozen=True)
@@ -100,13 +100,13 @@ class NestedStructures:
 
     def _with_frictions(self, item: Equation, rubs: frozenset[str]) -> Equation:
         """Return an equation with the given optional frictions and all mandatory ones."""
-        found, own, choices = item.friction, f"friction of {item.output}", self.frictions
-        if found is None:
+        friction, own, choices = item.friction, f"friction of {item.output}", self.frictions
+        if friction is None:
             return item
         if own in choices and own not in rubs:
             return replace(item, coulomb=UNSET)
         near = f"{own} near rest"
-        return replace(item, coulomb=replace(found, more=UNSET)) if near in choices and near not in rubs else item
+        return replace(item, coulomb=replace(friction, more=UNSET)) if near in choices and near not in rubs else item
 
     @property
     def without_optional_friction(self) -> Structure:
@@ -125,28 +125,34 @@ class NestedStructures:
             equations.append(self._with_frictions(replace(item, terms=terms), variant.frictions))
         names = {n for e in equations for n in e.order_names}
         signals = tuple(dict.fromkeys(n for e in equations for n in (e.output, *e.signals)))
-        left = {i.name for i in structure.free_inputs} - variant.inputs
-        free = {n: v for n, v in structure.free_delays.items() if n in signals and input_name("delay", n) not in left}
-        made = replace(
+        dropped_inputs = {i.name for i in structure.free_inputs} - variant.inputs
+        free = {
+            n: v
+            for n, v in structure.free_delays.items()
+            if n in signals and input_name("delay", n) not in dropped_inputs
+        }
+        candidate = replace(
             structure,
             equations=tuple(equations),
             order_values={n: v for n, v in structure.order_values.items() if n in names},
             delay={n: v for n, v in structure.delay.items() if n in signals},
             free_delays=free,
-            input_nonlinearities=tuple(x for x in structure.limits if x.signal in signals and x.name not in left)
+            input_nonlinearities=tuple(
+                x for x in structure.limits if x.signal in signals and x.name not in dropped_inputs
+            )
             or UNSET,
             sensor_filter=restrict_filter(structure.sensor_filter, signals),
         ).with_orders({n: v for n, v in variant.integer_orders if n in names})
-        asked = structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none"
-        return replace(made, offset=asked)
+        offset = structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none"
+        return replace(candidate, offset=offset)
 
     def is_valid(self, variant: Variant) -> bool:
         """Whether a variant is valid: its own orders differ and are below the highest."""
         try:
-            made = self.build(variant)
+            candidate = self.build(variant)
         except ModelError:
             return False
-        for item in made.equations:
+        for item in candidate.equations:
             places = [(t.column, t.order.constant) for t in item.terms if not t.order.names]
             if len(set(places)) < len(places):
                 return False
@@ -180,8 +186,8 @@ class NestedStructures:
             # A non-linear term that contains the output is not an input term.
             item = self.structure.equations[0]
             drives = [t for t in item.terms if t.coefficient in self.droppable and item.output not in t.signals]
-            known = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
-            if not drives or known:
+            has_fixed_terms = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
+            if not drives or has_fixed_terms:
                 yield Change(self._describe(base), base)
                 continue
             for term in drives:
@@ -189,8 +195,8 @@ class NestedStructures:
 
     def highest_orders(self, variant: Variant) -> tuple[float | None, ...]:
         """Integer values of the highest orders of a variant; None for a free one."""
-        held = variant.integer_order_values()
-        return tuple(held.get(n) for n in sorted(self._highest))
+        orders = variant.integer_order_values()
+        return tuple(orders.get(n) for n in sorted(self._highest))
 
     def _describe(self, variant: Variant) -> str:
         return describe_structure(self.build(variant))
@@ -202,10 +208,10 @@ class NestedStructures:
         """Return the variant of all own terms with distinct integer orders and all mandatory terms."""
         droppable = self.droppable
         whole: dict[str, float] = dict(top)
-        kept: list[str] = []
+        names_used: list[str] = []
         for item in self.structure.equations:
             highest = top.get(item.order.names[0]) if item.order.is_single else item.order.constant
-            taken = {t.order.constant for t in item.terms if t.column == item.output and not t.order.names}
+            values_used = {t.order.constant for t in item.terms if t.column == item.output and not t.order.names}
             for term in item.terms:
                 if term.order.is_single and term.order.names[0] in whole:
                     continue
@@ -215,7 +221,9 @@ class NestedStructures:
                 if term.order.is_single:
                     name = term.order.names[0]
                     places = [
-                        v for v in self.integer_values(name) if not own or (v < (highest or 0.0) and v not in taken)
+                        v
+                        for v in self.integer_values(name)
+                        if not own or (v < (highest or 0.0) and v not in values_used)
                     ]
                     if not places:
                         if term.coefficient in droppable:
@@ -226,16 +234,16 @@ class NestedStructures:
                     below = any(t.column == item.output and t.order.is_single for t in later)
                     value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
                     whole[name] = value
-                    taken |= {value} if own else set()
+                    values_used |= {value} if own else set()
                 elif own and not term.order.names and term.order.constant >= (highest or 0.0):
                     if term.coefficient in droppable:
                         continue
                     return None
                 if isinstance(term.coefficient, str):
-                    kept.append(term.coefficient)
+                    names_used.append(term.coefficient)
         names = [*self.structure.coefficient_names]
-        kept += [n for n in names if n not in droppable]
-        variant = Variant(frozenset(kept), tuple(sorted(whole.items())), self.structure.offset == "constant")
+        names_used += [n for n in names if n not in droppable]
+        variant = Variant(frozenset(names_used), tuple(sorted(whole.items())), self.structure.offset == "constant")
         # Without own terms the equation is valid only once an input term is added.
         alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
         return variant if self.is_valid(variant) or not alone else None
@@ -243,37 +251,38 @@ class NestedStructures:
     def _with_term(self, variant: Variant, term: Term) -> Iterator[Change]:
         """Yield variants with one more term, its order at each of its integer values."""
         assert isinstance(term.coefficient, str)
-        kept = variant.coefficients | {term.coefficient}
+        coefficients = variant.coefficients | {term.coefficient}
         if not term.order.names:
-            grown = [replace(variant, coefficients=kept)]
+            variants = [replace(variant, coefficients=coefficients)]
         elif term.order.is_single and term.order.names[0] not in variant.integer_order_values():
             name = term.order.names[0]
-            grown = [
-                replace(variant, coefficients=kept).with_integer_orders({name: v}) for v in self.integer_values(name)
+            variants = [
+                replace(variant, coefficients=coefficients).with_integer_orders({name: v})
+                for v in self.integer_values(name)
             ]
             if self._owns(term):
                 # If other own terms have all integer orders, the order is free from the start.
-                grown = [v for v in grown if self.is_valid(v)] or [replace(variant, coefficients=kept)]
+                variants = [v for v in variants if self.is_valid(v)] or [replace(variant, coefficients=coefficients)]
         else:
-            grown = [replace(variant, coefficients=kept)]
-        for one in grown:
+            variants = [replace(variant, coefficients=coefficients)]
+        for one in variants:
             if self.is_valid(one):
                 yield Change(f"+ {self._term_in(one, term)}", one)
 
     def _term_in(self, variant: Variant, term: Term) -> str:
         """Return a term of a variant as text."""
-        made = self.build(variant)
-        found = next(t for e in made.equations for t in e.terms if t.coefficient == term.coefficient)
-        return str(found)
+        candidate = self.build(variant)
+        match = next(t for e in candidate.equations for t in e.terms if t.coefficient == term.coefficient)
+        return str(match)
 
     def richest(self, variant: Variant) -> Variant:
         """Return the variant with all terms for which an integer order is left that no other term has."""
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
-                    grown = [c.variant for c in self._with_term(variant, term)]
+                    variants = [c.variant for c in self._with_term(variant, term)]
                     free = set(self.build(variant).order_names)
-                    variant = next((v for v in grown if set(self.build(v).order_names) <= free), variant)
+                    variant = next((v for v in variants if set(self.build(v).order_names) <= free), variant)
         return variant
 
     def larger(self, variant: Variant) -> Iterator[Change]:
@@ -300,8 +309,8 @@ class NestedStructures:
 
     def smaller(self, variant: Variant) -> Iterator[Change]:
         """Yield every variant with one term, free order or offset fewer."""
-        made = self.build(variant)
-        for item in made.equations:
+        candidate = self.build(variant)
+        for item in candidate.equations:
             for term in item.terms:
                 own = term.column == item.output
                 others = [t for t in item.terms if t is not term and (t.column == item.output) == own]
@@ -309,7 +318,7 @@ class NestedStructures:
                     less = replace(variant, coefficients=variant.coefficients - {str(term.coefficient)})
                     if self.is_valid(less):
                         yield Change(f"without {term}", less)
-        for name in made.order_names:
+        for name in candidate.order_names:
             for value in self.integer_values(name):
                 less = variant.with_integer_orders({name: value})
                 if self.is_valid(less):
@@ -374,9 +383,9 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
             out |= {name: replace(structure, offset="none"), f"{name}, offset": replace(structure, offset="constant")}
         else:
             out[name] = structure
-    seen: dict[str, str] = {}
+    names_by_content: dict[str, str] = {}
     for name, structure in out.items():
-        other = seen.setdefault(_content(structure), name)
+        other = names_by_content.setdefault(_content(structure), name)
         if other != name:
             only = "" if repr(out[other]) == repr(structure) else " except for parameter names"
             raise ModelError(f"candidates {other!r} and {name!r} are the same structure{only}; leave one out")

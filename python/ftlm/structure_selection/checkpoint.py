@@ -21,7 +21,7 @@ from ftlm.structure_selection.best_subset import ScreenedSubset
 from ftlm.structure_selection.cross_validation import Trial
 from ftlm.utils.checkpoint_file import DIGEST_BYTES, RECORD_ENCODER, CheckpointFile, decode_array
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 #: Version of fit and validation. Results of different versions must not be combined.
 ALGORITHM_VERSION = 3
 #: Errors of a candidate's fit. Any other error is a defect.
@@ -64,7 +64,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
             "candidates": "of other candidates",
             "validation": "with other validation data",
         }
-        return next((said for n, said in words.items() if getattr(self, n) != getattr(other, n)), None)
+        return next((text for n, text in words.items() if getattr(self, n) != getattr(other, n)), None)
 
 
 def _run_content(run: Run) -> list[object]:
@@ -150,7 +150,7 @@ class Store:
     """Results of a selection so far, locked until closed; safe for concurrent threads."""
 
     def __init__(self, path: str | os.PathLike[str], request: Request) -> None:
-        self._known: dict[bytes, Answer] = {}
+        self._answers: dict[bytes, Answer] = {}
         self._lock = threading.Lock()
         self._file = CheckpointFile(path, "selection", "create")
         try:
@@ -184,50 +184,50 @@ class Store:
         wrong = record.answer.inconsistency() if isinstance(record.answer, StoredFit) else None
         if wrong is not None:
             raise DataError(f"store {path} holds a fit with {wrong} in record {number}; choose another file")
-        self._known[record.request] = record.answer
+        self._answers[record.request] = record.answer
 
-    def _check_same(self, asked: Request, held: Request) -> None:
+    def _check_same(self, request: Request, stored: Request) -> None:
         path = self._file.path
         # Digests of candidates depend on the version that wrote them, so only those of one version can be compared.
-        if (asked.algorithm, asked.version) != (held.algorithm, held.version):
+        if (request.algorithm, request.version) != (stored.algorithm, stored.version):
             raise DataError(
-                f"store {path} was written by ftlm {held.version}, algorithm {held.algorithm}; this is "
-                f"{asked.version}, "
-                f"algorithm {asked.algorithm}: finish the selection with that version, or start it again in another "
+                f"store {path} was written by ftlm {stored.version}, algorithm {stored.algorithm}; this is "
+                f"{request.version}, "
+                f"algorithm {request.algorithm}: finish the selection with that version, or start it again in another "
                 "file"
             )
-        difference = asked.difference(held)
+        difference = request.difference(stored)
         if difference is not None:
             raise DataError(f"store {path} holds a selection {difference}; choose another file")
 
-    def _other(self, asked: str, answer: Answer) -> DataError:
-        held = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
+    def _other(self, description: str, answer: Answer) -> DataError:
+        words = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
         return DataError(
-            f"store {self._file.path} holds {held[type(answer)]} where {asked} is expected; choose another file"
+            f"store {self._file.path} holds {words[type(answer)]} where {description} is expected; choose another file"
         )
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._answers)
 
     def recall_or_compute(
         self,
-        asked: object,
-        compute: Callable[[], Made],
-        write: Callable[[Made], Answer | None],
-        read: Callable[[Answer], Made],
-    ) -> Made:
+        request: object,
+        compute: Callable[[], Result],
+        write: Callable[[Result], Answer | None],
+        read: Callable[[Answer], Result],
+    ) -> Result:
         """Return a stored result, or compute and store it; a None result is not stored."""
-        key = _digest(asked)
+        key = _digest(request)
         with self._lock:
-            answer = self._known.get(key)
+            answer = self._answers.get(key)
         if answer is None:
-            made = compute()
-            answer = write(made)
+            result = compute()
+            answer = write(result)
             if answer is None:
-                return made
+                return result
             with self._lock:
                 self._file.append([RECORD_ENCODER.encode(StoredAnswer(key, answer))])
-                self._known[key] = answer
+                self._answers[key] = answer
         # Decode the stored form even of a new result, so that a resumed selection gives the same bits.
         return read(answer)
 
@@ -240,10 +240,10 @@ class Store:
     ) -> JointFit | FtlmError:
         """Return a fit on all runs, or its error."""
 
-        def write(made: JointFit | FtlmError) -> Answer | None:
-            if isinstance(made, JointFit):
-                return StoredFit.of(made)
-            return FitError.of(made)
+        def write(result: JointFit | FtlmError) -> Answer | None:
+            if isinstance(result, JointFit):
+                return StoredFit.of(result)
+            return FitError.of(result)
 
         def read(answer: Answer) -> JointFit | FtlmError:
             if isinstance(answer, StoredFit):
@@ -266,11 +266,11 @@ class Store:
             fit = None if trial.failed is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)
 
-        def write(made: Trial) -> Answer:
-            return StoredTrial(replace(made, joint=None))
+        def write(result: Trial) -> Answer:
+            return StoredTrial(replace(result, joint=None))
 
-        asked = ("judge", structure, joint.names, joint.values, joint.initial, fine)
-        return self.recall_or_compute(asked, compute, write, read)
+        request = ("judge", structure, joint.names, joint.values, joint.initial, fine)
+        return self.recall_or_compute(request, compute, write, read)
 
     def subsets(self, structure: Structure, compute: Callable[[], list[ScreenedSubset]]) -> list[ScreenedSubset]:
         """Return all screened subsets."""

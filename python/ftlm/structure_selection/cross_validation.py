@@ -89,21 +89,23 @@ class Fold:
         """
         outputs = model.outputs
         if self.rows is None:
-            there = compare(model, self.validation_run)
-            samples = {o: int(np.isfinite(y[0]).sum()) for o, y in there.measured.items()}
-            left = {o: 1.0 - len(there.initial[0].get(o, ())) / max(n, 1) for o, n in samples.items()}
-            return {o: 100.0 - (100.0 - f) / math.sqrt(max(left[o], 1e-3)) for o, f in there.fit.items()}
+            comparison = compare(model, self.validation_run)
+            samples = {o: int(np.isfinite(y[0]).sum()) for o, y in comparison.measured.items()}
+            freedom = {o: 1.0 - len(comparison.initial[0].get(o, ())) / max(n, 1) for o, n in samples.items()}
+            return {o: 100.0 - (100.0 - f) / math.sqrt(max(freedom[o], 1e-3)) for o, f in comparison.fit.items()}
         # Without the first block, initial terms that decay early would not be identifiable.
         moving = self.rows[0] == 0 and model.structure.initial != "rest"
-        before = compare(
+        rest_comparison = compare(
             model, self.validation_run if moving else mask_outputs(self.validation_run, outputs, self.rows)
         )
-        answer = simulate(model, self.validation_run, tolerance=SIMULATION_TOLERANCE, initial=before.initial[0])
+        answer = simulate(
+            model, self.validation_run, tolerance=SIMULATION_TOLERANCE, initial=rest_comparison.initial[0]
+        )
         out = {}
         for name in outputs:
-            measured, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.validation_run, answer))
-            known = np.isfinite(measured)
-            missed, size = measured[known] - free[known], measured[known] - np.mean(measured[known])
+            output, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.validation_run, answer))
+            is_finite = np.isfinite(output)
+            missed, size = output[is_finite] - free[is_finite], output[is_finite] - np.mean(output[is_finite])
             share = vector_norm(missed) / max(vector_norm(size), 1e-300)
             out[name] = 100.0 * (1.0 - share)
         return out
@@ -177,7 +179,7 @@ class Folds:
             others = as_runs(validation)
             as_runs([*every, *others])
             for run in others:
-                if any(_same(run, fitted) for fitted in every):
+                if any(_same(run, estimation_run) for estimation_run in every):
                     raise ModelError(
                         f"validation run {run.name} is also an estimation run, so it validates nothing; leave it "
                         f"out of one of the two, or use {parameter('validation', 'runs')}"
@@ -208,9 +210,9 @@ class Folds:
         Of more than :data:`MAX_SPLIT_FOLDS` pieces as many are used, spread evenly; the final estimate uses all.
         """
         every = [piece for run in runs for piece in run.split(duration)]
-        chosen = np.unique(np.linspace(0, len(every) - 1, MAX_SPLIT_FOLDS).astype(int))
-        folds = cls.of([every[k] for k in chosen], "runs")
-        words = f"each of {len(chosen)} pieces of {duration:.2g} s by the others"
+        indices = np.unique(np.linspace(0, len(every) - 1, MAX_SPLIT_FOLDS).astype(int))
+        folds = cls.of([every[k] for k in indices], "runs")
+        words = f"each of {len(indices)} pieces of {duration:.2g} s by the others"
         return replace(folds, description=words, split=(runs, duration))
 
 
@@ -339,19 +341,19 @@ def fit(
     Friction that the initial guesses omit is set to 0, where it may have no descent direction. Automatic initial
     guesses are therefore added.
     """
-    asked = fix_initial_conditions(structure, runs)
+    fixed_structure = fix_initial_conditions(structure, runs)
     if near is not None:
-        return fit_output_error(runs, asked, refine=refine, near=near)
-    problem = FreeProblem.of(asked)
+        return fit_output_error(runs, fixed_structure, refine=refine, near=near)
+    problem = FreeProblem.of(fixed_structure)
     if not starts or any(n not in s for s in starts for n in problem.names):
         # With zero friction the Stribeck speed is arbitrary.
         nothing = {n: 0.0 if low == 0 else 1.0 for n, (low, _) in zip(problem.names, problem.all_bounds, strict=True)}
-        return fit_output_error(runs, asked, refine=refine, known=[{**nothing, **s} for s in starts])
+        return fit_output_error(runs, fixed_structure, refine=refine, guesses=[{**nothing, **s} for s in starts])
     ends: list[JointFit] = []
     last: FtlmError | None = None
     for start in starts:
         try:
-            ends.append(fit_output_error(runs, asked, start=start, refine=refine))
+            ends.append(fit_output_error(runs, fixed_structure, start=start, refine=refine))
         except FtlmError as error:
             last = error
     if not ends:
@@ -453,9 +455,9 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
         for output, residuals in joint.residuals[place].items():
             if residuals.size != fold.validation_run.length - 2:
                 return -math.inf
-            left, there = residuals[max(first - 1, 0) : last - 1], fold.validation_run[output][first:last]
-            size = vector_norm(there - np.nanmean(there))
-            share = scale[output] * vector_norm(drop_missing(left)) / max(size, 1e-300)
+            residual, output_values = residuals[max(first - 1, 0) : last - 1], fold.validation_run[output][first:last]
+            size = vector_norm(output_values - np.nanmean(output_values))
+            share = scale[output] * vector_norm(drop_missing(residual)) / max(size, 1e-300)
             scores.append(math.log(min(max(share, 1e-12), 1.0 - MIN_FIT_PERCENT / 100.0)))
     return float(np.mean(scores))
 

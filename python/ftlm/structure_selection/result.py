@@ -160,14 +160,14 @@ class Selection(ReportMixin):
             if trial.parameters not in best or trial.score < best[trial.parameters].score:
                 best[trial.parameters] = trial
         along = sorted(best)
-        seen, validation_data = (
+        estimation, validation_data = (
             [best[n].estimation_fit for n in along],
             [max(best[n].validation_fit, MIN_FIT_PERCENT) for n in along],
         )
-        chosen = [v if n == self.winner.parameters else math.nan for n, v in zip(along, validation_data, strict=True)]
+        choice = [v if n == self.winner.parameters else math.nan for n, v in zip(along, validation_data, strict=True)]
         return LineChart(
             [float(n) for n in along],
-            [("estimation", seen), ("validation", validation_data), ("chosen", chosen)],
+            [("estimation", estimation), ("validation", validation_data), ("chosen", choice)],
             title="Fit by number of parameters",
             x_label="estimated parameters",
             y_label="fit in %",
@@ -260,9 +260,9 @@ def _row(trial: Trial) -> str:
     """Text line of a candidate."""
     if trial.failed is not None:
         return f"{'-':>9}{'-':>9}{'-':>10}{trial.parameters:>9}  {trial.name}: {trial.failed}"
-    told = trial.name + (UNSTABLE_NOTE if trial.unstable else "")
+    label = trial.name + (UNSTABLE_NOTE if trial.unstable else "")
     validation, worst = format_fit(trial.validation_fit), format_fit(trial.worst_fold)
-    return f"{validation:>9}{worst:>9}{format_fit(trial.estimation_fit):>10}{trial.parameters:>9}  {told}"
+    return f"{validation:>9}{worst:>9}{format_fit(trial.estimation_fit):>10}{trial.parameters:>9}  {label}"
 
 
 def format_fit(fit: float) -> str:

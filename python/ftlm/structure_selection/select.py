@@ -60,8 +60,8 @@ def automatic_problems(
     ModelError
         A driving signal that is not in the runs or is the output itself.
     """
-    first, asked = runs[0], dict(driven_by or {})
-    for output, drivers in asked.items():
+    first, drivers_by_output = runs[0], dict(driven_by or {})
+    for output, drivers in drivers_by_output.items():
         if output not in first.outputs:
             raise ModelError(
                 f"{parameter('driven_by')}: {output!r} is not an output{nearest(output, first.outputs)}; the runs have "
@@ -73,12 +73,12 @@ def automatic_problems(
                     f"{parameter('driven_by')}: {name!r} cannot drive {output}; name an input or another output of "
                     f"the runs: {', '.join(n for n in first.signals if n != output)}"
                 )
-    found = []
+    problems = []
     for output in first.outputs:
-        drivers = tuple(dict.fromkeys(asked.get(output, first.inputs)))
+        drivers = tuple(dict.fromkeys(drivers_by_output.get(output, first.inputs)))
         suffix = f"_{output}" if len(first.outputs) > 1 else ""
-        found.append(OutputProblem(runs, output, drivers, dict(delays or {}), suffix))
-    return found
+        problems.append(OutputProblem(runs, output, drivers, dict(delays or {}), suffix))
+    return problems
 
 
 #: Difference of Schwarz criteria that is not significant; doi:10.1080/01621459.1995.10476572.
@@ -224,9 +224,9 @@ def select(
         )
     if store is None:
         return _run_selection(CandidateEvaluator(folds, workers, progress), searched, every, sought)
-    asked = Request.of(folds.runs, [searched, every, *automatic], folds.unseen_runs, folds.description)
-    with Store(store, asked) as kept:
-        return _run_selection(CandidateEvaluator(folds, workers, progress, store=kept), searched, every, sought)
+    request = Request.of(folds.runs, [searched, every, *automatic], folds.unseen_runs, folds.description)
+    with Store(store, request) as open_store:
+        return _run_selection(CandidateEvaluator(folds, workers, progress, store=open_store), searched, every, sought)
 
 
 def _run_selection(
@@ -237,16 +237,16 @@ def _run_selection(
 ) -> Selection:
     """Evaluate nested and listed structures, or automatic ones of outputs, and choose."""
     if sought:
-        found = _select_automatically(work, sought)
-        winner = found.trials[found.chosen]
+        selection = _select_automatically(work, sought)
+        winner = selection.trials[selection.chosen]
         poor = winner.unstable or winner.validation_fit < MIN_VALIDATION_FIT
         duration = _piece_duration(sought) if poor and not work.folds.unseen_runs else None
         if duration is None:
-            return found
+            return selection
         folds = Folds.of_pieces(work.folds.runs, duration)
         problems = [replace(p, runs=folds.runs, initial="caputo") for p in sought]
         split = _select_automatically(replace(work, folds=folds, trials=[]), problems)
-        return split if split.trials[split.chosen].validation_fit > winner.validation_fit else found
+        return split if split.trials[split.chosen].validation_fit > winner.validation_fit else selection
     for structure in searched:
         select_stepwise(NestedStructures(structure), work)
     if every:
@@ -286,16 +286,16 @@ def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice
 
     If integer orders are preferred, fractional ones are chosen only as :func:`_eligible_indices` says.
     """
-    there = [t for t in work.trials if t.joint is not None]
-    if not there:
+    fits = [t for t in work.trials if t.joint is not None]
+    if not fits:
         why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
         raise ConvergenceError(f"no candidate can be fitted to {work.folds.description}{why}")
-    kept: dict[str, Trial] = {}
+    best_trials: dict[str, Trial] = {}
     for trial in work.trials:
         key = signature(trial.structure)
-        if key not in kept or trial.score < kept[key].score:
-            kept[key] = trial
-    ranked = _rank_trials(list(kept.values()))
+        if key not in best_trials or trial.score < best_trials[key].score:
+            best_trials[key] = trial
+    ranked = _rank_trials(list(best_trials.values()))
     ranked = _with_criteria(ranked)
     best = ranked[0]
     near = [k for k in _peer_indices(ranked) if _predicts_equally(ranked[k], best)]
@@ -319,7 +319,7 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
         choices = [_without_free_delays(choice) for choice in choices]
     winners = [c.winner for c in choices]
     structures = [w.structure for w in winners]
-    made = replace(
+    combination = replace(
         structures[0],
         equations=tuple(e for s in structures for e in s.equations),
         order_values={n: v for s in structures for n, v in s.order_values.items()},
@@ -328,9 +328,11 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
         offset=max((s.offset for s in structures), key=("none", "level", "ramp").index),
     )
     if any(w.joint is not None and w.joint.initial != "rest" for w in winners):
-        made = replace(made, initial="caputo")
+        combination = replace(combination, initial="caputo")
     start = {n: v for w in winners for n, v in w.values.items()}
-    trial = work.validate(describe_structure(made), made, work.fit_candidate(made, [start]), fine=True)
+    trial = work.validate(
+        describe_structure(combination), combination, work.fit_candidate(combination, [start]), fine=True
+    )
     reason = " ".join(c.reason for c in choices)
     if not agreed:
         reason += (
@@ -351,8 +353,8 @@ def _have_common_delays(winners: Sequence[Trial]) -> bool:
             return False
         values = np.array([w.values[name] for w in driven])
         errors = np.array([w.errors[name] for w in driven])
-        apart = np.abs(values[:, None] - values) > NORMAL_99 * np.hypot(errors[:, None], errors)
-        if np.any(apart):
+        is_apart = np.abs(values[:, None] - values) > NORMAL_99 * np.hypot(errors[:, None], errors)
+        if np.any(is_apart):
             return False
     return True
 
@@ -372,13 +374,13 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
     folds, winner = work.folds, choice.winner
     structure = _with_validated_initial_conditions(winner, folds)
     if folds.split is None:
-        found = identify(list(folds.runs), structure, threads=work.threads)
+        result = identify(list(folds.runs), structure, threads=work.threads)
     else:
         runs, duration = folds.split
-        found = identify_pieces(runs, structure, duration, threads=work.threads)
+        result = identify_pieces(runs, structure, duration, threads=work.threads)
     findings: list[Finding] = []
-    if winner.joint is not None and found.joint is not None and found.joint.noise:
-        lower = [o for o, v in found.joint.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
+    if winner.joint is not None and result.joint is not None and result.joint.noise:
+        lower = [o for o, v in result.joint.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
         if lower:
             findings.append(make_finding("other_optimum", output=", ".join(lower)))
     if winner.validation_fit < MIN_VALIDATION_FIT:
@@ -387,17 +389,17 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
     if worse:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
     for part in choice.parts or (choice,):
-        findings += _fractional_order_findings(part.winner, part.ranked, found)
+        findings += _fractional_order_findings(part.winner, part.ranked, result)
     validation_data = folds.unseen_runs
     return Selection(
         choice.ranked,
         choice.ranked.index(winner),
-        found,
+        result,
         folds.description,
         choice.reason,
         work.done_count,
         tuple(findings),
-        None if not validation_data else found.validate(validation_data),
+        None if not validation_data else result.validate(validation_data),
     )
 
 
@@ -412,45 +414,46 @@ def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
     ]
 
 
-def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], found: Identification) -> list[Finding]:
+def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: Identification) -> list[Finding]:
     """Return a finding on whether the fractional orders of the chosen candidate improve the prediction.
 
     The rule is that of ``ftlm orders`` on validation data, compared with the best candidate whose orders are all
     integers; candidates may have delays and offsets.
     """
-    orders = {n: v for n, v in winner.values.items() if n in winner.structure.order_names and n in found.orders}
+    orders = {n: v for n, v in winner.values.items() if n in winner.structure.order_names and n in result.orders}
     if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
         return []
-    named = ", ".join(f"{n} = {found.orders[n]:.3g}" for n in orders)
+    orders_text = ", ".join(f"{n} = {result.orders[n]:.3g}" for n in orders)
     rival = next((t for t in ranked if t.failed is None and not has_memory(t.structure)), None)
     if rival is None or set(rival.parts) != set(winner.parts):
         reason = "no candidate with integer orders was fitted"
-        return [make_finding("fractional_orders_not_told", parameter=named, reason=reason)]
+        return [make_finding("fractional_orders_not_told", parameter=orders_text, reason=reason)]
     gains = [fit - rival.parts[name] for name, fit in winner.parts.items()]
     parts = f"{len(gains)} part{'s' if len(gains) > 1 else ''}"
-    about = {"parameter": named, "other": rival.name, "parts": parts, "gain": median(gains)}
-    if is_degenerate(found) or rival.unstable or not rival.validation_fit >= MIN_VALIDATION_FIT:
+    about = {"parameter": orders_text, "other": rival.name, "parts": parts, "gain": median(gains)}
+    if is_degenerate(result) or rival.unstable or not rival.validation_fit >= MIN_VALIDATION_FIT:
         reason = f"the fit of {rival.name}, or of the chosen candidate, must not be used"
         return [make_finding("fractional_orders_not_told", reason=reason, **about)]
-    intervals = {n: {"all": found.intervals[n]} for n in orders if n in found.intervals}
+    intervals = {n: {"all": result.intervals[n]} for n in orders if n in result.intervals}
     whole = {n: float(round(orders[n])) for n in intervals}
     gained = improves_prediction(gains, intervals, whole) if intervals else None
     if gained is None:
-        lost = min(gains) <= -MIN_FIT_GAIN
-        reason = f"over {rival.name} some parts gain, and others {'lose' if lost else 'do not'}"
+        is_worse = min(gains) <= -MIN_FIT_GAIN
+        reason = f"over {rival.name} some parts gain, and others {'lose' if is_worse else 'do not'}"
         return [make_finding("fractional_orders_not_told", reason=reason, **about)]
     return [make_finding("fractional_orders_gain" if gained else "fractional_orders_gain_nothing", **about)]
 
 
 def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
     """Return, for each trial, the parts that it predicts badly while a stable trial predicts them far better."""
-    left = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
+    scores_by_part = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
     least: dict[str, float] = {}
-    for scores in (part for part, t in zip(left, every, strict=True) if not t.unstable):
+    for scores in (part for part, t in zip(scores_by_part, every, strict=True) if not t.unstable):
         for name, score in scores.items():
             least[name] = min(score, least.get(name, math.inf))
     return [
-        [n for n, v in s.items() if v > FAILURE_SCORE and v > least.get(n, math.inf) + FAILURE_SCORE_GAP] for s in left
+        [n for n, v in s.items() if v > FAILURE_SCORE and v > least.get(n, math.inf) + FAILURE_SCORE_GAP]
+        for s in scores_by_part
     ]
 
 
@@ -482,12 +485,12 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
     case of ten. If one block contains information that the others lack, omitting it costs the true structure far more
     than 5 %. Very strong evidence on all samples keeps it eligible; with too few folds for a t-test only within 5 %.
     """
-    apart = np.array(trial.scores) - np.array(best.scores)
+    differences = np.array(trial.scores) - np.array(best.scores)
     far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
-    if apart.size < MIN_T_TEST_FOLDS:
+    if differences.size < MIN_T_TEST_FOLDS:
         return far <= SCORE_TOLERANCE or (far <= MAX_SCORE_TOLERANCE and likely)
-    error = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
-    quantile = STUDENT_QUANTILES_95[min(apart.size - MIN_T_TEST_FOLDS, len(STUDENT_QUANTILES_95) - 1)]
+    error = float(np.std(differences, ddof=1)) / math.sqrt(differences.size)
+    quantile = STUDENT_QUANTILES_95[min(differences.size - MIN_T_TEST_FOLDS, len(STUDENT_QUANTILES_95) - 1)]
     return (far <= quantile * error and likely) or far <= max(
         SCORE_TOLERANCE, min(quantile * error, MAX_SCORE_TOLERANCE)
     )
@@ -517,11 +520,11 @@ def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[lis
 
 def _predicts_better(trial: Trial, other: Trial) -> bool:
     """Whether the residuals of a trial are smaller than another's by 1 %, and significantly over folds."""
-    apart = np.array(trial.scores) - np.array(other.scores)
-    if apart.size < MIN_T_TEST_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
+    differences = np.array(trial.scores) - np.array(other.scores)
+    if differences.size < MIN_T_TEST_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
         return False
-    error = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
-    return float(np.mean(apart)) < -MIN_BETTER_T_STATISTIC * error
+    error = float(np.std(differences, ddof=1)) / math.sqrt(differences.size)
+    return float(np.mean(differences)) < -MIN_BETTER_T_STATISTIC * error
 
 
 def _winner(near: Sequence[Trial]) -> Trial:
@@ -576,19 +579,19 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
 def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
     """Describe better candidates that fail on a part, and failures of the winner."""
     failures = dict(zip(map(id, ranked), _failed_parts(ranked), strict=True))
-    told = ""
-    ahead = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.unstable == winner.unstable]
-    if ahead:
-        other = min(ahead, key=lambda t: t.score)
+    text = ""
+    better = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.unstable == winner.unstable]
+    if better:
+        other = min(better, key=lambda t: t.score)
         name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
-        told += (
+        text += (
             f" {other.name} has {share:.2g} % smaller residuals on average and is not chosen: it fails on {name}, with "
             f"a fit of {format_fit(other.parts[name])} % where the chosen one has {format_fit(winner.parts[name])} %."
         )
     for name in failures[id(winner)]:
         other = max((t for t in ranked if name in t.parts and not t.unstable), key=lambda t: t.parts[name])
-        told += (
+        text += (
             f" It fails on {name}, with a fit of {format_fit(winner.parts[name])} %; {other.name} has "
             f"{format_fit(other.parts[name])} % there, but fails elsewhere."
         )
-    return told
+    return text

@@ -38,7 +38,7 @@ from ftlm.utils.resources import interruptible_pool
 PRESCREEN_SAMPLES, PRESCREEN_EVALUATIONS, MAX_PRESCREEN_COST_RATIO = 1200, 60, 3.0
 
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 #: A structure and its initial guesses.
 Start = tuple[Structure, Sequence[Mapping[str, float]]]
 
@@ -65,8 +65,8 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Ta
 
     levels = pool.map_items(level, starts)
     limit = MAX_PRESCREEN_COST_RATIO * min(levels)
-    ahead = sorted(every, key=lambda k: (levels[k], k))[:least]
-    return [k for k in every if levels[k] <= limit or k in ahead]
+    best_levels = sorted(every, key=lambda k: (levels[k], k))[:least]
+    return [k for k in every if levels[k] <= limit or k in best_levels]
 
 
 def _prescreen_cost(
@@ -80,16 +80,14 @@ def _prescreen_cost(
         [1.0 / (COARSE_SHARE * size) for size in output_deviations(runs, structure)],
         decimation=decimation,
     )
-    found = math.inf
+    cost = math.inf
     for point in points:
         try:
-            found = min(
-                found, grid.minimize(start_from_values(problem, point), PRESCREEN_EVALUATIONS).cost_per_residual
-            )
+            cost = min(cost, grid.minimize(start_from_values(problem, point), PRESCREEN_EVALUATIONS).cost_per_residual)
         except FtlmError:
             # Initial guesses without a finite simulation are skipped.
             continue
-    return found
+    return cost
 
 
 #: Initial guesses of an order that becomes free, relative to its integer value.
@@ -142,12 +140,12 @@ class CandidateEvaluator:
     known_count: int = 0
     trials: list[Trial] = field(default_factory=list)
 
-    def map_candidates(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def map_candidates(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """Return the results for candidates, in their order, with progress reports."""
         self.known_count += len(items)
         return self._in_order(work, items, self._report_progress)
 
-    def map_items(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """Return the results for items, in their order, without progress reports."""
         return self._in_order(work, items, lambda: None)
 
@@ -156,11 +154,13 @@ class CandidateEvaluator:
         if self.progress is not None:
             self.progress(self.done_count, self.known_count)
 
-    def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], report: Callable[[], None]) -> list[Made]:
-        out: list[Made] = []
+    def _in_order(
+        self, work: Callable[[Item], Result], items: Sequence[Item], report: Callable[[], None]
+    ) -> list[Result]:
+        out: list[Result] = []
         with interruptible_pool(self.threads) as workers:
-            for made in workers.map(work, items):
-                out.append(made)
+            for result in workers.map(work, items):
+                out.append(result)
                 report()
         return out
 
@@ -250,10 +250,12 @@ def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[
     with all orders free is a second initial structure.
     """
     subsets = work.best_subsets(inside)
-    found = _select_from_subsets(inside, work, subsets)
-    if found:
+    ends_from_subsets = _select_from_subsets(inside, work, subsets)
+    if ends_from_subsets:
         # Screened subsets are not fitted again as neighbors of other variants.
-        return _eliminate_from_ends(inside, work, found, {signature(inside.build(s.change.variant)) for s in subsets})
+        return _eliminate_from_ends(
+            inside, work, ends_from_subsets, {signature(inside.build(s.change.variant)) for s in subsets}
+        )
     if not inside.droppable:
         return _select_from_full(inside, work)
     changes = _untried_changes(inside, inside.simplest(), set())
@@ -266,27 +268,27 @@ def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[
             work.validate(c.words, inside.build(c.variant), j) for c, j in zip(changes, joints, strict=True)
         ]
     ends: list[tuple[Trial, FittedVariant]] = []
-    tried: set[str] = set()
+    keys: set[str] = set()
     for pairs in roots.values():
-        ahead = _by_criterion(inside, work, pairs)[:1]
-        ends += [_select_forward(inside, work, one, tried) for one in ahead]
+        best_changes = _by_criterion(inside, work, pairs)[:1]
+        ends += [_select_forward(inside, work, one, keys) for one in best_changes]
     if not ends:
         return work.trials
     first = min(ends, key=lambda end: _ranking_key(end[0]))
     joined = [j.values_by_name for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
-    from_above = _eliminate_from_full(inside, work, first[1], joined, tried)
+    from_above = _eliminate_from_full(inside, work, first[1], joined, keys)
     ends += [] if from_above is None else [from_above]
-    return _eliminate_from_ends(inside, work, ends, tried)
+    return _eliminate_from_ends(inside, work, ends, keys)
 
 
 def _eliminate_from_ends(
-    inside: NestedStructures, work: CandidateEvaluator, ends: Sequence[tuple[Trial, FittedVariant]], tried: set[str]
+    inside: NestedStructures, work: CandidateEvaluator, ends: Sequence[tuple[Trial, FittedVariant]], keys: set[str]
 ) -> list[Trial]:
     """Eliminate terms backward from each forward-selection result that is as good as the best."""
     least = min(_ranking_key(trial) for trial, _ in ends)
     for trial, at in ends:
         if (trial.unstable, trial.score) <= (least[0], least[1] + SCORE_TOLERANCE):
-            _eliminate_backward(inside, work, trial, at, tried)
+            _eliminate_backward(inside, work, trial, at, keys)
     return work.trials
 
 
@@ -307,15 +309,15 @@ def _select_from_full(inside: NestedStructures, work: CandidateEvaluator) -> lis
     if not roots:
         work.trials += [work.validate(c.words, inside.build(c.variant), j) for c, j in pairs]
         return work.trials
-    first = _validate_variants(inside, work, roots, beyond=-math.inf, margin=MAX_ROOT_SCORE_GAP)
-    tried = {_key(inside, r.change) for r in roots}
+    first = _validate_variants(inside, work, roots, limit=-math.inf, margin=MAX_ROOT_SCORE_GAP)
+    keys = {_key(inside, r.change) for r in roots}
     least = min(trial.score for trial in first)
     ends = [
-        _select_forward(inside, work, at, tried, trial)
+        _select_forward(inside, work, at, keys, trial)
         for trial, at in reversed(list(zip(first, roots, strict=False)))
         if trial.score <= least + MAX_ROOT_SCORE_GAP
     ]
-    return _eliminate_from_ends(inside, work, ends, tried)
+    return _eliminate_from_ends(inside, work, ends, keys)
 
 
 def _select_from_subsets(
@@ -324,23 +326,23 @@ def _select_from_subsets(
     """Fit and validate the best subsets; extend the best of them by free orders."""
     if not subsets:
         return []
-    ahead = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
+    best_subsets = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
     by_size: dict[int, ScreenedSubset] = {}
     for one in subsets:
         by_size.setdefault(len(one.start), one)
-    ahead += [s for s in by_size.values() if s not in ahead]
+    best_subsets += [s for s in by_size.values() if s not in best_subsets]
 
     def from_grid(subset: ScreenedSubset) -> JointFit | FtlmError:
         return work.fit_candidate(inside.build(subset.change.variant), [subset.start], refine=False)
 
-    joints = work.map_candidates(from_grid, ahead)
-    steps = _by_criterion(inside, work, [(s.change, j) for s, j in zip(ahead, joints, strict=True)])
+    joints = work.map_candidates(from_grid, best_subsets)
+    steps = _by_criterion(inside, work, [(s.change, j) for s, j in zip(best_subsets, joints, strict=True)])
     if not steps:
         return []
     ends = list(zip(_validate_variants(inside, work, steps), steps, strict=True))
-    tried = {signature(inside.build(s.change.variant)) for s in subsets}
+    keys = {signature(inside.build(s.change.variant)) for s in subsets}
     first = min(ends, key=lambda end: _ranking_key(end[0]))
-    return [first, _select_forward(inside, work, first[1], tried, first[0])]
+    return [first, _select_forward(inside, work, first[1], keys, first[0])]
 
 
 def _ranking_key(trial: Trial) -> tuple[bool, float]:
@@ -351,25 +353,25 @@ def _ranking_key(trial: Trial) -> tuple[bool, float]:
 def _select_forward(
     inside: NestedStructures,
     work: CandidateEvaluator,
-    chosen: FittedVariant,
-    tried: set[str],
+    candidate: FittedVariant,
+    keys: set[str],
     validated: Trial | None = None,
 ) -> tuple[Trial, FittedVariant]:
     """Add one term, free order or offset at a time while the prediction improves; return the best result."""
-    best = validated or _validate_variants(inside, work, [chosen])[0]
-    best_at, idle = chosen, 0
-    tried.add(_key(inside, chosen.change))
+    best = validated or _validate_variants(inside, work, [candidate])[0]
+    best_at, idle = candidate, 0
+    keys.add(_key(inside, candidate.change))
     while idle < MAX_IDLE_STEPS:
-        larger = _untried_changes(inside, inside.larger(chosen.change.variant), tried)
-        ahead = _fit_changes(inside, work, chosen, larger)[:VALIDATED_CHANGES]
-        if not ahead:
+        larger = _untried_changes(inside, inside.larger(candidate.change.variant), keys)
+        changes = _fit_changes(inside, work, candidate, larger)[:VALIDATED_CHANGES]
+        if not changes:
             break
-        found = _validate_variants(inside, work, ahead, beyond=_max_relevant_score(best))
-        tried |= {_key(inside, s.change) for s in ahead}
-        place = min(range(len(found)), key=lambda k: (_ranking_key(found[k]), k))
-        chosen = ahead[place]
-        if _is_better(found[place], best):
-            best, best_at, idle = found[place], chosen, 0
+        trials = _validate_variants(inside, work, changes, limit=_max_relevant_score(best))
+        keys |= {_key(inside, s.change) for s in changes}
+        place = min(range(len(trials)), key=lambda k: (_ranking_key(trials[k]), k))
+        candidate = changes[place]
+        if _is_better(trials[place], best):
+            best, best_at, idle = trials[place], candidate, 0
         else:
             idle += 1
     return best, best_at
@@ -390,7 +392,7 @@ def _eliminate_from_full(
     work: CandidateEvaluator,
     low: FittedVariant,
     others: Sequence[Mapping[str, float]],
-    tried: set[str],
+    keys: set[str],
 ) -> tuple[Trial, FittedVariant] | None:
     """Eliminate one term at a time from the full structure at integer orders; return the best result."""
     full = inside.richest(low.change.variant)
@@ -398,26 +400,26 @@ def _eliminate_from_full(
         return None
     structure = inside.build(full)
     known_values = (low.joint.values_by_name, *others)
-    starts = [initial_guesses(structure, known, full.integer_order_values())[0] for known in known_values]
+    starts = [initial_guesses(structure, coefficients, full.integer_order_values())[0] for coefficients in known_values]
     (joint,) = work.map_candidates(lambda item: work.fit_candidate(item, starts, refine=False), [structure])
     if isinstance(joint, FtlmError):
         return None
     at = FittedVariant(Change(describe_structure(structure), full), joint, 0.0)
-    found = _validate_variants(inside, work, [at])
-    best, best_at = found[0], at
+    trials = _validate_variants(inside, work, [at])
+    best, best_at = trials[0], at
     while True:
         changes = [
             c
             for c in inside.smaller(at.change.variant)
             if len(c.variant.coefficients) < len(at.change.variant.coefficients)
         ]
-        ahead = _fit_changes(inside, work, at, changes)
-        if not ahead:
+        fits = _fit_changes(inside, work, at, changes)
+        if not fits:
             return best, best_at
-        at = ahead[0]
-        if _key(inside, at.change) in tried:
+        at = fits[0]
+        if _key(inside, at.change) in keys:
             continue
-        tried.add(_key(inside, at.change))
+        keys.add(_key(inside, at.change))
         (trial,) = _validate_variants(inside, work, [at])
         if _ranking_key(trial) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT):
             best, best_at = trial, at
@@ -426,28 +428,28 @@ def _eliminate_from_full(
 def _validate_variants(
     inside: NestedStructures,
     work: CandidateEvaluator,
-    ahead: Sequence[FittedVariant],
+    candidates: Sequence[FittedVariant],
     *,
-    beyond: float = math.inf,
+    limit: float = math.inf,
     margin: float = 0.0,
 ) -> list[Trial]:
     """Evaluate fitted variants on validation data, without those that cannot be the best.
 
-    Variants from the first whose lower bound of the score exceeds `beyond` are evaluated after those before it. They
+    Variants from the first whose lower bound of the score exceeds `limit` are evaluated after those before it. They
     are skipped if all their bounds exceed the best score so far by more than the margin.
     """
 
-    def one(fitted: FittedVariant) -> Trial:
-        return work.validate(_name(inside, fitted), inside.build(fitted.change.variant), fitted.joint)
+    def one(candidate: FittedVariant) -> Trial:
+        return work.validate(_name(inside, candidate), inside.build(candidate.change.variant), candidate.joint)
 
-    least = [validation_score_bound(f.joint, work.folds) for f in ahead]
-    first = next((k for k, level in enumerate(least) if k > 0 and level > beyond), len(ahead))
-    found = work.map_candidates(one, ahead[:first])
-    best = min(found, key=_ranking_key, default=None)
+    least = [validation_score_bound(f.joint, work.folds) for f in candidates]
+    first = next((k for k, level in enumerate(least) if k > 0 and level > limit), len(candidates))
+    trials = work.map_candidates(one, candidates[:first])
+    best = min(trials, key=_ranking_key, default=None)
     if best is not None and (best.unstable or any(level <= best.score + margin for level in least[first:])):
-        found += work.map_candidates(one, ahead[first:])
-    work.trials += found
-    return found
+        trials += work.map_candidates(one, candidates[first:])
+    work.trials += trials
+    return trials
 
 
 def _fit_changes(
@@ -460,38 +462,38 @@ def _fit_changes(
         structure = inside.build(change.variant)
         whole = {**at.change.variant.integer_order_values(), **change.variant.integer_order_values()}
         starts.append((structure, initial_guesses(structure, values, whole)))
-    ahead = prescreen(work.folds.runs, starts, VALIDATED_CHANGES, work)
-    joints = work.map_candidates(lambda k: work.fit_candidate(*starts[k], refine=False), ahead)
-    return _by_criterion(inside, work, [(changes[k], joint) for k, joint in zip(ahead, joints, strict=True)])
+    selection = prescreen(work.folds.runs, starts, VALIDATED_CHANGES, work)
+    joints = work.map_candidates(lambda k: work.fit_candidate(*starts[k], refine=False), selection)
+    return _by_criterion(inside, work, [(changes[k], joint) for k, joint in zip(selection, joints, strict=True)])
 
 
 def _by_criterion(
     inside: NestedStructures, work: CandidateEvaluator, pairs: Sequence[tuple[Change, JointFit | FtlmError]]
 ) -> list[FittedVariant]:
     """Sort fitted variants by Schwarz's criterion, with the smallest variance inflation of their residuals."""
-    there = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
-    if not there:
+    fits = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
+    if not fits:
         return []
-    inflation = min(residual_variance_inflation(j) for _, j in there)
-    count = [parameter_count(inside.build(c.variant), j, work.folds) for c, j in there]
-    every = [FittedVariant(c, j, schwarz_criterion(j, n, inflation)) for (c, j), n in zip(there, count, strict=True)]
+    inflation = min(residual_variance_inflation(j) for _, j in fits)
+    count = [parameter_count(inside.build(c.variant), j, work.folds) for c, j in fits]
+    every = [FittedVariant(c, j, schwarz_criterion(j, n, inflation)) for (c, j), n in zip(fits, count, strict=True)]
     return sorted(every, key=lambda f: f.bic)
 
 
 def _eliminate_backward(
-    inside: NestedStructures, work: CandidateEvaluator, best: Trial, at: FittedVariant, tried: set[str]
+    inside: NestedStructures, work: CandidateEvaluator, best: Trial, at: FittedVariant, keys: set[str]
 ) -> None:
     """Eliminate one term, free order or offset at a time while the prediction does not get worse."""
     while True:
         changes = [
-            c for c in _untried_changes(inside, inside.smaller(at.change.variant), tried) if _is_adjacent_integer(c, at)
+            c for c in _untried_changes(inside, inside.smaller(at.change.variant), keys) if _is_adjacent_integer(c, at)
         ]
         steps = _fit_changes(inside, work, at, changes)
-        tried |= {_key(inside, c) for c in changes}
-        found = _validate_variants(inside, work, steps[:VALIDATED_CHANGES], beyond=_max_relevant_score(best))
+        keys |= {_key(inside, c) for c in changes}
+        trials = _validate_variants(inside, work, steps[:VALIDATED_CHANGES], limit=_max_relevant_score(best))
         better = [
             (t, s)
-            for t, s in zip(found, steps, strict=False)
+            for t, s in zip(trials, steps, strict=False)
             if _ranking_key(t) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT)
         ]
         if not better:
@@ -509,13 +511,13 @@ def _key(inside: NestedStructures, change: Change) -> str:
     return signature(inside.build(change.variant))
 
 
-def _untried_changes(inside: NestedStructures, changes: Iterable[Change], tried: set[str]) -> list[Change]:
+def _untried_changes(inside: NestedStructures, changes: Iterable[Change], keys: set[str]) -> list[Change]:
     """Return changes to untried variants, each once."""
-    return list({key: c for c in changes if (key := _key(inside, c)) not in tried}.values())
+    return list({key: c for c in changes if (key := _key(inside, c)) not in keys}.values())
 
 
-def _name(inside: NestedStructures, fitted: FittedVariant) -> str:
-    return describe_structure(inside.build(fitted.change.variant))
+def _name(inside: NestedStructures, candidate: FittedVariant) -> str:
+    return describe_structure(inside.build(candidate.change.variant))
 
 
 def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator) -> list[Trial]:
@@ -528,9 +530,9 @@ def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator)
     items = list(candidates.items())
     # Stored results take no time, so they give no estimate of it.
     if len(items) > TIME_ESTIMATE_CANDIDATES and not (work.store is not None and len(work.store)):
-        begun = work.clock()
+        start_time = work.clock()
         work.trials += work.map_candidates(one, items[: work.threads])
-        took = work.clock() - begun
+        took = work.clock() - start_time
         rest = len(items) - work.threads
         warnings.warn(
             f"{len(items)} candidates: the first {work.threads} took {format_duration(took)}, so the other {rest} "

@@ -59,25 +59,25 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
         Fewer than two finite values.
     """
     every = as_floats("values", values, gaps=True).ravel()
-    there = every[np.isfinite(every)]
-    if there.size < 2:
-        raise DataError(f"a histogram needs two finite values at least, not {there.size}; give a longer run")
+    finite = every[np.isfinite(every)]
+    if finite.size < 2:
+        raise DataError(f"a histogram needs two finite values at least, not {finite.size}; give a longer run")
     # As many bars as Sturges and the spread of outliers ask for, symmetric about the mean.
-    mean, deviation = float(np.mean(there)), float(np.std(there))
-    reach = float(np.max(np.abs(there - mean)))
+    mean, deviation = float(np.mean(finite)), float(np.std(finite))
+    reach = float(np.max(np.abs(finite - mean)))
     if reach <= max(1e-12 * abs(mean), MIN_DIFFERENCE):
         reach = 0.1 * abs(mean) if abs(mean) > MIN_DIFFERENCE else 1.0
-    bars = min(MAX_BARS, 2 * math.ceil(math.log2(there.size)) + 1)
+    bars = min(MAX_BARS, 2 * math.ceil(math.log2(finite.size)) + 1)
     edges = mean + np.linspace(-reach, reach, bars + 1)
-    counts, _ = np.histogram(there, edges)
+    counts, _ = np.histogram(finite, edges)
     width = edges[1] - edges[0]
     at = np.linspace(edges[0], edges[-1], 121)
-    curve = there.size * width * _normal(at, mean, deviation) if deviation > 0 else np.zeros(at.size)
-    lost = every.size - there.size
-    said = f"{caption} {lost} values are not finite and left out.".strip() if lost else caption
+    curve = finite.size * width * _normal(at, mean, deviation) if deviation > 0 else np.zeros(at.size)
+    nonfinite_count = every.size - finite.size
+    text = f"{caption} {nonfinite_count} values are not finite and left out.".strip() if nonfinite_count else caption
     described = (
-        f"Histogram of {there.size} values: mean {number(mean, 3)}, standard deviation {number(deviation, 3)}, from "
-        f"{number(float(there.min()), 3)} to {number(float(there.max()), 3)}."
+        f"Histogram of {finite.size} values: mean {number(mean, 3)}, standard deviation {number(deviation, 3)}, from "
+        f"{number(float(finite.min()), 3)} to {number(float(finite.max()), 3)}."
     )
     return LineChart(
         at,
@@ -85,7 +85,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
         title=title,
         x_label=x_label,
         y_label="samples",
-        caption=said,
+        caption=text,
         bars=(edges, counts.astype(np.float64)),
         width=SMALL_WIDTH_PX,
         height=HISTOGRAM_HEIGHT_PX,
@@ -350,8 +350,8 @@ def _dot(x: float, y: float) -> Markup:
 
 def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
     """Points of complex values [px]; far outside of the plot it no longer matters where."""
-    found = np.asarray(values, dtype=np.complex128)
-    xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(found.real), plot.y_pixels(found.imag)))
+    points = np.asarray(values, dtype=np.complex128)
+    xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(points.real), plot.y_pixels(points.imag)))
     return list(zip(xs, ys, strict=True))
 
 

@@ -252,9 +252,9 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
     if len(inside) >= 2:
         labels = [f"{s * 10.0**p:g}".replace("-", "−") for s, p in inside]
         return Ticks([math.log10(s) + p for s, p in inside], labels)
-    found = ticks(10.0**low, 10.0**high, most)
-    kept = [(math.log10(v), label) for v, label in zip(found.values, found.labels, strict=True) if v > 0]
-    return Ticks([v for v, _ in kept], [label for _, label in kept], found.factor)
+    scale_ticks = ticks(10.0**low, 10.0**high, most)
+    pairs = [(math.log10(v), label) for v, label in zip(scale_ticks.values, scale_ticks.labels, strict=True) if v > 0]
+    return Ticks([v for v, _ in pairs], [label for _, label in pairs], scale_ticks.factor)
 
 
 def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
@@ -281,8 +281,8 @@ def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
     order = np.lexsort((values[finite], stretch))
     picked = np.concatenate([order[edges[:-1]], order[edges[1:] - 1], [0, finite.size - 1]])
-    kept: NDArray[np.intp] = finite[np.unique(picked)]
-    return kept
+    selection: NDArray[np.intp] = finite[np.unique(picked)]
+    return selection
 
 
 def limits(values: list[Floats], margin: float) -> tuple[float, float]:

@@ -67,27 +67,27 @@ def slider_readout(
         Every position is a sample. The position of the largest difference between the first two lines is included and
         marked.
     """
-    there = np.flatnonzero(np.isfinite(x))
-    if not there.size or not lines:
+    rows_present = np.flatnonzero(np.isfinite(x))
+    if not rows_present.size or not lines:
         return ""
-    chosen = there[:: max(1, math.ceil(there.size / min(places, SLIDER_POSITIONS)))]
+    rows = rows_present[:: max(1, math.ceil(rows_present.size / min(places, SLIDER_POSITIONS)))]
     begin = None
     if len(lines) > 1:
-        apart = np.abs(lines[0][2][there] - lines[1][2][there])
-        if np.isfinite(apart).any():
-            begin = there[int(np.nanargmax(apart))]
-    chosen = np.unique(np.append(chosen, [there[-1], *([] if begin is None else [begin])]))
+        differences = np.abs(lines[0][2][rows_present] - lines[1][2][rows_present])
+        if np.isfinite(differences).any():
+            begin = rows_present[int(np.nanargmax(differences))]
+    rows = np.unique(np.append(rows, [rows_present[-1], *([] if begin is None else [begin])]))
     name, unit = _split_unit(x_label)
-    told = {
+    data = {
         "name": name,
         "unit": unit,
         "y": _split_unit(y_label)[1],
-        "at": _scaled_integers(x[chosen]),
-        "begin": 0 if begin is None else int(np.searchsorted(chosen, begin)),
+        "at": _scaled_integers(x[rows]),
+        "begin": 0 if begin is None else int(np.searchsorted(rows, begin)),
         "apart": begin is not None,
-        "lines": [{"name": n, "style": s, "at": _scaled_integers(y[chosen])} for n, s, y in lines],
+        "lines": [{"name": n, "style": s, "at": _scaled_integers(y[rows])} for n, s, y in lines],
     }
-    return json.dumps(told, separators=(",", ":"), allow_nan=False)
+    return json.dumps(data, separators=(",", ":"), allow_nan=False)
 
 
 def _split_unit(label: str) -> tuple[str, str]:
@@ -422,15 +422,15 @@ def _outline(line: _Line, plot: PlotArea, points: int) -> str:
     good = good[:: max(1, good.size // points)]
     xs, top = plot.tenths(line.x[good], high[good])
     _, bottom = plot.tenths(line.x[good], low[good])
-    there = [f"{x} {y}" for x, y in zip(xs, top, strict=True)]
+    upper_points = [f"{x} {y}" for x, y in zip(xs, top, strict=True)]
     back = [f"{x} {y}" for x, y in zip(xs[::-1], bottom[::-1], strict=True)]
-    return "M" + "L".join([*there, *back]) + "Z"
+    return "M" + "L".join([*upper_points, *back]) + "Z"
 
 
 def _stem_path(line: _Line, plot: PlotArea) -> str:
-    kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
+    rows = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
     zero = round(float(plot.y_pixels(0.0) - plot.top) * TENTHS_PER_PIXEL)
-    return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[kept], line.y[kept]), strict=True))
+    return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[rows], line.y[rows]), strict=True))
 
 
 def _stroke(style: int, *, dots: bool = False) -> Markup:
@@ -459,15 +459,15 @@ def stroke_path(style: int, places: Iterable[tuple[float, float]], width: float 
 
 def _path(line: _Line, plot: PlotArea, points: int) -> str:
     """Path data in integer tenths of a pixel, relative to the previous point, restarted after every gap."""
-    kept = decimate(line.y, points)
-    if kept.size == 0:
+    rows = decimate(line.y, points)
+    if rows.size == 0:
         return ""
-    xs, ys = plot.tenths(line.x[kept], line.y[kept])
-    starts = np.diff(np.cumsum(~np.isfinite(line.y))[kept], prepend=-1) != 0
+    xs, ys = plot.tenths(line.x[rows], line.y[rows])
+    starts = np.diff(np.cumsum(~np.isfinite(line.y))[rows], prepend=-1) != 0
     # A line of no length, h0: a lone point between gaps still shows, as a dot.
     parts = [
-        f"M{x} {y}h0" if start else f"l{x - before} {y - above}"
-        for x, y, before, above, start in zip(xs, ys, [0, *xs], [0, *ys], starts.tolist(), strict=False)
+        f"M{x} {y}h0" if start else f"l{x - x_before} {y - above}"
+        for x, y, x_before, above, start in zip(xs, ys, [0, *xs], [0, *ys], starts.tolist(), strict=False)
     ]
     return "".join(parts).replace(" -", "-")
 

@@ -59,26 +59,26 @@ def check_arguments(decorated: Decorated) -> Decorated:
         return decorated
 
     @functools.wraps(decorated)
-    def call_function(*given: Any, **named: Any) -> Any:
-        for value in (*given, *named.values()):
+    def call_function(*args: Any, **kwargs: Any) -> Any:
+        for value in (*args, *kwargs.values()):
             if isinstance(value, range):
-                _check_range(decorated, given, named)
+                _check_range(decorated, args, kwargs)
         try:
-            return decorated(*given, **named)
+            return decorated(*args, **kwargs)
         except Exception as error:
             # A decorated function below names its own argument, and the caller knows the one of this function.
             cause = error.__cause__ if isinstance(error, FtlmError) else error
             foreign = cause is error or isinstance(cause, _FROM_ARGUMENTS)
             if foreign and cause is not None and not _is_raised_by_caller(cause):
-                _raise_type_error(decorated, given, named, error)
+                _raise_type_error(decorated, args, kwargs, error)
             raise
 
     return cast("Decorated", call_function)
 
 
-def _check_range(function: Callable[..., Any], given: Any, named: Any) -> None:
+def _check_range(function: Callable[..., Any], args: Any, kwargs: Any) -> None:
     """Raise for the first argument that is a range with more values than can be read."""
-    for name, value in inspect.signature(function).bind_partial(*given, **named).arguments.items():
+    for name, value in inspect.signature(function).bind_partial(*args, **kwargs).arguments.items():
         if isinstance(value, range) and value and abs((value[-1] - value[0]) // value.step) >= MAX_SEQUENCE_LENGTH:
             raise ModelError(
                 f"{setting(name)} {short_repr(value)} has more than {MAX_SEQUENCE_LENGTH} values; give fewer"
@@ -97,11 +97,11 @@ def _is_raised_by_caller(error: BaseException) -> bool:
     return False
 
 
-def _raise_type_error(function: Callable[..., Any], given: Any, named: Any, error: Exception) -> None:
+def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, error: Exception) -> None:
     """Raise ModelError for the first argument whose type is not the annotated one."""
     signature = inspect.signature(function)
     try:
-        bound = signature.bind(*given, **named)
+        bound = signature.bind(*args, **kwargs)
     except TypeError:
         return
     names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))

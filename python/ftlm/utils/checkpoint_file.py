@@ -66,8 +66,8 @@ def decode_array(_: type, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
 RECORD_ENCODER = msgspec.msgpack.Encoder(enc_hook=encode_numpy)
 
 
-def _digest(before: bytes, payload: bytes) -> bytes:
-    return hashlib.blake2b(before + payload, digest_size=DIGEST_BYTES).digest()
+def _digest(prefix: bytes, payload: bytes) -> bytes:
+    return hashlib.blake2b(prefix + payload, digest_size=DIGEST_BYTES).digest()
 
 
 def _insert(connection: sqlite3.Connection, kind: Kind, payloads: Sequence[bytes]) -> None:
@@ -154,14 +154,14 @@ class CheckpointFile:
 
     def _check_kind(self) -> None:
         """Raise DataError if the database is that of another kind of computation, or of another program."""
-        found = [str(sql) for (sql,) in self._connection.execute("SELECT sql FROM sqlite_master")]
-        self._is_empty = not found
+        statements = [str(sql) for (sql,) in self._connection.execute("SELECT sql FROM sqlite_master")]
+        self._is_empty = not statements
         other: Kind = "selection" if self.kind == "search" else "search"
-        if found == [f"CREATE TABLE {other} {TABLE_COLUMNS}"]:
+        if statements == [f"CREATE TABLE {other} {TABLE_COLUMNS}"]:
             raise DataError(
                 f"{self.path} is the store of a {other}, not of a {self.kind}; go on with it by the call that began it"
             )
-        if found not in ([], [f"CREATE TABLE {self.kind} {TABLE_COLUMNS}"]):
+        if statements not in ([], [f"CREATE TABLE {self.kind} {TABLE_COLUMNS}"]):
             raise self._foreign_error()
 
     def _foreign_error(self) -> DataError:
@@ -202,8 +202,8 @@ class CheckpointFile:
                 payloads.append(payload)
             else:
                 # Pages that no record uses, which an append might.
-                found = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-                damage = None if found == "ok" else f"after record {len(payloads)}: {found}"
+                answer = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+                damage = None if answer == "ok" else f"after record {len(payloads)}: {answer}"
         except sqlite3.Error as error:
             damage = f"after record {len(payloads)}: {error}"
         return payloads, damage

@@ -69,15 +69,15 @@ def check_new(path: str | os.PathLike[str], *, force: bool, words: FileMessages 
     file = Path(path)
     if words.folder and file.is_dir():
         raise DataError(f"{words.format_path(file)} is a folder; {words.folder}")
-    there = _link_status(file)
+    status = _link_status(file)
     # A dangling link is a file that someone meant to be there.
-    if there is not None and not force:
+    if status is not None and not force:
         raise DataError(
             f"{words.format_path(file)} exists; choose another name, or overwrite it with {parameter('force', True)}"
         )
-    if there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode):
+    if status is not None and not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
         # A device of the system would be gone, and what stands behind a link is not what was asked for.
-        kind = "a link" if stat.S_ISLNK(there.st_mode) else "a device, pipe or socket"
+        kind = "a link" if stat.S_ISLNK(status.st_mode) else "a device, pipe or socket"
         raise DataError(
             f"{words.format_path(file)} is {kind}, no regular file, and is not overwritten; choose another name"
         )
@@ -114,10 +114,10 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
-    there = [name for name in names if os.path.lexists(folder / name)]
-    if there and not force:
+    names_present = [name for name in names if os.path.lexists(folder / name)]
+    if names_present and not force:
         raise DataError(
-            f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or "
+            f"{folder / names_present[0]} exists ({len(names_present)} such files); choose another folder, or "
             f"{parameter('force', True)}"
         )
 
@@ -136,16 +136,16 @@ def write_atomically(
     try:
         # In its folder, since no rename crosses disks; short, so that long names have room.
         beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
-        there = _link_status(file)
+        status = _link_status(file)
         # Never through a link that another program left. The permissions are those that a new file has here, or those
         # of the file that is overwritten, from the first byte on.
-        descriptor = os.open(beside, _NEW_FILE_FLAGS, 0o666 if there is None else stat.S_IMODE(there.st_mode) & 0o777)
+        descriptor = os.open(beside, _NEW_FILE_FLAGS, 0o666 if status is None else stat.S_IMODE(status.st_mode) & 0o777)
         try:
             with os.fdopen(descriptor, "wb") as stream:
                 stream.write(content)
                 stream.flush()
-                if there is not None and hasattr(os, "fchmod"):
-                    os.fchmod(stream.fileno(), stat.S_IMODE(there.st_mode) & 0o777)
+                if status is not None and hasattr(os, "fchmod"):
+                    os.fchmod(stream.fileno(), stat.S_IMODE(status.st_mode) & 0o777)
                 os.fsync(stream.fileno())
             if force:
                 os.replace(beside, file)
@@ -231,11 +231,11 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
     except (OSError, ValueError) as error:
         # What no file system takes is not put into words as it is.
         name = str(file)
-        shown = (
+        path_text = (
             name if name.isprintable() and len(name) <= MAX_NAME_CHARACTERS else short_repr(name, MAX_NAME_CHARACTERS)
         )
         why = (error.strerror if isinstance(error, OSError) else None) or error
-        raise DataError(f"{what} {shown} cannot be read: {why}; check the path") from error
+        raise DataError(f"{what} {path_text} cannot be read: {why}; check the path") from error
     if not stat.S_ISREG(state.st_mode):
         raise DataError(f"{file} is not a regular file; give {source}")
     raise DataError(f"{file} has {state.st_size} bytes, no {what} is larger than {max_bytes}; give {source}")

@@ -39,19 +39,19 @@ SYMBOL_PATTERN = re.compile(rf"({'|'.join(GREEK_LETTERS)}|[A-Za-z])_?(\d*)", re.
 
 def symbol(name: str) -> str:
     """Return a name as a symbol: ``theta12`` becomes θ₁₂; other names are unchanged."""
-    found = SYMBOL_PATTERN.fullmatch(name)
-    if not found:
+    match = SYMBOL_PATTERN.fullmatch(name)
+    if not match:
         return name
-    return GREEK_LETTERS.get(found[1], found[1]) + found[2].translate(_SUBSCRIPT_DIGITS)
+    return GREEK_LETTERS.get(match[1], match[1]) + match[2].translate(_SUBSCRIPT_DIGITS)
 
 
 def symbol_html(name: str) -> Markup:
     """Return the symbol with an HTML subscript, escaped."""
-    found = SYMBOL_PATTERN.fullmatch(name)
-    if not found:
+    match = SYMBOL_PATTERN.fullmatch(name)
+    if not match:
         return Markup("<i>{}</i>").format(name)
-    stem = Markup("<i>{}</i>").format(GREEK_LETTERS.get(found[1], found[1]))
-    return stem + Markup("<sub>{}</sub>").format(found[2]) if found[2] else stem
+    stem = Markup("<i>{}</i>").format(GREEK_LETTERS.get(match[1], match[1]))
+    return stem + Markup("<sub>{}</sub>").format(match[2]) if match[2] else stem
 
 
 class Exact(float):
@@ -125,7 +125,7 @@ _CONTROL_PATTERN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u061c\\u200e\
 
 def escape_controls(text: str) -> str:
     """Return a text with control characters replaced by escapes of JSON."""
-    return _CONTROL_PATTERN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return _CONTROL_PATTERN.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 class EscapedStream:

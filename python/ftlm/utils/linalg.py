@@ -49,17 +49,17 @@ def triangular_factor(tall: Floats) -> Floats:
 
 def thin_svd(tall: Floats) -> tuple[Floats, Floats, Floats]:
     """Thin singular value decomposition: the matrix is left * sizes @ right."""
-    left, sizes, right = _core.singular_values(np.ascontiguousarray(tall.T))
-    return left.reshape(sizes.size, len(tall)).T, sizes, right.reshape(sizes.size, tall.shape[1])
+    u, sizes, right = _core.singular_values(np.ascontiguousarray(tall.T))
+    return u.reshape(sizes.size, len(tall)).T, sizes, right.reshape(sizes.size, tall.shape[1])
 
 
-def minimum_norm_solution(tall: Floats, wanted: Floats, rcond: float | None) -> Floats:
+def minimum_norm_solution(tall: Floats, target: Floats, rcond: float | None) -> Floats:
     """Minimum-norm least-squares solution; singular values below a share ``rcond`` of the largest are zero.
 
     Without ``rcond`` the cutoff is the rounding level.
     """
     columns = tall.shape[1]
-    both = triangular_factor(np.column_stack([tall, wanted]))
+    both = triangular_factor(np.column_stack([tall, target]))
     if rcond is None:
         rcond = float(np.finfo(np.float64).eps) * max(tall.shape)
     return np.asarray(np.linalg.lstsq(both[:, :columns], both[:, columns], rcond=rcond)[0])
@@ -69,5 +69,5 @@ def orthonormal(columns: Floats, least: float) -> Floats:
     """Orthonormal basis of columns of any scale; directions below a share ``least`` are dropped."""
     sizes = column_norms(columns)
     directions, spread, _ = thin_svd(columns / np.where(sizes > 0, sizes, 1.0))
-    kept: Floats = directions[:, spread > least * spread.max(initial=0.0)]
-    return kept
+    basis: Floats = directions[:, spread > least * spread.max(initial=0.0)]
+    return basis

@@ -44,11 +44,11 @@ def current_interface() -> Interface:
 @contextmanager
 def use_interface(name: Interface) -> Iterator[None]:
     """Make messages for an interface within a block."""
-    before, _Current.interface = _Current.interface, name
+    interface_before, _Current.interface = _Current.interface, name
     try:
         yield
     finally:
-        _Current.interface = before
+        _Current.interface = interface_before
 
 
 def flag_of(name: str) -> str:

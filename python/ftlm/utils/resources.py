@@ -43,13 +43,13 @@ def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
     ModelError
         ``FTLM_MEMORY`` is not a positive size.
     """
-    given = os.environ.get(MEMORY_VARIABLE, "")
-    if given:
-        size = re.fullmatch(r"([0-9]{1,18})([KMGT]?)(?:i?B)?", given.strip(), re.ASCII)
+    text = os.environ.get(MEMORY_VARIABLE, "")
+    if text:
+        size = re.fullmatch(r"([0-9]{1,18})([KMGT]?)(?:i?B)?", text.strip(), re.ASCII)
         count = int(size[1]) << 10 * " KMGT".index(size[2] or " ") if size else 0
         if not 0 < count < 1 << 63:
             raise ModelError(
-                f"{MEMORY_VARIABLE}={given!r} is not a memory size; give bytes, or a number with K, M, G or T"
+                f"{MEMORY_VARIABLE}={text!r} is not a memory size; give bytes, or a number with K, M, G or T"
             )
         return count
     return int(DEFAULT_MEMORY_SHARE * (available_memory(system) or FALLBACK_MEMORY_BYTES / DEFAULT_MEMORY_SHARE))
@@ -60,13 +60,13 @@ def available_memory(system: Path = _SYSTEM_ROOT) -> int | None:
 
     Minimum of the kernel's available memory and of the remainder of every control group of this process.
     """
-    left = [*_kernel_available_bytes(system), *_cgroup_available_bytes(system)]
-    if not left:
+    amounts = [*_kernel_available_bytes(system), *_cgroup_available_bytes(system)]
+    if not amounts:
         try:
-            left = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2]
+            amounts = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2]
         except (AttributeError, ValueError, OSError):  # not on Windows
             return None
-    return max(min(left), 1)
+    return max(min(amounts), 1)
 
 
 def _text(path: Path) -> str:
@@ -77,13 +77,13 @@ def _text(path: Path) -> str:
 
 
 def _kernel_available_bytes(system: Path) -> list[int]:
-    found = re.search(r"^MemAvailable:\s+([0-9]+) kB", _text(system / "proc/meminfo"), re.MULTILINE)
-    return [int(found[1]) << 10] if found else []
+    match = re.search(r"^MemAvailable:\s+([0-9]+) kB", _text(system / "proc/meminfo"), re.MULTILINE)
+    return [int(match[1]) << 10] if match else []
 
 
 def _cgroup_available_bytes(system: Path) -> list[int]:
     """Remaining memory of each control group, v1 and v2; reclaimable page cache counts as free."""
-    left = []
+    amounts = []
     for line in _text(system / "proc/self/cgroup").splitlines():
         number, controllers, name = (*line.split(":", 2), "", "")[:3]
         if number == "0" and not controllers:
@@ -100,12 +100,12 @@ def _cgroup_available_bytes(system: Path) -> list[int]:
         parts = [part for part in name.split("/") if part not in ("", "..")]
         for depth in range(len(parts), -1, -1):
             folder = system.joinpath(root, *parts[:depth])
-            limit, used = _text(folder / most).strip(), _text(folder / now).strip()
+            limit, usage = _text(folder / most).strip(), _text(folder / now).strip()
             # "max" is no limit; one beyond all memory is the older version's way to say so.
-            if limit.isdecimal() and used.isdecimal() and int(limit) < 1 << 60:
-                found = re.search(rf"^{droppable} ([0-9]+)$", _text(folder / "memory.stat"), re.MULTILINE)
-                left.append(int(limit) - int(used) + (int(found[1]) if found else 0))
-    return left
+            if limit.isdecimal() and usage.isdecimal() and int(limit) < 1 << 60:
+                match = re.search(rf"^{droppable} ([0-9]+)$", _text(folder / "memory.stat"), re.MULTILINE)
+                amounts.append(int(limit) - int(usage) + (int(match[1]) if match else 0))
+    return amounts
 
 
 #: Length of the timed FFT, duration of the measurement [s], and time of one FFT on the reference machine [s], two
@@ -123,11 +123,11 @@ PARALLEL_EFFICIENCY = 0.7
 def machine_slowdown() -> float:
     """Return the time per unit of work on one core relative to the reference machine, at the current load."""
     values, count = np.ones(BENCHMARK_FFT_LENGTH), 0
-    begun = time.perf_counter()
-    while time.perf_counter() - begun < BENCHMARK_DURATION_S:
+    start_time = time.perf_counter()
+    while time.perf_counter() - start_time < BENCHMARK_DURATION_S:
         np.fft.rfft(values)
         count += 1
-    return max((time.perf_counter() - begun) / max(count, 1) / REFERENCE_FFT_TIME_S, 0.1)
+    return max((time.perf_counter() - start_time) / max(count, 1) / REFERENCE_FFT_TIME_S, 0.1)
 
 
 def estimate_duration(seconds: float, threads: int) -> float:
@@ -163,13 +163,13 @@ def stop_flag() -> _core.Stop | None:
 def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
     """Thread pool that cancels running computations and queued tasks when the main thread is interrupted."""
     flag = stop_flag() or _core.Stop()
-    with ThreadPoolExecutor(threads, initializer=_STOP_FLAG.set, initargs=(flag,)) as made:
+    with ThreadPoolExecutor(threads, initializer=_STOP_FLAG.set, initargs=(flag,)) as pool:
         try:
-            yield made
+            yield pool
         except BaseException as error:
             if not isinstance(error, Exception):
                 flag.set()
-            made.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
@@ -189,8 +189,8 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
     site
         Whether the site packages are set up at the start, which takes some time.
     """
-    here = os.getcwd()
-    folders = [folder for folder in sys.path if os.path.isabs(folder) and folder != here]
+    folder_now = os.getcwd()
+    folders = [folder for folder in sys.path if os.path.isabs(folder) and folder != folder_now]
     # The package itself may have been found in the working directory.
     folders.append(str(Path(__file__).resolve().parents[2]))
     program = f"import runpy, sys; sys.path += {folders!a}; runpy.run_path({str(script)!a}, run_name='__main__')"

@@ -33,9 +33,9 @@ def is_rest(samples: Floats) -> bool:
 
     Only the first sample is tested, because a machine at rest may respond within a few samples.
     """
-    there = samples[~np.isnan(samples)]
+    finite = samples[~np.isnan(samples)]
     noise = white_noise(samples)
-    return bool(abs(there[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(there)))
+    return bool(abs(finite[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(finite)))
 
 
 def estimate_noise(samples: Floats) -> float:

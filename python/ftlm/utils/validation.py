@@ -47,9 +47,9 @@ def error_text(error: BaseException, most: int = 500) -> str:
     return (text if len(text) <= most else f"{text[:most]}…").encode("utf-8", "backslashreplace").decode()
 
 
-def check_choice(name: str, value: object, known: Iterable[str]) -> None:
+def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise unless a value is one of some strings."""
-    words = list(known)
+    words = list(choices)
     if not isinstance(value, str) or value not in words:
         raise ModelError(f"{setting(name)} {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
 
@@ -144,8 +144,8 @@ def join_names(names: Iterable[object], most: int = 40) -> str:
 def nearest(word: object, names: Iterable[object]) -> str:
     """Return " (did you mean …?)" for the closest of names, or an empty string."""
     options = [str(name) for name in names]
-    begun = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
-    close = [max(begun, key=len)] if begun else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
+    prefixes = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
+    close = [max(prefixes, key=len)] if prefixes else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
@@ -154,19 +154,19 @@ def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> Dat
     return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
 
 
-def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
+def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]:
     """Return {signal: column} for None, one name, a list of names or a mapping."""
-    if given is None:
+    if column_names is None:
         return {}
-    if isinstance(given, str):
-        return {given: given}
-    if isinstance(given, Mapping):
-        return dict(given)
-    if not isinstance(given, Iterable):
+    if isinstance(column_names, str):
+        return {column_names: column_names}
+    if isinstance(column_names, Mapping):
+        return dict(column_names)
+    if not isinstance(column_names, Iterable):
         raise DataError(
-            f"{parameter(argument)} is a {type(given).__name__}; pass a dict of name: column, or a list of names"
+            f"{parameter(argument)} is a {type(column_names).__name__}; pass a dict of name: column, or a list of names"
         )
-    names = list(given)
+    names = list(column_names)
     for index, name in enumerate(names):
         if not isinstance(name, str):
             raise DataError(
@@ -177,19 +177,19 @@ def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
     return {name: name for name in names}
 
 
-def as_mapping(argument: str, given: object, of: str = "array") -> Mapping[str, object]:
+def as_mapping(argument: str, value: object, of: str = "array") -> Mapping[str, object]:
     """Return a mapping unchanged; raise for anything else."""
-    if not isinstance(given, Mapping):
-        raise DataError(f"{parameter(argument)} is a {type(given).__name__}; pass a dict of name: {of}")
-    return given
+    if not isinstance(value, Mapping):
+        raise DataError(f"{parameter(argument)} is a {type(value).__name__}; pass a dict of name: {of}")
+    return value
 
 
-def check_known(what: str, given: Iterable[str], known: Sequence[str]) -> None:
+def check_known(what: str, names: Iterable[str], choices: Sequence[str]) -> None:
     """Raise for a name that does not occur in the equation."""
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(str(name), known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(dict.fromkeys(known)) or 'none'}"
+    for name in names:
+        if name not in choices:
+            near = difflib.get_close_matches(str(name), choices, 1)
+            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(dict.fromkeys(choices)) or 'none'}"
             raise ModelError(f"{what} {name!r} does not occur in the equation; {hint}")
 
 
@@ -210,12 +210,10 @@ def check_threads(threads: int | None) -> int:
         Fewer than one or more than 1024 threads, or an invalid ``FTLM_THREADS``.
     """
     if threads is None:
-        given = os.environ.get(THREADS_VARIABLE, "").strip()
-        if given and not (given.isascii() and given.isdecimal() and len(given) < 5 and 1 <= int(given) <= 1024):
-            raise ModelError(
-                f"{THREADS_VARIABLE}={given!r} is not a number of threads; give 1 to 1024, or leave it out"
-            )
-        return int(given) if given else available_threads()
+        text = os.environ.get(THREADS_VARIABLE, "").strip()
+        if text and not (text.isascii() and text.isdecimal() and len(text) < 5 and 1 <= int(text) <= 1024):
+            raise ModelError(f"{THREADS_VARIABLE}={text!r} is not a number of threads; give 1 to 1024, or leave it out")
+        return int(text) if text else available_threads()
     count = whole_number(threads)
     if count is None or not 1 <= count <= 1024:
         raise ModelError(f"{setting('threads')} {threads!r} is outside [1, 1024]; leave it out to use all cores")
@@ -276,8 +274,8 @@ def _check_sequence(name: str, values: object) -> None:
         except Exception as error:
             raise DataError(f"{name} is not an array of numbers ({error_text(error, 200)}); give an array") from error
         if length > MAX_SEQUENCE_LENGTH or depth > MAX_DIMENSIONS:
-            found = f"{MAX_SEQUENCE_LENGTH} values" if length > MAX_SEQUENCE_LENGTH else f"{MAX_DIMENSIONS} dimensions"
-            raise DataError(f"{name} is not an array of numbers, but a sequence of more than {found}; give an array")
+            size = f"{MAX_SEQUENCE_LENGTH} values" if length > MAX_SEQUENCE_LENGTH else f"{MAX_DIMENSIONS} dimensions"
+            raise DataError(f"{name} is not an array of numbers, but a sequence of more than {size}; give an array")
         if not length:
             return
         depth, first = depth + 1, item
@@ -347,11 +345,11 @@ def apply_along_axis(
     array = finite_floats(name, values)
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
-    moved = np.moveaxis(array, axis, -1)
-    if moved.shape[-1] == 0:
+    samples = np.moveaxis(array, axis, -1)
+    if samples.shape[-1] == 0:
         raise DataError(f"{name} has shape {array.shape} and holds no value; give at least one")
-    rows = np.ascontiguousarray(moved.reshape(-1, moved.shape[-1]))
-    return np.moveaxis(work(rows).reshape(moved.shape), -1, axis)
+    rows = np.ascontiguousarray(samples.reshape(-1, samples.shape[-1]))
+    return np.moveaxis(work(rows).reshape(samples.shape), -1, axis)
 
 
 CSV_TIME = "t_s"

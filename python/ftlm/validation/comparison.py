@@ -101,15 +101,15 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     return Metrics(*_core.metrics(y, y - prediction))
 
 
-def pooled_metrics(measured: list[Floats], residuals: list[Floats]) -> Metrics:
+def pooled_metrics(outputs: list[Floats], residuals: list[Floats]) -> Metrics:
     """Return metrics over several runs without missing samples; the fit uses each run's own mean."""
-    known = [~np.isnan(y) for y in measured]
-    if not all(k.all() for k in known):
-        measured = [y[k] for y, k in zip(measured, known, strict=True)]
-        residuals = [e[k] for e, k in zip(residuals, known, strict=True)]
-    if len(measured) == 1:
-        return Metrics(*_core.metrics(measured[0], residuals[0]))
-    return Metrics(*_core.metrics(np.concatenate([y - np.mean(y) for y in measured]), np.concatenate(residuals)))
+    finite = [~np.isnan(y) for y in outputs]
+    if not all(k.all() for k in finite):
+        outputs = [y[k] for y, k in zip(outputs, finite, strict=True)]
+        residuals = [e[k] for e, k in zip(residuals, finite, strict=True)]
+    if len(outputs) == 1:
+        return Metrics(*_core.metrics(outputs[0], residuals[0]))
+    return Metrics(*_core.metrics(np.concatenate([y - np.mean(y) for y in outputs]), np.concatenate(residuals)))
 
 
 #: Orders of an output's own terms closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
@@ -221,12 +221,12 @@ class Comparison:
                 )
         if self.output_samples:
             count = max(sum(drop_missing(y).size for y in parts) for parts in self.measured.values())
-            known = (
+            reference_text = (
                 f", equation error over {self.m} block pulses per run"
                 if set(self.measured) - set(self.without_equation_error)
                 else ""
             )
-            lines.append(f"output error over {count} samples{known}")
+            lines.append(f"output error over {count} samples{reference_text}")
         else:
             lines.append(f"over {self.m} block pulses per run")
         lines += describe_missing_equation_errors(self.without_equation_error)
@@ -312,17 +312,17 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
     full = records(runs, model.structure, m)
     parts = []
     for run, sampled, rec in zip(runs, free, full, strict=True):
-        measured = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
+        outputs = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
         simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
-        parts.append(_run_errors(model, rec, simulated, measured, sampled.initial, gaps=run.missing_samples))
+        parts.append(_run_errors(model, rec, simulated, outputs, sampled.initial, gaps=run.missing_samples))
     times = [compared_times(run, model.structure) for run in runs]
-    found = _pooled_comparison(model, runs, parts, m, times, sampled=True)
-    findings = list(found.findings)
+    result = _pooled_comparison(model, runs, parts, m, times, sampled=True)
+    findings = list(result.findings)
     if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _is_unconverged(sampled)]:
         findings.append(make_finding("sampling_coarse", run=", ".join(restless)))
     if moving := runs_in_motion(model, runs):
         findings.append(make_finding("simulated_from_rest", run=", ".join(moving)))
-    return replace(found, findings=tuple(findings))
+    return replace(result, findings=tuple(findings))
 
 
 def _is_unconverged(sampled: OutputSamples) -> bool:
@@ -351,8 +351,8 @@ def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> 
     check_model(model)
     several = as_runs(runs)
     carried = min(run.length for run in several) - 1
-    chosen = min(model.m or default_m(several, power_of_two=False), carried) if m is None else m
-    m = check_m(chosen, several, power_of_two=False)
+    length = min(model.m or default_m(several, power_of_two=False), carried) if m is None else m
+    m = check_m(length, several, power_of_two=False)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
     return several, m
@@ -375,8 +375,8 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
             out[item.output] = {"level": initial[item.output][LEVEL_EXPONENT]}
             continue
         alone = initial_exponents(item, "caputo", model.structure.offset)
-        found = {round(e, 9) for e in initial[item.output] if e > -1}
-        if not found or (isinstance(model.structure.initial, str) and not found <= set(alone)):
+        exponent_set = {round(e, 9) for e in initial[item.output] if e > -1}
+        if not exponent_set or (isinstance(model.structure.initial, str) and not exponent_set <= set(alone)):
             out[item.output] = {}
             continue
         exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
@@ -429,7 +429,7 @@ def _run_errors(
     model: Model,
     full: Record,
     simulated: dict[str, Floats],
-    measured: dict[str, Floats],
+    outputs: dict[str, Floats],
     initial: dict[str, dict[float, float]],
     *,
     gaps: Container[str] = (),
@@ -447,7 +447,7 @@ def _run_errors(
         # Nor has one with a non-linear term that has no value.
         if e.output not in gaps and e.friction is None and all(np.isfinite(full.of(t.column)).all() for t in e.terms)
     }
-    return _RunErrors(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
+    return _RunErrors(full.step, initial, simulated, outputs, {o: full.of(o) for o in model.outputs}, missed)
 
 
 def _pooled_comparison(
@@ -539,11 +539,11 @@ def validation_findings(own: Comparison, validation: Comparison) -> list[Finding
     findings = []
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
-            fitted, tested = (
+            first_lags, tested = (
                 np.stack([c.measured[o][i] for o in own.measured]) for c, i in ((own, k), (validation, j))
             )
-            shared = common_rows(fitted, tested)
-            if shared == tested.shape[1] == fitted.shape[1]:
+            shared = common_rows(first_lags, tested)
+            if shared == tested.shape[1] == first_lags.shape[1]:
                 findings.append(make_finding("validates_itself", run=other, other=name))
             elif shared:
                 numbers = {"count": shared, "rows": tested.shape[1]}
@@ -577,14 +577,17 @@ def common_rows(one: Floats, other: Floats) -> int:
     return 0
 
 
-def validation_fit_findings(before: Mapping[str, float], validation: Comparison) -> list[Finding]:
+def validation_fit_findings(estimation_fits: Mapping[str, float], validation: Comparison) -> list[Finding]:
     """Return findings on outputs whose fit on validation runs is far below that on the estimation data."""
     findings = []
     for other, _, figures in validation.per_run:
         for output, f in figures.items():
             # Negated so that a fit that is not a number counts as lost.
-            if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - MAX_FIT_DROP_POINTS:
-                numbers = {"before": before[output], "after": f.fit, "where": ""}
+            if (
+                np.isfinite(estimation_fits.get(output, np.nan))
+                and not f.fit >= estimation_fits[output] - MAX_FIT_DROP_POINTS
+            ):
+                numbers = {"before": estimation_fits[output], "after": f.fit, "where": ""}
                 findings.append(make_finding("fit_falls", run=other, output=output, **numbers))
     return findings
 
@@ -613,9 +616,13 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
         for name in output:
             unit = (units or {}).get(name, "")
             label = symbol_html(name) + (Markup(" [{}]").format(unit) if unit else Markup(""))
-            known = equation[name] is not UNKNOWN_METRICS
+            has_values = equation[name] is not UNKNOWN_METRICS
             rows.append(
-                [label, *(astuple(equation[name]) if known else [None] * len(_METRIC_LABELS)), *astuple(output[name])]
+                [
+                    label,
+                    *(astuple(equation[name]) if has_values else [None] * len(_METRIC_LABELS)),
+                    *astuple(output[name]),
+                ]
             )
 
     for label, comparison in compared:
@@ -629,9 +636,11 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
     own = 1 + len(_METRIC_LABELS)
     if unequated and all(cell is None for row in rows for cell in row[1:own]):
         # Four columns of nothing would push what is known off a narrow screen.
-        kept: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
+        shown_rows: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
         single = (("", 1), ("output error (simulation)", 4))
-        return Table(title, ("output", *_METRIC_LABELS), kept, groups=single, headings=headings, note=" ".join(reasons))
+        return Table(
+            title, ("output", *_METRIC_LABELS), shown_rows, groups=single, headings=headings, note=" ".join(reasons)
+        )
     note = (
         "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
         "close to one another; only the simulation shows what the model knows."

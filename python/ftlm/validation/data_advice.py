@@ -194,21 +194,23 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
         return
     # The rows in which an input moves are of rest, too: the output answers later, after a dead time much later.
     late = max(1, int(DEAD_TIME_SHARE * rows))
-    held = [run[n][first : first + rows - late] for n in run.inputs]
+    first_values = [run[n][first : first + rows - late] for n in run.inputs]
     ends = [run[n][first + rows - late : first + rows + 1] for n in run.inputs]
-    moved = any(np.any(after != before[0]) for before, after in zip(held, ends, strict=True))
-    without_input = not any(values[0] for values in held)
-    if all(np.ptp(values) == 0 for values in held) and (without_input or (first == 0 and moved)):
+    is_moving = any(
+        np.any(change_after != row_before[0]) for row_before, change_after in zip(first_values, ends, strict=True)
+    )
+    without_input = not any(values[0] for values in first_values)
+    if all(np.ptp(values) == 0 for values in first_values) and (without_input or (first == 0 and is_moving)):
         return
     begin, end = first * run.step, (first + rows) * run.step
-    after = (
+    change_after = (
         f"use {parameter('window', (float(f'{end:.4g}'), None))}"
         if first < run.length // 20
         else "check the sensor, or cut it away"
     )
     level = _with_unit(run, name, float(y[first]))
     yield make_finding(
-        "channel_off", run=run.name, output=name, level=level, begin=begin, end=end, rows=rows, after=after
+        "channel_off", run=run.name, output=name, level=level, begin=begin, end=end, rows=rows, after=change_after
     )
 
 
@@ -227,11 +229,11 @@ def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
     moving = np.abs(np.diff(y))
     typical = float(np.median(moving[moving > 0])) if np.any(moving > 0) else 0.0
     # A slow turning point that ends with an input step is steep on one side only.
-    before = abs(y[first - 1] - y[first - 2]) if first >= 2 else math.inf
+    step_before = abs(y[first - 1] - y[first - 2]) if first >= 2 else math.inf
     end = first + rows
-    after = abs(y[end + 1] - y[end]) if end + 1 < y.size else math.inf
+    step_after = abs(y[end + 1] - y[end]) if end + 1 < y.size else math.inf
     at_extreme = y[first] in (y.min(), y.max())
-    return bool(at_extreme and rows < y.size and min(before, after) > max(4 * _quantum(y), 0.2 * typical))
+    return bool(at_extreme and rows < y.size and min(step_before, step_after) > max(4 * _quantum(y), 0.2 * typical))
 
 
 def _saturation(run: Run, name: str) -> Iterator[Finding]:
@@ -299,14 +301,14 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
     for at in jumps.tolist():
         if at < WRAP_SLOPE or at + WRAP_SLOPE + 1 >= y.size:
             continue
-        before = float(y[at] - y[at - WRAP_SLOPE])
-        after = float(y[at + 1 + WRAP_SLOPE] - y[at + 1])
+        slope_before = float(y[at] - y[at - WRAP_SLOPE])
+        slope_after = float(y[at + 1 + WRAP_SLOPE] - y[at + 1])
         if any(_jumps_near(run[n], at) for n in run.inputs):
             # A measured current follows its command, which jumps.
             continue
         # Both slopes oppose the jump: the quantity continued while its counter restarted.
-        stays = max(abs(before), abs(after)) < 0.5 * abs(steps[at])
-        if stays and before * steps[at] < 0 and after * steps[at] < 0:
+        stays = max(abs(slope_before), abs(slope_after)) < 0.5 * abs(steps[at])
+        if stays and slope_before * steps[at] < 0 and slope_after * steps[at] < 0:
             rows.append(at + 1)
     if not rows:
         return
@@ -368,13 +370,13 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
             # A free response: its transient is all there is.
             continue
         moving = [n for n in inputs if np.ptp(run[n]) > 0]
-        known = sum(2 * spectral_lines(run[n])[0] for n in moving)
-        known += sum(abs(float(np.mean(run[n]))) > LEVEL_SHARE * float(np.std(run[n])) for n in inputs)
+        line_count = sum(2 * spectral_lines(run[n])[0] for n in moving)
+        line_count += sum(abs(float(np.mean(run[n]))) > LEVEL_SHARE * float(np.std(run[n])) for n in inputs)
         free = len(item.order_names) + len(item.coefficient_names)
-        if free > known:
+        if free > line_count:
             listed = ", ".join(inputs)
             yield make_finding(
-                "excitation_short", run=run.name, output=item.output, free=free, listed=listed, known=int(known)
+                "excitation_short", run=run.name, output=item.output, free=free, listed=listed, known=int(line_count)
             )
 
 
@@ -426,8 +428,8 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
         if float(t_left @ t_left) < MIN_TREND_RESIDUAL_SHARE * float(t @ t):
             continue
         slope = float(t_left @ y_left) / float(t_left @ t_left)
-        left = y_left - slope * t_left
-        blocks = np.array_split(left * t_left, DRIFT_BLOCKS)
+        remainder = y_left - slope * t_left
+        blocks = np.array_split(remainder * t_left, DRIFT_BLOCKS)
         spread = math.sqrt(sum(float(np.sum(b)) ** 2 for b in blocks)) / float(t_left @ t_left)
         size = float(np.std(y))
         if abs(slope) > DRIFT_SHARE * size and abs(slope) > DRIFT_SIGMAS * spread:

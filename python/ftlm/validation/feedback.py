@@ -146,10 +146,14 @@ def feedback_test(
         return FeedbackTest("undecided", f"{count} changes; {MIN_CHANGES} are needed", rows=longest)
     if not dense:
         # Between its changes a held input has no innovation. The residual before a change is known at the change.
-        kept = [k for k, c in enumerate(changes) if c.size >= MIN_CHANGES // 2]
-        if not kept:
+        rows_by_run = [k for k, c in enumerate(changes) if c.size >= MIN_CHANGES // 2]
+        if not rows_by_run:
             return FeedbackTest("undecided", f"{count} changes over {len(runs)} short runs", rows=longest)
-        runs, inputs, changes = [runs[k] for k in kept], [inputs[k] for k in kept], [changes[k] for k in kept]
+        runs, inputs, changes = (
+            [runs[k] for k in rows_by_run],
+            [inputs[k] for k in rows_by_run],
+            [changes[k] for k in rows_by_run],
+        )
         missed = [_fill_missing(residuals[k])[c - 1] for k, c in zip(runs, changes, strict=True)]
         moves = [u[c] for u, c in zip(inputs, changes, strict=True)]
         beside = [[other[k][c] for k, c in zip(runs, changes, strict=True)] for other in others]
@@ -157,36 +161,40 @@ def feedback_test(
         missed, moves = [_fill_missing(residuals[k]) for k in runs], inputs
         beside = [[other[k] for k in runs] for other in others]
     room = MAX_FEEDBACK_ROWS
-    taken = []
+    sizes = []
     for u in moves:
-        taken.append(min(u.size, room))
-        room -= taken[-1]
-    used = [k for k, rows in enumerate(taken) if rows >= (MIN_FEEDBACK_ROWS if dense else MIN_CHANGES // 2)]
+        sizes.append(min(u.size, room))
+        room -= sizes[-1]
+    rows_used = [k for k, rows in enumerate(sizes) if rows >= (MIN_FEEDBACK_ROWS if dense else MIN_CHANGES // 2)]
     test = _Innovations(
-        [missed[k][: taken[k]] for k in used],
-        [moves[k][: taken[k]] for k in used],
-        [[other[k][: taken[k]] for k in used] for other in beside],
+        [missed[k][: sizes[k]] for k in rows_used],
+        [moves[k][: sizes[k]] for k in rows_used],
+        [[other[k][: sizes[k]] for k in rows_used] for other in beside],
         shift=int(dense),
     ).test()
     if not test.has_feedback:
         return test
     responses: list[Floats] = [np.zeros(u.size) for u in signal]
-    for k, response in zip(used, test.response, strict=True):
-        there, size = responses[runs[k]], inputs[k].size
+    for k, response in zip(rows_used, test.response, strict=True):
+        response_rows, size = responses[runs[k]], inputs[k].size
         if dense:
-            there[: response.size] = response
+            response_rows[: response.size] = response
         else:
             ends = [*changes[k][1 : response.size], size][: response.size]
             for_rows = np.diff([changes[k][0], *ends])
-            held = np.repeat(response, for_rows)
-            there[changes[k][0] : changes[k][0] + held.size] = held
+            series = np.repeat(response, for_rows)
+            response_rows[changes[k][0] : changes[k][0] + series.size] = series
     return replace(test, response=tuple(responses))
 
 
 def _fill_missing(residuals: Floats) -> Floats:
     """Return residuals with their mean at missing samples, which only reduces the power of the test."""
-    gone = np.isnan(residuals)
-    return np.where(gone, np.mean(residuals[~gone]), residuals) if gone.any() and not gone.all() else residuals
+    is_missing = np.isnan(residuals)
+    return (
+        np.where(is_missing, np.mean(residuals[~is_missing]), residuals)
+        if is_missing.any() and not is_missing.all()
+        else residuals
+    )
 
 
 def _has_clock(changes: Sequence[NDArray[np.intp]]) -> bool:
@@ -280,10 +288,10 @@ def _local_past(w: Floats, past: Floats) -> float:
     x = x - x.mean(axis=1, keepdims=True)
     y = w[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS, 1)
     y = y - y.mean(axis=1, keepdims=True)
-    left, sizes, _ = np.linalg.svd(x, full_matrices=False)
-    told = np.where(sizes[:, :, None] > 1e-9 * sizes[:, :1, None], left.transpose(0, 2, 1) @ y, 0.0)
+    u, sizes, _ = np.linalg.svd(x, full_matrices=False)
+    projection = np.where(sizes[:, :, None] > 1e-9 * sizes[:, :1, None], u.transpose(0, 2, 1) @ y, 0.0)
     total = np.sum(y * y, axis=(1, 2))
-    shares = np.sum(told * told, axis=(1, 2)) / np.where(total > 0, total, np.inf)
+    shares = np.sum(projection * projection, axis=(1, 2)) / np.where(total > 0, total, np.inf)
     return float(np.mean(LOCAL_ROWS * shares / x.shape[2])) / (1 + 3.5 / math.sqrt(count))
 
 
@@ -375,7 +383,7 @@ class _Innovations:
         sizes = np.linalg.norm(columns, axis=0)
         columns = columns / np.where(sizes > 0, sizes, 1.0)
         sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
-        ratios = [_score_ratio(clipped[rows], chosen) for chosen in sets]
+        ratios = [_score_ratio(clipped[rows], columns) for columns in sets]
         best = int(np.argmax(ratios))
         return ratios[best], sets[best], rows
 
@@ -395,8 +403,8 @@ class _Innovations:
             return FeedbackTest("command", f"its own past determines it to {self.scale:.1e}", rows=count)
         ratio, columns, rows = self._ratio(0, clipped)
         target = clipped[rows]
-        fitted = columns @ minimum_norm_solution(columns, target, 1e-12)
-        share = float(1 - np.sum((target - fitted) ** 2) / np.sum(target**2))
+        fit = columns @ minimum_norm_solution(columns, target, 1e-12)
+        share = float(1 - np.sum((target - fit) ** 2) / np.sum(target**2))
 
         def result(state: FeedbackState, reason: str = "") -> FeedbackTest:
             response = self._response(columns, rows) if state == "found" else ()
@@ -419,7 +427,7 @@ class _Innovations:
         if self._ratio_with_noisy_input(rows) <= 1:
             return result("undecided", "a closed loop, or noise in the measured input")
         # A loop acts all the time. Two signals that were made beforehand agree on one stretch by chance.
-        gains = np.array([part.sum() for part in np.array_split(fitted * target, STEADY_PARTS)])
+        gains = np.array([part.sum() for part in np.array_split(fit * target, STEADY_PARTS)])
         if np.median(gains) < STEADY_SHARE * max(float(gains.sum()), 1e-300):
             return result("undecided", "only one part of the run shows it")
         first = max(INNOVATION_COUNTS) + self.input_lags
@@ -465,11 +473,11 @@ class _Innovations:
             w = y - past @ (inverse @ at)
             w = np.clip(w / max(robust_deviation(w), 1e-300), -INPUT_CLIP, INPUT_CLIP)
             w = w - w.mean()
-            left = columns - past @ (inverse @ from_columns)
-            sizes = np.linalg.norm(left, axis=0)
-            left = left / np.where(sizes > 0, sizes, 1.0)
-            sets = [left[:, :1], left[:, :3], *(left[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
-            least = min(least, max(_score_ratio(w, chosen) for chosen in sets))
+            remainder = columns - past @ (inverse @ from_columns)
+            sizes = np.linalg.norm(remainder, axis=0)
+            remainder = remainder / np.where(sizes > 0, sizes, 1.0)
+            sets = [remainder[:, :1], remainder[:, :3], *(remainder[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
+            least = min(least, max(_score_ratio(w, columns_of_set) for columns_of_set in sets))
         return least
 
     def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:

@@ -73,10 +73,10 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     -----
     doi:10.1109/TAC.1974.1100705, doi:10.1093/biomet/76.2.297, doi:10.1214/aos/1176344136.
     """
-    given = check_integer("parameters", parameters, 0)
+    count = check_integer("parameters", parameters, 0)
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
-    k = given + tests.initial_terms + len(tests.outputs)
+    k = count + tests.initial_terms + len(tests.outputs)
     likelihood = 0.0
     for name, output in tests.outputs.items():
         # A residual of exactly nothing has no finite likelihood.
@@ -89,8 +89,8 @@ def criteria_of_likelihood(log_likelihood: float, parameters: int, samples: int)
     """Return AIC, AICc and BIC from a log likelihood, and the numbers of all estimated parameters and samples."""
     k = parameters
     aic = 2 * k - 2 * log_likelihood
-    left = samples - k - 1
-    aicc = aic + 2 * k * (k + 1) / left if left > 0 else math.inf
+    degrees_of_freedom = samples - k - 1
+    aicc = aic + 2 * k * (k + 1) / degrees_of_freedom if degrees_of_freedom > 0 else math.inf
     return InformationCriteria(k, samples, log_likelihood, aic, aicc, k * math.log(samples) - 2 * log_likelihood)
 
 

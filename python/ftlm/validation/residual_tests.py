@@ -102,8 +102,8 @@ class CorrelationTest:
     @property
     def largest(self) -> tuple[int, float]:
         """Lag and value of the largest correlation among the tested lags."""
-        judged = np.where((self.lags >= self.first) & (self.values != 1.0), np.abs(self.values), -1.0)
-        at = int(np.argmax(judged))
+        magnitudes = np.where((self.lags >= self.first) & (self.values != 1.0), np.abs(self.values), -1.0)
+        at = int(np.argmax(magnitudes))
         return int(self.lags[at]), float(self.values[at])
 
     def to_dict(self) -> dict[str, Any]:
@@ -369,9 +369,9 @@ def run_residual_tests(
     outputs = {}
     for item in model.equations:
         name = item.output
-        measured = [compared_values(run, model.structure, name) for run in runs]
-        deviation = math.sqrt(float(np.mean([np.nanvar(y) for y in measured])))
-        gaps = [np.isnan(y[1:-1]) for y in measured]
+        measurements = [compared_values(run, model.structure, name) for run in runs]
+        deviation = math.sqrt(float(np.mean([np.nanvar(y) for y in measurements])))
+        gaps = [np.isnan(y[1:-1]) for y in measurements]
         direct = {s for t in item.terms for s in t.signals if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
         outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
@@ -398,14 +398,14 @@ def _test_output(
 
     ``commands`` states for each input of the equation whether the model has direct feedthrough from it.
     """
-    everything = np.concatenate([e[~gone] for e, gone in zip(series, gaps, strict=True)])
+    everything = np.concatenate([e[~gap] for e, gap in zip(series, gaps, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
         rms = float(np.sqrt(np.mean(everything**2)))
     nr = rms / deviation if deviation > 0 else math.inf
     if not math.isfinite(rms):
-        lost, across = _failed_test(np.arange(lags + 1)), _failed_test(np.arange(-lags, lags + 1))
-        return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across))
-    series = [np.where(gone, np.nan, e) for e, gone in zip(series, gaps, strict=True)]
+        failure, across = _failed_test(np.arange(lags + 1)), _failed_test(np.arange(-lags, lags + 1))
+        return OutputResiduals(series, math.inf, math.inf, failure, dict.fromkeys(signals, across))
+    series = [np.where(gap, np.nan, e) for e, gap in zip(series, gaps, strict=True)]
     white_test = _whiteness(series, everything.size, lags)
     moving = {n: signals[n] for n in run_inputs if not is_constant(signals[n])}
     loops = {
@@ -449,8 +449,8 @@ def _test_beyond_parameters(
     for name, test in output.inputs.items():
         if test.failed:
             noise = NoiseModel.fit(output.residuals, signals[name], lags)
-            beyond = noise.subtract(output.residuals, sensitivities)
-            again = _independence(beyond, signals[name], noise, lags, first=test.first)
+            residuals = noise.subtract(output.residuals, sensitivities)
+            again = _independence(residuals, signals[name], noise, lags, first=test.first)
             inputs[name] = again if again.passed else test
     return replace(output, inputs=inputs)
 
@@ -513,12 +513,12 @@ class NoiseModel:
         """
         if [rows.shape[1] for rows in directions] != [e.size for e in series]:
             return series
-        there = [np.where(np.isnan(e), np.nan, rows) for e, rows in zip(series, directions, strict=True)]
-        columns = [np.concatenate(self.whiten(list(rows))) for rows in zip(*there, strict=True)]
+        directions_with_gaps = [np.where(np.isnan(e), np.nan, rows) for e, rows in zip(series, directions, strict=True)]
+        columns = [np.concatenate(self.whiten(list(rows))) for rows in zip(*directions_with_gaps, strict=True)]
         if not columns:
             return series
-        measured = np.concatenate(self.whiten(series))
-        amounts = minimum_norm_solution(np.stack(columns, axis=1), measured, SENSITIVITY_RANK_TOLERANCE)
+        residuals = np.concatenate(self.whiten(series))
+        amounts = minimum_norm_solution(np.stack(columns, axis=1), residuals, SENSITIVITY_RANK_TOLERANCE)
         return [e - amounts @ rows for e, rows in zip(series, directions, strict=True)]
 
 
@@ -568,33 +568,33 @@ def friction_term(output: str, coefficient: str, tanh_slope: float = math.inf) -
 
 def failed_tests(tests: Residuals) -> list[Finding]:
     """Return findings on failed and undecided tests, and on detected feedback."""
-    found = []
+    findings = []
     for name, output in tests.outputs.items():
         if not math.isfinite(output.rms):
-            found.append(make_finding("out_of_range", output=name))
+            findings.append(make_finding("out_of_range", output=name))
             continue
         white = output.whiteness
         if not white.passed and not output.follows_direction:
             numbers = {"statistic": white.statistic, "lags": int(white.lags[-1]), "limit": white.limit}
             noise = make_finding("noise_coloured", output=name)
-            found.append(noise if output.is_noise else make_finding("output_not_white", output=name, **numbers))
+            findings.append(noise if output.is_noise else make_finding("output_not_white", output=name, **numbers))
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
                 code = "follow_undecided_still" if math.isnan(test.limit) else "follow_undecided"
-                found.append(make_finding(code, output=name, input=signal, limit=test.limit))
+                findings.append(make_finding(code, output=name, input=signal, limit=test.limit))
             elif not test.passed:
                 numbers = {"value": value, "lag": lag, "limit": test.limit}
-                found.append(make_finding("residuals_follow_input", output=name, input=signal, **numbers))
+                findings.append(make_finding("residuals_follow_input", output=name, input=signal, **numbers))
             elif test.first:
                 at_once = test.values[test.lags == 0]
-                found.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
+                findings.append(make_finding("moves_within_row", output=name, input=signal, value=float(at_once[0])))
         if output.follows_direction and output.direction is not None:
             numbers = {"value": output.direction.largest[1], "limit": output.direction.limit}
             term = friction_term(name, "fc", output.sign_slope)
-            found.append(make_finding("residuals_follow_direction", output=name, term=term, **numbers))
-        found += [feedback_finding(name, signal, output) for signal in output.feedback]
-    return found
+            findings.append(make_finding("residuals_follow_direction", output=name, term=term, **numbers))
+        findings += [feedback_finding(name, signal, output) for signal in output.feedback]
+    return findings
 
 
 def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding:
@@ -621,9 +621,9 @@ def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
     """Return a table of the residual tests with statistic, limit and verdict."""
     rows: list[list[Cell]] = []
     for name, output in tests.outputs.items():
-        judged = [(Markup("whiteness"), output.whiteness)]
-        judged += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
-        rows += [[symbol_html(name), what, t.statistic, t.limit, t.verdict] for what, t in judged]
+        test_rows = [(Markup("whiteness"), output.whiteness)]
+        test_rows += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
+        rows += [[symbol_html(name), what, t.statistic, t.limit, t.verdict] for what, t in test_rows]
     note = (
         "Whiteness: statistic over all lags. Independence: largest correlation at lags >= 0 after residual and input "
         "pass the filter that whitens the residual. A true model fails each test in 1 % of cases. Undecided: the test "
