@@ -210,7 +210,7 @@ def test_equation_is_read(text, output, order, terms):
         (
             "D D = a D + b u",
             3,
-            "at character 3, found 'D'; D is the derivative in an equation: give a signal of this name",
+            "at character 3, found 'D'; D is the derivative in an equation: rename a signal called D",
         ),
         ("D y = a y + b D", 16, "at character 16, found 'the end'; D is the derivative in an equation"),
         ("D^1.5 y = / u", 11, "expected the name of a signal at character 11, found '/'"),

@@ -178,8 +178,8 @@ class EquationParser:
             return self._error(f"{value!r} at character {at + 1} has no meaning there")
         if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
             return self._error(
-                f"expected {expectation} at character {at + 1}, found {value!r}; D is the derivative in an equation: give a "
-                "signal of this name another one, for column D by -y y=D, or by outputs={'y': 'D'} in Python"
+                f"expected {expectation} at character {at + 1}, found {value!r}; D is the derivative in an equation: "
+                "rename a signal called D, for column D by -y y=D, or by outputs={'y': 'D'} in Python"
             )
         return self._error(
             f"expected {expectation} at character {at + 1}, found {value!r}; "
