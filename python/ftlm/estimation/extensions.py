@@ -67,6 +67,8 @@ MIN_SATURATION_SHARE = 0.05
 MAX_DEAD_ZONE_SHARE = 0.9
 #: Initial guesses of a saturation or dead zone, as shares of the largest value of an input.
 LIMIT_GUESS_SHARES = (0.25, 0.6)
+#: Friction of a local start, as a share of the largest term of an input.
+LOCAL_FRICTION_SHARE = 0.02
 #: Least share of rows in which an input changes, so that its intersample behavior is in doubt.
 MIN_CHANGING_SHARE = 0.5
 #: Intersample behavior as text.
@@ -102,6 +104,9 @@ class Extension:
         Inputs that the additional terms act on.
     starts
         Initial guesses; None stands for the automatic ones.
+    local_start
+        Values at which the extension hardly changes the fit. The initial guesses are tried only if a fit from there
+        lowers the criterion, because a multistart takes much longer.
     term_text
         Additional terms as text, for the remedy.
     runs
@@ -117,6 +122,7 @@ class Extension:
     parameter_count: int
     inputs: Sequence[str]
     starts: Sequence[Mapping[str, float] | None] = (None,)
+    local_start: Mapping[str, float] | None = None
     term_text: str = ""
     runs: Runs | None = None
     load_time: float = 0.0
@@ -164,8 +170,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
         extensions = [*_drift(structure, joint, runs), *_other_intersample(structure, joint, runs)]
         if names:
             extensions += _extensions(structure, joint, runs, names)
-            extensions += [*_friction(structure, runs), *_load_step(structure, joint, runs)]
-        fits = [f for e in extensions if (f := _fit_extension(e, runs)) is not None]
+            extensions += [*_friction(structure, joint, runs), *_load_step(structure, joint, runs)]
+        fits = [f for e in extensions if (f := _fit_extension(e, runs, own)) is not None]
         best = _best_extension(fits, own)
         clear = best is not None and best.criterion <= own - MIN_CRITERION_DECREASE
         findings = _extension_findings(best, structure, joint, runs, names, about) if best and clear else []
@@ -292,16 +298,27 @@ def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list
     return list(itertools.islice((n for n in names if n not in reserved_names), count))
 
 
-def _fit_extension(extension: Extension, runs: Runs) -> FittedExtension | None:
-    """Return the best fit of an extension; None if a fit fails."""
-    fit_runs = extension.runs or runs
-    try:
-        fits = [fit_output_error(fit_runs, extension.structure, start=s, refine=False) for s in extension.starts]
-    except FtlmError:
-        return None
-    refit = min(fits, key=lambda f: max(f.noise.values()))
-    criterion = _prediction_criterion(refit, extension.structure, fit_runs, extension.parameter_count)
-    return FittedExtension(extension, refit, criterion)
+def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> FittedExtension | None:
+    """Return the best fit of an extension; None if no fit is found.
+
+    The criterion of the fit without the extension is ``own_criterion``.
+    """
+    there = extension.runs or runs
+
+    def fit(start: Mapping[str, float] | None) -> FittedExtension:
+        refit = fit_output_error(there, extension.structure, start=start, refine=False)
+        criterion = _prediction_criterion(refit, extension.structure, there, extension.parameter_count)
+        return FittedExtension(extension, refit, criterion)
+
+    fits: list[FittedExtension] = []
+    with contextlib.suppress(FtlmError):
+        if extension.local_start is not None:
+            fits.append(fit(extension.local_start))
+            if not fits[0].criterion < own_criterion:
+                return fits[0]
+    with contextlib.suppress(FtlmError):
+        fits += [fit(start) for start in extension.starts]
+    return min(fits, key=lambda f: max(f.fit.noise.values()), default=None)
 
 
 def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
@@ -361,12 +378,26 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     terms_text = " + ".join(f"{t.coefficient} D^{t.order} {t.signal}" for t in more)
     known_orders = not equation.order.weights and not any(t.order.weights for t in more)
     former = f"{lag_name} D^{equation.order} {equation.output}"
-    add("lag_fits", partial(with_lag, []), 1, names, term_text=former)
-    add("delay_fits", lambda: late, len(names), names, starts=[None, begin])
+    unchanged = joint.values_by_name | dict.fromkeys(coefficients, 0.0)
+    fast = None
+    if set(structure.coefficient_names) == {t.coefficient for t in equation.terms}:
+        # A lag of two samples multiplies all coefficients by its rate.
+        rate = 0.5 / step
+        rates = dict.fromkeys(structure.coefficient_names, rate)
+        fast = {lag_name: -rate} | {n: v * rates.get(n, 1.0) for n, v in unchanged.items()}
+    add("lag_fits", partial(with_lag, []), 1, names, local_start=fast, term_text=former)
+    add("delay_fits", lambda: late, len(names), names, local_start=begin)
     if known_orders and all(t.order.constant <= equation.order.constant for t in more):
-        add("zero_fits", partial(with_terms, more), len(more), names, term_text=terms_text)
+        add("zero_fits", partial(with_terms, more), len(more), names, local_start=unchanged, term_text=terms_text)
     if known_orders and all(t.order.constant <= equation.order.constant + 1.0 for t in more):
-        add("mode_fits", partial(with_lag, more), 1 + len(more), names, term_text=f"{former} + {terms_text}")
+        add(
+            "mode_fits",
+            partial(with_lag, more),
+            1 + len(more),
+            names,
+            local_start=fast,
+            term_text=f"{former} + {terms_text}",
+        )
     values, (coefficient,) = joint.values_by_name, _unused_names("k", 1, structure, runs[0])
     for name in names if not structure.limits and not structure.delay else ():
         largest = max(float(np.nanmax(np.abs(run[name]))) for run in runs)
@@ -385,7 +416,7 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     return extensions
 
 
-def _friction(structure: Structure, runs: Runs) -> list[Extension]:
+def _friction(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
     """Return the structure with Coulomb friction −fc sign(D y), and with −fc tanh(s y), of an output that is a speed.
 
     The second form needs an output of both signs. An output of one sign makes it a constant.
@@ -395,12 +426,17 @@ def _friction(structure: Structure, runs: Runs) -> list[Extension]:
     # A simulation with friction starts from a level and a velocity.
     initial = "caputo" if isinstance(structure.initial, History) else structure.initial
     extensions = []
+    values = joint.values_by_name
+    sizes = {n: max(float(np.nanmax(np.abs(run[n]))) for run in runs) for n in runs[0].inputs if n in item.signals}
+    drives = [abs(values.get(str(t.coefficient), 1.0)) * sizes[t.signal] for t in item.terms if t.signal in sizes]
+    local_start = {**values, name: LOCAL_FRICTION_SHARE * max(drives)}
 
     def add(text: str, **changes: Any) -> None:
         # Some structures with friction cannot be simulated, such as one of order 1 or one behind a sensor filter.
         with contextlib.suppress(FtlmError):
             wider = replace(structure, equations=(replace(item, **changes),), initial=initial)
-            extensions.append(Extension("friction_fits", wider, 1, [], term_text=text, positive_coefficient=name))
+            extension = Extension("friction_fits", wider, 1, [], local_start=local_start, term_text=text)
+            extensions.append(replace(extension, positive_coefficient=name))
 
     add(friction_term(item.output, name), coulomb=Friction(name))
     slope = sign_tanh_slope([run[item.output] for run in runs])
