@@ -104,7 +104,7 @@ def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:
     assert link.sensor_filter.signals == ("theta12", "theta22")
     # On lqr a link that feeds energy, taken away by its initial terms, has 84.2 and 73.7: no more than chance.
     # On psf the gauge has a level of its own; without it the fit has 91.0, and 70.6 on lqr.
-    for fitted, other, own, unseen in (("psf", "lqr", 92.5, 70.8), ("lqr", "psf", 83.6, 72.3)):
+    for fitted, other, own, unseen in (("psf", "lqr", 92.5, 70.8), ("lqr", "psf", 83.6, 73.0)):
         found = ftlm.identify(runs[fitted], link, method="output-error")
         assert found.fit["theta22"] == pytest.approx(own, abs=0.5)
         assert found.model.compare(runs[other]).fit["theta22"] == pytest.approx(unseen, abs=0.5)

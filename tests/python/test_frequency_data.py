@@ -412,7 +412,7 @@ def test_it_prints_draws_and_reports(tmp_path):
     assert "<svg" in found._repr_html_()
     for figure, axes in ((ftlm.plot.response(found), 2), (ftlm.plot.nyquist(found.model, arc(2)), 1)):
         assert len(figure.axes) == axes
-        points, curve = figure.axes[0].lines
+        points, curve, *_ = figure.axes[0].lines
         assert points.get_xdata().size == W.size
         assert curve.get_xdata().size > 2 * W.size
     with pytest.raises(ftlm.ModelError, match="a model alone has no measured points; give data"):

@@ -207,9 +207,9 @@ def test_what_cannot_matter_is_not_judged(runs):
 
     both = names([better, worse])
     assert len(both) == 2
-    assert names([better, worse], beyond=min(scores) + 0.01) == both[:1]
-    assert names([better, worse], beyond=-np.inf, margin=10.0) == both
-    assert names([worse, better], beyond=min(scores) + 0.01) == both[::-1]
+    assert names([better, worse], limit=min(scores) + 0.01) == both[:1]
+    assert names([better, worse], limit=-np.inf, margin=10.0) == both
+    assert names([worse, better], limit=min(scores) + 0.01) == both[::-1]
 
 
 def test_long_records_are_fitted_by_those_alone_that_may_lead():

@@ -75,7 +75,13 @@ from ftlm.validation.comparison import (
 )
 from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
-from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, residual_findings, run_residual_tests
+from ftlm.validation.residual_tests import (
+    DEFAULT_LAGS,
+    NEGLIGIBLE_RESIDUAL_RATIO,
+    Residuals,
+    residual_findings,
+    run_residual_tests,
+)
 
 #: Findings on residuals that known missing dynamics explain.
 SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
@@ -273,13 +279,12 @@ def _shows_level(fit: Fit) -> bool:
     joint = fit.joint
     if joint is None or joint.initial == "rest" or fit.task.structure.initial != "auto":
         return False
-    if has_colored_residuals(joint):
-        return True
+    share = NEGLIGIBLE_RESIDUAL_RATIO if has_colored_residuals(joint) else MAX_RESIDUAL_SHARE
     for output, noise in joint.noise.items():
         values = [drop_missing(run[output]) for run in fit.task.runs]
         if any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values):
             return True
-        if noise > MAX_RESIDUAL_SHARE * max(float(np.std(y)) for y in values):
+        if noise > share * max(float(np.std(y)) for y in values):
             return True
     return False
 

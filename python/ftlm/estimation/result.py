@@ -321,7 +321,7 @@ class Identification:
 
         Parameters
         ----------
-        **known
+        **values
             One parameter per stage by name, such as ``J_12=0.1704``.
 
         Returns

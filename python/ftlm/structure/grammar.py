@@ -179,7 +179,7 @@ class EquationParser:
         if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
             return self._error(
                 f"expected {expectation} at character {at + 1}, found {value!r}; D is the derivative in an equation: "
-                "rename a signal called D, for column D by -y y=D, or by outputs={'y': 'D'} in Python"
+                f"rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
             )
         return self._error(
             f"expected {expectation} at character {at + 1}, found {value!r}; "
