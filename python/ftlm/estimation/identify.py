@@ -176,7 +176,8 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     if fit.task.structure.offset != "none" or not structure.is_linear:
         return hypotheses.take(structure, fit)
     shows_level = _shows_level(fit)
-    level = _fit_with_level(fit, structure, hypotheses, has_level=True) if shows_level else None
+    may_hide = fit.joint is not None and fit.joint.initial != "rest" and has_colored_residuals(fit.joint)
+    level = _fit_with_level(fit, structure, hypotheses, has_level=shows_level) if shows_level or may_hide else None
     if level is not None:
         return level
     test = fit_offset_test(fit) if _is_testable(fit.task.runs) else None
@@ -279,12 +280,11 @@ def _shows_level(fit: Fit) -> bool:
     joint = fit.joint
     if joint is None or joint.initial == "rest" or fit.task.structure.initial != "auto":
         return False
-    share = NEGLIGIBLE_RESIDUAL_RATIO if has_colored_residuals(joint) else MAX_RESIDUAL_SHARE
     for output, noise in joint.noise.items():
         values = [drop_missing(run[output]) for run in fit.task.runs]
         if any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values):
             return True
-        if noise > share * max(float(np.std(y)) for y in values):
+        if noise > MAX_RESIDUAL_SHARE * max(float(np.std(y)) for y in values):
             return True
     return False
 
