@@ -120,7 +120,7 @@ struct Realization {
     outputs: usize,
     /// h A.
     system: Vec<f64>,
-    /// h B and D of each input.
+    /// (h B, D) of each input.
     drives: Vec<(Vec<f64>, Vec<f64>)>,
     /// C, a row for each output.
     read: Vec<f64>,

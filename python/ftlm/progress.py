@@ -50,7 +50,7 @@ def format_duration_estimate(least: float, most: float) -> str:
 
 
 def round_coarsely(value: float) -> float:
-    """Return one of 1, 2, 3, 5, 7 times a power of ten, at least 1."""
+    """Round to 1, 2, 3, 5 or 7 times a power of ten, at least 1."""
     power = 10.0 ** max(math.floor(math.log10(max(value, 1.0))), 0)
     return power * min((1, 2, 3, 5, 7, 10), key=lambda digit: abs(digit * power - value))
 

@@ -134,7 +134,7 @@ pub struct StreamingOptions {
     pub prior: Prior,
     /// Factor in (0, 1] of all earlier information at every row.
     pub forgetting: f64,
-    /// Initial terms of a stream that begins in motion, with powers of t above −1.
+    /// Initial conditions of the stream; the exponents of t must exceed −1.
     pub initial: Initial,
 }
 

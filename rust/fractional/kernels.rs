@@ -153,7 +153,7 @@ impl SecondDifferences {
         }
     }
 
-    /// `v_n` and its derivative from (n−1)^{η+1} and ln(n−1).
+    /// `v_n` and d`v_n`/dη, from (n−1)^{η+1} and ln(n−1).
     #[allow(clippy::cast_precision_loss)]
     fn near_value_and_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let value = self.near_value(n, power);

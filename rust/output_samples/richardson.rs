@@ -70,7 +70,7 @@ struct Grid {
     changes: Vec<Vec<f64>>,
 }
 
-/// Richardson table of the last grids, finest last.
+/// Richardson table of recent grids, finest last.
 #[derive(Default)]
 pub(super) struct RichardsonTable {
     grids: Vec<Grid>,

@@ -140,7 +140,7 @@ def test_intervals_too_wide_for_a_shaper_are_refused_in_words():
     # Of the coefficient of y: 10 % are 5 % of the frequency, a fifth of it leaves too much.
     good = control.input_shaper(uncertain(text, {2: 10.0}))
     assert 0 < good.worst < 0.2
-    with pytest.raises(ftlm.ModelError, match=r"too wide to design on.* may leave .* longer run.*kind='zvd'"):
+    with pytest.raises(ftlm.ModelError, match=r"too uncertain for a shaper.* may leave .* longer run.*kind='zvd'"):
         control.input_shaper(uncertain(text, {2: 60.0}))
     assert control.input_shaper(uncertain(text, {2: 40.0}), "zvd").worst < 0.1
 

@@ -222,7 +222,7 @@ REFUSED = [
     ((*WORDS, "MODEL", "--input", "U"), "input = 'U' is not one"),
     ((*WORDS, "no.json"), "cannot be read"),
     (("input-shaper", "MODEL", "--modes", 0), "--modes 0"),
-    (("input-shaper", "MODEL", "--modes", 9), "oscillatory modes, and 9 are to be shaped"),
+    (("input-shaper", "MODEL", "--modes", 9), "9 modes are to be shaped, but"),
     (("input-shaper", "MODEL", "--rate", 1), "fewer than four samples"),
     (("input-shaper", "MODEL", "--kind", "zw"), "is not one of"),
     (("input-shaper", "MODEL", "-o", "s.json"), "does not end in .csv"),

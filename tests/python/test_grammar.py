@@ -171,7 +171,7 @@ def test_what_is_printed_is_read(structure):
         ("D y = a y + b u(t - Td)", "the delay Td of u is free"),
         ("y = e^(-L s)/(s + 1) u", "an exponential at character 5 is a known delay"),
         ("D y = a y + u + 0.5 u(t - 0.1)", "u has two delays"),
-        ("y = 1/(s + 1) u + 2/(s + 1) u", "u stands there twice"),
+        ("y = 1/(s + 1) u + 2/(s + 1) u", "u occurs twice"),
         ("y = (a s + b)/((s + 1) (c s + 2)) u", "c stands in several terms once multiplied out"),
         ("y = 1/(s + a) u + 1/(s + b) v", "a*b is a product of two coefficients"),
         ("y = (s + 1) (a s + 1)/(s + 2) u", "a stands in several terms once multiplied out"),

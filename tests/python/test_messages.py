@@ -74,7 +74,7 @@ def test_options_of_the_flexible_link_are_refused_with_an_equation(command, word
 def test_what_is_identified_live_needs_live(tmp_path):
     done = run_command("record", "-o", tmp_path / "r.csv", "--innovation-length", "3", "--orders", "alpha1=1.9")
     assert done.exit_code == 2
-    assert "--orders, --innovation-length: of --live, which is not given" in done.stderr
+    assert "--orders, --innovation-length: only valid with --live" in done.stderr
     assert not (tmp_path / "r.csv").exists()
 
 

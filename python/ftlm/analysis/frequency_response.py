@@ -157,7 +157,7 @@ def transfer_functions(model: Model, *, coupling: str = "simulated") -> Transfer
         matrix = [lhs for lhs, _ in rows]
         bottom = determinant(matrix)
         if not bottom:
-            raise ModelError(f"the equations of {', '.join(names)} cannot be solved for them: their determinant is 0")
+            raise ModelError(f"the equations of {', '.join(names)} are dependent (determinant 0); change one of them")
         for j, output in enumerate(names):
             denominator[output] = _coefficient_pairs(bottom)
             for signal in inputs:

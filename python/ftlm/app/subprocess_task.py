@@ -90,7 +90,7 @@ class Task:
             try:
                 line = await process.stdout.readline()
             except ValueError:
-                raise TaskError("its answer is too long for a page; take fewer columns") from None
+                raise TaskError("the result is too long for a page; use fewer columns") from None
             if not line:
                 raise TaskError("stopped" if self._ended else _describe_exit(await process.wait()))
             try:

@@ -199,8 +199,8 @@ def input_shaper(
     swings = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
     if len(swings) < count:
         raise ModelError(
-            f"the model has {len(swings)} oscillatory modes, and {short_repr(count)} are to be shaped; relaxing modes "
-            "need no shaper"
+            f"{short_repr(count)} modes are to be shaped, but {len(swings)} modes of the model oscillate; shape only "
+            "these, the others need no shaper"
         )
     modes_used = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)
@@ -215,7 +215,7 @@ def input_shaper(
     if worst is not None and not worst <= MAX_RESIDUAL_VIBRATION:
         widest = max(modes_used, key=lambda m: (m.frequency_error or 0.0) / m.frequency + (m.damping_error or 0.0))
         raise ModelError(
-            f"the intervals are too wide to design on: within those of the mode at "
+            f"the poles are too uncertain for a shaper: within the intervals of the mode at "
             f"{with_error(widest.frequency, widest.frequency_error)} rad/s, damping "
             f"{with_error(widest.damping, widest.damping_error)}, a {kind} shaper may leave {100 * worst:.0f} % of the "
             f"vibration, more than {100 * MAX_RESIDUAL_VIBRATION:.0f} %; identify from a longer run, or from one "

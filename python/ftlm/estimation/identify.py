@@ -77,7 +77,6 @@ from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import (
     DEFAULT_LAGS,
-    NEGLIGIBLE_RESIDUAL_RATIO,
     Residuals,
     residual_findings,
     run_residual_tests,

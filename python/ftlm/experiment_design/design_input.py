@@ -390,7 +390,7 @@ def _check_arguments(
     )
     if not 2 <= every <= 2 * rows:
         raise ModelError(
-            f"{setting('period')} {period:g} s is not between two steps and twice the run; give another one"
+            f"{setting('period')} {period:g} s is out of range; give two samples to twice the duration of the run"
         )
     findings = () if solved.estimate is None or solved.estimate.findings is UNSET else solved.estimate.findings
     missing = [f for f in findings if f.code in LEFT_OUT_CODES]

@@ -272,7 +272,7 @@ def stability(reproduction: Reproduction) -> Outcome:
 
 
 def returned_coefficients(reproduction: Reproduction) -> Outcome:
-    """Return whether multi-innovation finds the coefficients of the printed models again."""
+    """Return whether a fit to the response of each published model recovers its coefficient `a`."""
     if not reproduction.ran:
         return None
     back = [

@@ -152,7 +152,7 @@ def printed_head(words: str) -> Markup:
 
 
 def printed_cells(words: str, row: printed.PublishedRow, *, criteria: bool = True) -> list[Cell]:
-    """Cells of a printed row."""
+    """Cells of a row of the paper."""
     cells = [printed_head(words), *number_cells(row.orders, row.coefficients)]
     return [*cells, *row.criteria] if criteria else cells
 

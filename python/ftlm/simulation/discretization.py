@@ -279,7 +279,7 @@ def _check_excess_order(signal: str, order: float, output: str, alpha: float) ->
 def records(
     runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True
 ) -> list[Record]:
-    """Return records of several runs (see :func:`record`), cached for runs that were checked together.
+    """Return records of several runs (see :func:`record`), cached if `runs` is a :class:`Runs`.
 
     Records with a finer grid than the runs are large and used once, so they are not cached.
     """

@@ -590,7 +590,7 @@ class EquationParser:
         return signal
 
     def _time_argument(self, signal: str) -> None:
-        """Parse ``(t)`` or ``(t - 0.06 s)`` behind a signal; the delay is kept."""
+        """Parse ``(t)`` or ``(t - 0.06 s)`` after a signal, and store its delay."""
         if not (self._sees("(", "t") and self._peek(2)[1] in ")-+"):
             self._check_delay(signal, 0.0)
             return
@@ -763,7 +763,7 @@ class EquationParser:
             signal = common or self._transform()
             self.delays[signal] = delay
             if any(signal == other for _, _, other in paths):
-                raise self._error(f"{signal} stands there twice; write one transfer function for each input")
+                raise self._error(f"{signal} occurs twice; combine its terms into one transfer function")
             paths.append(([(sign * c, n, o) for c, n, o in top], bottom, signal))
             if self._peek()[0] != "symbol" or self._peek()[1] not in "+-":
                 break

@@ -299,7 +299,7 @@ class LineChart(Figure):
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
 
     def small(self, height: int = 220) -> LineChart:
-        """Return the chart in a size of which two stand side by side; the height is in pixels."""
+        """Return a copy as wide as charts that stand side by side; `height` is in pixels."""
         return replace(self, width=SMALL_WIDTH_PX, height=height)
 
     def draw(self, *, narrow: bool) -> Markup:

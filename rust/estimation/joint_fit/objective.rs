@@ -254,7 +254,7 @@ impl<'a> Objective<'a> {
             .flat_map(move |e| (0..outputs).map(move |i| (e, i, e.sample_weights.get(i).map(Vec::as_slice))))
     }
 
-    /// Residuals in units of the noise by run and output, without robust weights; NaN for missing samples.
+    /// Residuals divided by their noise level, by run and output, without robust weights; NaN where a sample is missing.
     #[must_use]
     pub fn residuals(&self, attempt: &OptimizationResult) -> Vec<Vec<Vec<f64>>> {
         let outputs = self.problem.outputs.len();

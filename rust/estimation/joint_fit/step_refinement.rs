@@ -51,7 +51,7 @@ pub struct OptimumStatistics {
     pub covariance: Vec<f64>,
     /// Standard deviation of the residuals by output; with a robust loss from the median absolute residual.
     pub noise: Vec<f64>,
-    /// Residuals in units of the noise by run and output; NaN for missing samples.
+    /// Residuals divided by their noise level, by run and output; NaN where a sample is missing.
     pub residuals: Vec<Vec<Vec<f64>>>,
     /// Counts of downweighted residuals of a robust loss; None for squares.
     pub robust: Option<RobustSummary>,

@@ -30,7 +30,7 @@ pub(crate) struct KinkCorrection {
 }
 
 impl KinkCorrection {
-    /// Kinks of all zero-order-hold input terms; None for uniform samples.
+    /// Kinks of the outputs due to the steps of zero-order-hold inputs; None for uniform samples.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
         let NonuniformSamples { readings, jumps } = experiment.nonuniform.as_ref()?;
         let step = experiment.record.step();

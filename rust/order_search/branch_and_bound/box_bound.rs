@@ -577,9 +577,9 @@ const LANE_OFFSETS: [f64; ROW_LANES] = [0.0, 1.0, 2.0, 3.0];
 /// Coefficients on û and v̂ of all candidates of some rows of a slice.
 #[derive(Default)]
 pub(super) struct RowCoefficients {
-    /// First row, and number of values in a row.
+    /// First row.
     pub(super) start: usize,
-    /// See `start`.
+    /// Number of values in a row.
     pub(super) len: usize,
     /// (p + q)/2, (p − q)/2 and 1 − B². All are 0 if 1 − B² is negligible or NaN.
     pub(super) plus: Vec<f64>,

@@ -198,7 +198,7 @@ pub(super) fn plain_gram(bank: &Bank, target: &[f64], stop: &Stop) -> Vec<f64> {
     dense::gram(bank.columns(), target, stop)
 }
 
-/// Apply multi-innovation weights to a Gram matrix: p on all rows but the last p − 1.
+/// Apply multi-innovation weights to a Gram matrix: min(p, m − j) for row j of m.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn apply_innovation_weights(
     gram: &mut [f64],

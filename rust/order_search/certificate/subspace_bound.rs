@@ -25,8 +25,9 @@ pub(super) struct DerivativeSubspace {
     terms: usize,
     matrix: [[f64; MAX_BASIS_ROWS]; MAX_BASIS_ROWS],
     target: [f64; MAX_BASIS_ROWS],
-    /// Largest norm omitted from a unit column, and smallest norm of a unit column within the cell.
+    /// Bound of the omitted Taylor terms of a unit column.
     max_omitted_norm: f64,
+    /// Least norm of a unit column within the cell.
     min_column_norm: f64,
     /// Rounding-error bound of a product of two unit columns.
     rounding: f64,

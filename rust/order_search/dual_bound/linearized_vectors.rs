@@ -24,11 +24,11 @@ const MAX_ERROR_LIMIT_RATIO: f64 = 4.0;
 /// Magnitude below which products stay finite.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
-/// Whether a linearized test vector proves that an equation's output error exceeds `limit`. The vector is built for
-/// `made_for` and corrected for an equation with the same orders of the output. The error is Σ|y − ŷ| or Σ(y − ŷ)².
+/// Whether a test vector that was built for `made_for` proves that the output error of `equation`, Σ|y − ŷ| or
+/// Σ(y − ŷ)², exceeds `limit`. The vector is corrected to first order; the orders of the output must be the same.
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients that are not one a term, other orders of the output.
+/// Invalid orders or signals, not one coefficient for each term, other orders of the output or more than 4.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;

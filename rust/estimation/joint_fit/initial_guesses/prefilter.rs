@@ -10,7 +10,7 @@ use crate::regressors::Record;
 use crate::series;
 use crate::signal::statistics::{mean, sum};
 
-/// Maximum number of cached prefilter series.
+/// Maximum number of cached low-pass filters.
 const MAX_CACHED_LOW_PASSES: usize = 32;
 
 /// Key of a cached low-pass: bits of the cutoff frequency, number of pulses, bits of the pulse width.

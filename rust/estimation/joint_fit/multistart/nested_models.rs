@@ -61,11 +61,11 @@ impl ReducedProblem {
     }
 }
 
-/// Submodels with one term less; empty with a law, under which no single coefficient can be 0.
+/// Submodels with one term less; empty if a law ties orders or coefficients to one another.
 ///
-/// A term of a measured signal is removed if it is not the only input. The signals of one machine are correlated, so
-/// there can be optima in which one signal replaces the others. For the same reason a coefficient with a known physical
-/// value is first fixed at that value.
+/// A free input term of fixed order is removed if it is not the only one and the equations are not coupled. The signals
+/// of one machine are correlated, so there can be optima in which one signal replaces the others. For the same reason a
+/// coefficient with a known physical value is first fixed at that value.
 #[must_use]
 pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
     let structure = &free.structure;

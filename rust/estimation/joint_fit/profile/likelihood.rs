@@ -262,9 +262,10 @@ impl<'a> ProfileLikelihood<'a> {
         }
     }
 
-    /// Initial guesses of the other parameters at a value of one, most promising first.
+    /// Initial guesses with parameter `i` fixed at `value`, most promising first.
     ///
-    /// Along the tangent; if that moves them far, also along power laws, for all parameters or for the orders only.
+    /// The other parameters follow the tangent or stay; if the tangent moves them far, also power laws, for all parameters
+    /// or for the orders only.
     /// Unbounded valleys often have the form d mu = const, d + a = const.
     fn refit_starts(&self, i: usize, value: f64, near: &OptimizationResult) -> Result<Vec<Vec<f64>>> {
         let (values, tangent) = (near.values(), tangent(near, i)?);
