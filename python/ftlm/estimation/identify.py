@@ -77,6 +77,7 @@ from ftlm.validation.data_advice import data_notes
 from ftlm.validation.information_criteria import InformationCriteria, information_criteria
 from ftlm.validation.residual_tests import (
     DEFAULT_LAGS,
+    NEGLIGIBLE_RESIDUAL_RATIO,
     Residuals,
     residual_findings,
     run_residual_tests,
@@ -175,8 +176,9 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     if fit.task.structure.offset != "none" or not structure.is_linear:
         return hypotheses.take(structure, fit)
     shows_level = _shows_level(fit)
-    may_hide = fit.joint is not None and fit.joint.initial != "rest" and has_colored_residuals(fit.joint)
-    level = _fit_with_level(fit, structure, hypotheses, has_level=shows_level) if shows_level or may_hide else None
+    level = None
+    if shows_level or _may_hide_level(fit):
+        level = _fit_with_level(fit, structure, hypotheses, has_level=shows_level)
     if level is not None:
         return level
     test = fit_offset_test(fit) if _is_testable(fit.task.runs) else None
@@ -273,11 +275,10 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
 def _shows_level(fit: Fit) -> bool:
     """Whether a fit with nonzero initial conditions, which rest at a level may have caused, is to be tried with one.
 
-    The mean of an output is large against its deviation, or the residuals are, or these have the color of a start that
-    leaves something out: such an optimum is near no other one, and the color of its residuals hides an offset.
+    The mean of an output is large against its deviation, or the residuals are: such an optimum is near no other one.
     """
     joint = fit.joint
-    if joint is None or joint.initial == "rest" or fit.task.structure.initial != "auto":
+    if not _is_found_in_motion(fit) or joint is None:
         return False
     for output, noise in joint.noise.items():
         values = [drop_missing(run[output]) for run in fit.task.runs]
@@ -286,6 +287,21 @@ def _shows_level(fit: Fit) -> bool:
         if noise > MAX_RESIDUAL_SHARE * max(float(np.std(y)) for y in values):
             return True
     return False
+
+
+def _may_hide_level(fit: Fit) -> bool:
+    """Whether colored residuals of a fit in motion may hide a level from the test of an offset."""
+    joint = fit.joint
+    if not _is_found_in_motion(fit) or joint is None:
+        return False
+    sizes = {o: max(float(np.nanstd(run[o])) for run in fit.task.runs) for o in joint.noise}
+    is_negligible = all(noise <= NEGLIGIBLE_RESIDUAL_RATIO * sizes[o] for o, noise in joint.noise.items())
+    return not is_negligible and has_colored_residuals(joint)
+
+
+def _is_found_in_motion(fit: Fit) -> bool:
+    """Whether nonzero initial conditions of a fit were not given but found."""
+    return fit.joint is not None and fit.joint.initial != "rest" and fit.task.structure.initial == "auto"
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:
