@@ -162,7 +162,7 @@ REFUSED = [
     (lambda: control.input_shaper(-3.0), "does not swing"),
     (lambda: control.input_shaper(complex("nan")), "does not swing"),
     (lambda: control.input_shaper(ftlm.Model(ftlm.equation("D^2 y = -9 y + 0.1 D y + u"))), "not stable"),
-    (lambda: control.input_shaper(ftlm.Model(ftlm.equation("D y = -9 y + u"))), "0 oscillatory modes"),
+    (lambda: control.input_shaper(ftlm.Model(ftlm.equation("D y = -9 y + u"))), "0 modes of the model oscillate"),
     (lambda: control.input_shaper(POLE).impulses(0), "rate = 0"),
     (lambda: control.input_shaper(POLE).impulses(10.0), "fewer than four samples in a period"),
     (lambda: control.input_shaper(POLE).impulses("fast"), "rate = 'fast' is not a number"),

@@ -439,7 +439,7 @@ BAD = {
     "no name": ({"parameters": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is not a free parameter"),
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),
     "seed": ({"seed": -1}, None, "seed = -1"),
-    "period": ({"period": 0.01}, None, "period = 0.01 s is not between"),
+    "period": ({"period": 0.01}, None, "period = 0.01 s is out of range"),
     "reference_run": ({"reference_run": 7}, None, "reference_run is int, not a Run"),
 }
 

@@ -199,8 +199,8 @@ def input_shaper(
     swings = sorted((m for m in every if m.oscillatory), key=lambda m: m.damping)
     if len(swings) < count:
         raise ModelError(
-            f"{short_repr(count)} modes are to be shaped, but {len(swings)} modes of the model oscillate; shape only "
-            "these, the others need no shaper"
+            f"{short_repr(count)} modes are to be shaped, but {len(swings)} modes of the model oscillate; other modes "
+            "need no shaper"
         )
     modes_used = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)
