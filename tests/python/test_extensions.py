@@ -7,6 +7,7 @@ import pytest
 from scipy import signal
 
 import ftlm
+from ftlm.estimation import extensions
 
 RATE = 0.4
 #: Numerator and denominator of the plant, rows of delay of the input (negative: it was logged late), the finding.
@@ -224,3 +225,23 @@ def test_what_the_remedy_of_a_lag_says_to_write_finds_the_plant():
     better = ftlm.identify(run, ftlm.equation("D^2 y = lag D^1 y + a y + b u"))
     assert abs(better.coefficients["a"] / -(RATE**2) - 1) < 0.02
     assert not {f.code for f in better.findings} & CODES
+
+
+def test_colored_noise_alone_starts_no_multistart(monkeypatch):
+    """A local fit tells that a lag, a delay or friction explains nothing; a load step has cheap starts of its own."""
+    automatic = []
+    fit = extensions.fit_output_error
+
+    def counted(runs, structure, **options):
+        if options.get("start") is None and options.get("near") is None and "load" not in structure.coefficient_names:
+            automatic.append(structure)
+        return fit(runs, structure, **options)
+
+    monkeypatch.setattr(extensions, "fit_output_error", counted)
+    plant = [1.0], [1 / RATE, 1.0], 0
+    for seed in range(4):
+        assert codes_of(record(*plant, seed, [1.0, -0.9])) & CODES == set()
+    assert automatic == []
+    # A missing lag is found from an automatic start.
+    codes_of(record([1.0], [0.3 / RATE**2, 1.3 / RATE, 1.0], 0, 0, [1.0]))
+    assert automatic

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import html
+import itertools
 import json
 import math
 import re
@@ -531,6 +532,17 @@ def test_ticks_are_round():
     assert axes.ticks(0, 0.3, 3).values == [0, 0.1, 0.2, 0.3]
     small = axes.ticks(-1e-7, 1e-7, 5)
     assert (small.labels[0], small.factor) == ("−100", "×10⁻⁹")
+
+
+def test_a_long_staircase_keeps_its_corners():
+    levels = np.repeat(np.random.default_rng(4).integers(0, 2, 60), 20).astype(float)
+    levels[100:103] = np.nan
+    rows = axes.decimate(levels, 200)
+    # Between two rows that are drawn one after the other, the value does not change in a row that is left out.
+    for first, last in itertools.pairwise(rows):
+        between = levels[first : last + 1]
+        assert last == first + 1 or np.isnan(between).any() or np.ptp(between) == 0.0, (first, last)
+    assert {99, 103} <= set(rows.tolist())
 
 
 def test_decimation_keeps_extremes_and_ends():

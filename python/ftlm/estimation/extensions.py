@@ -303,11 +303,11 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
 
     The criterion of the fit without the extension is ``own_criterion``.
     """
-    there = extension.runs or runs
+    extension_runs = extension.runs or runs
 
     def fit(start: Mapping[str, float] | None) -> FittedExtension:
-        refit = fit_output_error(there, extension.structure, start=start, refine=False)
-        criterion = _prediction_criterion(refit, extension.structure, there, extension.parameter_count)
+        refit = fit_output_error(extension_runs, extension.structure, start=start, refine=False)
+        criterion = _prediction_criterion(refit, extension.structure, extension_runs, extension.parameter_count)
         return FittedExtension(extension, refit, criterion)
 
     fits: list[FittedExtension] = []
@@ -428,7 +428,11 @@ def _friction(structure: Structure, joint: JointFit, runs: Runs) -> list[Extensi
     extensions = []
     values = joint.values_by_name
     sizes = {n: max(float(np.nanmax(np.abs(run[n]))) for run in runs) for n in runs[0].inputs if n in item.signals}
-    drives = [abs(values.get(str(t.coefficient), 1.0)) * sizes[t.signal] for t in item.terms if t.signal in sizes]
+    drives = [
+        abs(t.factor * (values[t.coefficient] if isinstance(t.coefficient, str) else t.coefficient)) * sizes[t.signal]
+        for t in item.terms
+        if t.signal in sizes
+    ]
     local_start = {**values, name: LOCAL_FRICTION_SHARE * max(drives)}
 
     def add(text: str, **changes: Any) -> None:

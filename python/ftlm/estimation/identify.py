@@ -176,21 +176,16 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     if fit.task.structure.offset != "none" or not structure.is_linear:
         return hypotheses.take(structure, fit)
     shows_level = _shows_level(fit)
-    level = None
-    if shows_level or _may_hide_level(fit):
-        level = _fit_with_level(fit, structure, hypotheses, has_level=shows_level)
+    is_level_tried = shows_level or _may_hide_level(fit)
+    level = _fit_with_level(fit, structure, hypotheses, has_level=shows_level) if is_level_tried else None
     if level is not None:
         return level
     test = fit_offset_test(fit) if _is_testable(fit.task.runs) else None
     offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
-    started = structure.initial == "auto" and fit.joint is not None and fit.joint.initial != "rest"
-    level = (
-        _fit_with_level(fit, structure, hypotheses, has_level=False)
-        if offset_findings and started and not shows_level
-        else None
-    )
-    if level is not None:
-        return level
+    if offset_findings and _is_found_in_motion(fit) and not is_level_tried:
+        level = _fit_with_level(fit, structure, hypotheses, has_level=False)
+        if level is not None:
+            return level
     fit = hypotheses.take(structure, fit)
     return replace(fit, findings=[*fit.findings, *offset_findings])
 
@@ -209,7 +204,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
     if not slow and has_white_residuals(joint):
         return None
     evidence = [rest_evidence(run, structure) for run in runs]
-    if any(evidence_item is not None and evidence_item.rows == 0 for evidence_item in evidence):
+    if any(item is not None and item.rows == 0 for item in evidence):
         # A constant input never tells.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
@@ -278,7 +273,7 @@ def _shows_level(fit: Fit) -> bool:
     The mean of an output is large against its deviation, or the residuals are: such an optimum is near no other one.
     """
     joint = fit.joint
-    if not _is_found_in_motion(fit) or joint is None:
+    if joint is None or not _is_found_in_motion(fit):
         return False
     for output, noise in joint.noise.items():
         values = [drop_missing(run[output]) for run in fit.task.runs]
@@ -292,7 +287,7 @@ def _shows_level(fit: Fit) -> bool:
 def _may_hide_level(fit: Fit) -> bool:
     """Whether colored residuals of a fit in motion may hide a level from the test of an offset."""
     joint = fit.joint
-    if not _is_found_in_motion(fit) or joint is None:
+    if joint is None or not _is_found_in_motion(fit):
         return False
     sizes = {o: max(float(np.nanstd(run[o])) for run in fit.task.runs) for o in joint.noise}
     is_negligible = all(noise <= NEGLIGIBLE_RESIDUAL_RATIO * sizes[o] for o, noise in joint.noise.items())
@@ -300,7 +295,7 @@ def _may_hide_level(fit: Fit) -> bool:
 
 
 def _is_found_in_motion(fit: Fit) -> bool:
-    """Whether nonzero initial conditions of a fit were not given but found."""
+    """Whether `identify` decided that a run began in motion; the user left the initial conditions open."""
     return fit.joint is not None and fit.joint.initial != "rest" and fit.task.structure.initial == "auto"
 
 

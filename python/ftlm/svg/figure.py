@@ -258,7 +258,7 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
 
 
 def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
-    """Return indices of points that represent a line: first, last, minimum and maximum of every block.
+    """Return indices of points that represent a line: the ends of constant stretches, or the extremes of blocks.
 
     Parameters
     ----------
@@ -276,6 +276,11 @@ def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
     finite = np.flatnonzero(np.isfinite(values))
     if finite.size <= most:
         return finite
+    # Rows within a constant stretch lie on the line between its ends, so that steps stay steps.
+    changes = values[1:] != values[:-1]
+    ends = np.flatnonzero(np.isfinite(values) & (np.append(True, changes) | np.append(changes, True)))
+    if ends.size <= most:
+        return ends
     edges = np.linspace(0, finite.size, max(1, (most - 2) // 2) + 1).astype(np.intp)
     # One pass each for all stretches: sort by (stretch, value), then take the ends of every stretch.
     stretch = np.repeat(np.arange(edges.size - 1), np.diff(edges))
