@@ -16,7 +16,7 @@ use super::law::{FrictionLaw, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
-/// Friction laws of coupled bodies, and the decrease of the end velocity of each for a unit of friction on each.
+/// Friction laws of coupled bodies, and gains G_ab: the decrease of end velocity a for a unit of friction on body b.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ContactProblem {
     laws: Vec<FrictionLaw>,

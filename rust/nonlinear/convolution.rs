@@ -100,7 +100,7 @@ impl<'a> OnlineConvolution<'a> {
         Self { kernel, sums, signal, buffers: Buffers::default(), block: Vec::new() }
     }
 
-    /// Sum Σ_{j<k} κ_{k−j} x_j for the next value k.
+    /// Sum Σ_{j<k} κ_{k−j} x_j over the k values so far.
     #[must_use]
     pub fn history_sum(&self) -> f64 {
         if let Memory::Polynomial(coefficients) = &self.kernel.memory {

@@ -544,7 +544,7 @@ impl<'a> Pulse<'a> {
         true
     }
 
-    /// Solve the pulse of a system without non-linear terms, with the present frictions.
+    /// Solve a pulse without non-linear terms for its state channels, at the present friction forces.
     fn solve_linear(&mut self) -> std::result::Result<(), PulseFailure> {
         if !self.linearize() {
             return Err(PulseFailure::Newton("its linearization is singular"));

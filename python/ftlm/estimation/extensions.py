@@ -101,12 +101,12 @@ class Extension:
     parameter_count
         Number of additional parameters.
     inputs
-        Inputs that the additional terms act on.
+        Inputs that the extension concerns.
     starts
         Initial guesses; None stands for the automatic ones.
     local_start
-        Values at which the extension hardly changes the fit. The initial guesses are tried only if a fit from there
-        lowers the criterion, because a multistart takes much longer.
+        Values at which the extension hardly changes the fit. If a fit from there does not lower the criterion, the
+        initial guesses are skipped: a multistart takes much longer.
     term_text
         Additional terms as text, for the remedy.
     runs
@@ -167,10 +167,13 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     try:
         joint, runs = _first_samples(joint, structure, runs)
         own = _prediction_criterion(joint, structure, runs, 0)
-        extensions = [*_drift(structure, joint, runs), *_other_intersample(structure, joint, runs)]
+        extensions = [*_drift_extensions(structure, joint, runs), *_intersample_extensions(structure, joint, runs)]
         if names:
-            extensions += _extensions(structure, joint, runs, names)
-            extensions += [*_friction(structure, joint, runs), *_load_step(structure, joint, runs)]
+            extensions += _input_extensions(structure, joint, runs, names)
+            extensions += [
+                *_friction_extensions(structure, joint, runs),
+                *_load_step_extensions(structure, joint, runs),
+            ]
         fits = [f for e in extensions if (f := _fit_extension(e, runs, own)) is not None]
         best = _best_extension(fits, own)
         clear = best is not None and best.criterion <= own - MIN_CRITERION_DECREASE
@@ -231,7 +234,7 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
     return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
 
 
-def _drift(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+def _drift_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
     """Return the linear structure with levels of the outputs that change linearly; none if its offsets were given."""
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
@@ -239,7 +242,7 @@ def _drift(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]
     return [Extension("drift_fits", replace(structure, offset="ramp"), count, [], starts=[joint.values_by_name])]
 
 
-def _other_intersample(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
     """Return the structure with the other intersample behavior of each input that changes in most rows.
 
     Samples alone do not distinguish a staircase from a smooth signal. The wrong assumption acts like a delay of half a
@@ -299,9 +302,9 @@ def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list
 
 
 def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> FittedExtension | None:
-    """Return the best fit of an extension; None if no fit is found.
+    """Return the fit of an extension with the least residuals; None if no fit is found.
 
-    The criterion of the fit without the extension is ``own_criterion``.
+    A local fit that does not lower ``own_criterion``, that of the fit without the extension, is final.
     """
     extension_runs = extension.runs or runs
 
@@ -316,8 +319,9 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
             fits.append(fit(extension.local_start))
             if not fits[0].criterion < own_criterion:
                 return fits[0]
-    with contextlib.suppress(FtlmError):
-        fits += [fit(start) for start in extension.starts]
+    for start in extension.starts:
+        with contextlib.suppress(FtlmError):
+            fits.append(fit(start))
     return min(fits, key=lambda f: max(f.fit.noise.values()), default=None)
 
 
@@ -351,7 +355,7 @@ def _delay_findings(
     return findings
 
 
-def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
+def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
     """Return the extensions of a structure of one equation, those that are preferred first."""
     (equation,) = structure.equations
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
@@ -416,10 +420,10 @@ def _extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequen
     return extensions
 
 
-def _friction(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the structure with Coulomb friction −fc sign(D y), and with −fc tanh(s y), of an output that is a speed.
+def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+    """Return the structure with Coulomb friction: −fc sign(D y) for a position y, and −fc tanh(s y) for a speed y.
 
-    The second form needs an output of both signs. An output of one sign makes it a constant.
+    The second form is left out if y has one sign only, which would make it nearly constant.
     """
     (item,) = structure.equations
     (name,) = _unused_names("fc", 1, structure, runs[0])
@@ -451,7 +455,7 @@ def _friction(structure: Structure, joint: JointFit, runs: Runs) -> list[Extensi
     return extensions
 
 
-def _load_step(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+def _load_step_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
     """Return the structure with a constant load from some row on; none for several runs or irregular rows.
 
     The load is fitted with its step at each of seven rows. From the best of these fits, and from the fit without a

@@ -175,14 +175,14 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     # In a nonlinear model a constant has no constant sensitivity: it determines where a body rests.
     if fit.task.structure.offset != "none" or not structure.is_linear:
         return hypotheses.take(structure, fit)
-    shows_level = _shows_level(fit)
-    is_level_tried = shows_level or _may_hide_level(fit)
-    level = _fit_with_level(fit, structure, hypotheses, has_level=shows_level) if is_level_tried else None
+    suggests_level = _suggests_level(fit)
+    is_level_tried = suggests_level or _may_hide_level(fit)
+    level = _fit_with_level(fit, structure, hypotheses, has_level=suggests_level) if is_level_tried else None
     if level is not None:
         return level
     test = fit_offset_test(fit) if _is_testable(fit.task.runs) else None
     offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
-    if offset_findings and _is_found_in_motion(fit) and not is_level_tried:
+    if offset_findings and _has_estimated_initial_conditions(fit) and not is_level_tried:
         level = _fit_with_level(fit, structure, hypotheses, has_level=False)
         if level is not None:
             return level
@@ -267,13 +267,13 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
     return replace(whole, model=model, findings=[*whole.findings, make_finding("level_estimated", **about)])
 
 
-def _shows_level(fit: Fit) -> bool:
-    """Whether a fit with nonzero initial conditions, which rest at a level may have caused, is to be tried with one.
+def _suggests_level(fit: Fit) -> bool:
+    """Whether nonzero initial conditions may stand in for a level of the output, so that one is fitted from new starts.
 
-    The mean of an output is large against its deviation, or the residuals are: such an optimum is near no other one.
+    The mean or the residuals of an output are large against its deviation: the optimum with a level may be far away.
     """
     joint = fit.joint
-    if joint is None or not _is_found_in_motion(fit):
+    if joint is None or not _has_estimated_initial_conditions(fit):
         return False
     for output, noise in joint.noise.items():
         values = [drop_missing(run[output]) for run in fit.task.runs]
@@ -285,17 +285,17 @@ def _shows_level(fit: Fit) -> bool:
 
 
 def _may_hide_level(fit: Fit) -> bool:
-    """Whether colored residuals of a fit in motion may hide a level from the test of an offset."""
+    """Whether colored residuals of a fit that is not from rest may make the offset test miss a level."""
     joint = fit.joint
-    if joint is None or not _is_found_in_motion(fit):
+    if joint is None or not _has_estimated_initial_conditions(fit):
         return False
     sizes = {o: max(float(np.nanstd(run[o])) for run in fit.task.runs) for o in joint.noise}
     is_negligible = all(noise <= NEGLIGIBLE_RESIDUAL_RATIO * sizes[o] for o, noise in joint.noise.items())
     return not is_negligible and has_colored_residuals(joint)
 
 
-def _is_found_in_motion(fit: Fit) -> bool:
-    """Whether `identify` decided that a run began in motion; the user left the initial conditions open."""
+def _has_estimated_initial_conditions(fit: Fit) -> bool:
+    """Whether `identify`, free to choose the initial conditions, chose nonzero ones."""
     return fit.joint is not None and fit.joint.initial != "rest" and fit.task.structure.initial == "auto"
 
 

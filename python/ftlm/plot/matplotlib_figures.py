@@ -105,7 +105,7 @@ def escape_math(text: str) -> str:
 
 
 def draw_chart(axis: Any, chart: Figure) -> None:
-    """Draw a chart of a page into axes."""
+    """Draw a chart in matplotlib axes."""
     axis.set_title(escape_math(chart.title), fontsize="small")
     if isinstance(chart, LineChart):
         _draw_lines(axis, chart)

@@ -231,14 +231,14 @@ class PlaneChart(Figure):
     sector
         Half-angle [rad] of the shaded unstable sector around the positive axis.
     curve
-        Curve of a model. The points are then measured values, drawn as dots and not around 0, and there is no sector.
+        Curve of a model. The points are then measured values, drawn as dots; the axes fit them, without a sector.
     caption
         Sentence below.
 
     Raises
     ------
     DataError
-        A point that is not finite, or a sector outside (0, pi); with a curve, no point.
+        A point that is not finite, a sector outside (0, pi), or a curve without points.
     """
 
     points: Sequence[complex] | Complex

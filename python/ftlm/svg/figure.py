@@ -26,7 +26,7 @@ LETTER_WIDTH_PX, LINE_HEIGHT_PX = 6.7, 15
 
 
 class Figure(ABC):
-    """Description of a chart, which a page draws as SVG and :mod:`ftlm.plot` with matplotlib.
+    """Chart that draws itself as SVG; :mod:`ftlm.plot` draws most kinds with matplotlib.
 
     Attributes
     ----------

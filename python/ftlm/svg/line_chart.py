@@ -157,7 +157,7 @@ class LineChart(Figure):
     caption
         Sentence below; omitted values are added to it.
     bands
-        (low, high) of a shaded band behind each of the first lines; each of shape (N,).
+        Shaded bands (low, high) behind the first lines, in order; edges of shape (N,).
     log_x, log_y
         Logarithmic axes.
     stems
@@ -180,7 +180,7 @@ class LineChart(Figure):
     Raises
     ------
     DataError
-        No line, or a line whose length differs from that of x.
+        No line, or a line or band not of the length of x.
     """
 
     x: ArrayLike
