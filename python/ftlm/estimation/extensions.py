@@ -104,6 +104,8 @@ class Extension:
         Inputs that the extension concerns.
     starts
         Initial guesses; None stands for the automatic ones.
+    near
+        Fit with the same parameters from whose optimum, on its grid, the extension is fitted instead.
     local_start
         Values at which the extension hardly changes the fit. If a fit from there does not lower the criterion, the
         initial guesses are skipped: a multistart takes much longer.
@@ -122,6 +124,7 @@ class Extension:
     parameter_count: int
     inputs: Sequence[str]
     starts: Sequence[Mapping[str, float] | None] = (None,)
+    near: JointFit | None = None
     local_start: Mapping[str, float] | None = None
     term_text: str = ""
     runs: Runs | None = None
@@ -239,7 +242,7 @@ def _drift_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
     count = (2 if structure.offset == "none" else 1) * len(structure.equations) * len(runs)
-    return [Extension("drift_fits", replace(structure, offset="ramp"), count, [], starts=[joint.values_by_name])]
+    return [Extension("drift_fits", replace(structure, offset="ramp"), count, [], near=joint)]
 
 
 def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
@@ -254,8 +257,7 @@ def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -
         if name in structure.signals and np.count_nonzero(steps) > MIN_CHANGING_SHARE * steps.size:
             other: Intersample = "foh" if runs[0].intersample[name] == ZERO_ORDER_HOLD else "zoh"
             changed = as_runs([run.with_intersample({name: other}) for run in runs])
-            starts = [joint.values_by_name]
-            extensions.append(Extension("other_intersample_fits", structure, 0, [name], starts, runs=changed))
+            extensions.append(Extension("other_intersample_fits", structure, 0, [name], near=joint, runs=changed))
     return extensions
 
 
@@ -309,7 +311,7 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
     extension_runs = extension.runs or runs
 
     def fit(start: Mapping[str, float] | None) -> FittedExtension:
-        refit = fit_output_error(extension_runs, extension.structure, start=start, refine=False)
+        refit = fit_output_error(extension_runs, extension.structure, start=start, near=extension.near, refine=False)
         criterion = _prediction_criterion(refit, extension.structure, extension_runs, extension.parameter_count)
         return FittedExtension(extension, refit, criterion)
 
