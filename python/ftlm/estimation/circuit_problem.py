@@ -1,4 +1,7 @@
-"""Residuals of measured impedances of a circuit in logarithms of its parameters, and initial guesses."""
+"""Residuals and initial guesses for a fit of a circuit to measured impedances.
+
+Resistances and other positive parameters are replaced by their logarithms; exponents are used as they are.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +27,10 @@ MAX_LOG_WIDTH = 700.0
 
 
 class CircuitProblem(ResponseProblem):
-    """Circuit and measured impedances.
+    """Estimation problem of a circuit: its free parameters and the measured impedances.
 
-    Parameters are logarithms, which keeps resistances above 0, but exponents themselves.
+    The optimizer varies the logarithm of each positive parameter (resistance, capacitance, time constant), which cannot
+    become negative. Exponents are varied directly.
     """
 
     def __init__(
@@ -45,20 +49,26 @@ class CircuitProblem(ResponseProblem):
         ]
 
     def with_records(self, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> CircuitProblem:
-        """Return the problem of other records."""
+        """Return the same problem for other measured impedances and weights."""
         return CircuitProblem(self.circuit, records, weights, self.bounds)
 
     def in_seconds(self, values: Floats) -> Floats:
-        """Return parameters from their logarithms."""
+        """Return the parameters in SI units from the variables of the optimizer."""
         return np.where(self.is_log, np.exp(np.where(self.is_log, values, 0.0)), values)
 
     def in_problem_units(self, values: Floats) -> Floats:
-        """Return the logarithms of positive parameters, and other parameters unchanged; NaN if one is not above 0."""
+        """Return the variables of the optimizer: logarithms of positive parameters, exponents unchanged.
+
+        A parameter that must be positive but is not gives NaN.
+        """
         safe = np.where(values > 0, values, np.nan)
         return np.where(self.is_log, np.log(np.where(self.is_log, safe, 1.0)), values)
 
     def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-        """Return intervals of given half-widths. Those of positive parameters are symmetric in the logarithm."""
+        """Return (low, high) of each parameter by name, in SI units, from half-widths by name.
+
+        The bounds of a positive parameter are symmetric in its logarithm.
+        """
         intervals = super().intervals(values, widths)
         for name, value, is_log in zip(self.names, values.tolist(), self.is_log.tolist(), strict=True):
             if is_log:
@@ -71,7 +81,10 @@ class CircuitProblem(ResponseProblem):
         return jacobian / np.where(self.is_log, self.in_seconds(values), 1.0)
 
     def responses(self, values: Floats, *, jacobian: bool = True) -> list[tuple[Complex, Complex | None]]:
-        """Return the impedance at every record, and its derivatives by all parameters (one column each)."""
+        """Return, for each record, the impedance and its Jacobian of shape (frequencies, parameters).
+
+        The derivatives are those with respect to the variables of the optimizer. Without `jacobian` they are None.
+        """
         by_parameter = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
         out: list[tuple[Complex, Complex | None]] = []
         for record in self.records:
@@ -82,7 +95,11 @@ class CircuitProblem(ResponseProblem):
         return out
 
     def constraints(self) -> tuple[Floats, Floats, list[str]]:
-        """Return the constraints ``rows @ values <= limits`` of exponents and bounds, with descriptions."""
+        """Return linear constraints ``rows @ values <= limits`` and a description of each, for messages.
+
+        They keep every parameter within its bounds, and exponents between 0.05 and 1. `values` are the variables of the
+        optimizer.
+        """
         rows, limits, words = [], [], []
         for k, name in enumerate(self.names):
             low, high = self.bounds.get(name, (-math.inf, math.inf))
@@ -94,11 +111,14 @@ class CircuitProblem(ResponseProblem):
         return np.reshape(np.array(rows), (-1, len(self.names))), np.array(limits), words
 
     def default_start(self) -> dict[str, float]:
-        """Return the best initial guess by name."""
+        """Return the best automatic initial guess by name, in SI units."""
         return dict(zip(self.names, self.in_seconds(self.initial_guesses()[0]).tolist(), strict=True))
 
     def sort_groups(self, values: Floats) -> Floats:
-        """Return values with equal parallel groups in series from the fastest to the slowest."""
+        """Return the parameters with identical parallel groups in series ordered from the fastest to the slowest.
+
+        Such groups can change places without a change of the impedance. The peak of -Im Z gives the speed of a group.
+        """
         kind, rest = self.circuit.tree
         if kind != "series" or self.circuit.values or self.bounds:
             return values
@@ -120,7 +140,8 @@ class CircuitProblem(ResponseProblem):
     def initial_guesses(self) -> list[Floats]:
         """Return feasible initial guesses, most promising first.
 
-        At time constants over the measured band, the sizes of the parts in series are least squares.
+        Time constants and exponents come from a Halton sequence over the measured band. Nonnegative least squares then
+        give the impedance scale of each part in series.
         """
         every = np.concatenate([r.frequency for r in self.records])
         slow, fast = -math.log10(float(every.min())), -math.log10(float(every.max()))
@@ -169,7 +190,7 @@ class CircuitProblem(ResponseProblem):
 
 
 def _positive_least_squares(table: Floats, goal: Floats) -> Floats:
-    """Return least-squares sizes above 0; those that would not be are small."""
+    """Return a positive least-squares solution; components that would be negative get 0.001 of the largest."""
     lengths = np.linalg.norm(table, axis=0)
     scaled = table / lengths
     is_active = np.ones(lengths.size, dtype=bool)

@@ -31,18 +31,19 @@ MIN_FIRST_STAGE_F = 10.0
 
 
 def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[Finding]]:
-    """Return runs whose inputs are replaced by their part explained by a reference, and findings.
+    """Return runs in which each input is replaced by its projection on past values of the reference, and findings.
 
-    Controller and loop form one linear filter from reference to input. Least squares over all runs fits it, as in the
-    first step of the two-stage method (Van den Hof and Schrama, An indirect method for transfer function estimation
-    from closed loop data, Automatica 29, 1993, 1523-1527). The explained part of an input contains no fed-back noise.
+    In a closed loop, a linear filter maps the reference to each input. Least squares over all runs fit this filter, as
+    in the first step of the two-stage method (Van den Hof and Schrama, An indirect method for transfer function
+    estimation from closed loop data, Automatica 29, 1993, 1523-1527). The projection contains no noise that feedback
+    carries into the input.
 
     Raises
     ------
     ModelError
-        The reference is a signal of the model.
+        If the reference is itself a signal of the model.
     DataError
-        A run lacks the reference, the reference is constant, or the model has no input.
+        If a run lacks the reference, the reference is constant, or the model has no input.
     """
     if reference in structure.signals:
         raise ModelError(
@@ -95,9 +96,12 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
 
 
 def past_regressors(signal: Floats, first: int, reach: int, *, dense: int = DENSE_PAST_SAMPLES) -> list[Floats]:
-    """Return samples of a signal ``first`` to ``dense`` samples back, then means of growing blocks up to ``reach``.
+    """Return past samples of a signal as regressors, minus its first sample: single lags, then means of lag blocks.
 
-    Samples before the first one are taken as equal to it, so ``reach`` may be at most the length of the signal.
+    Lags from ``first`` to ``dense`` each give one regressor. Longer lags up to ``reach`` are averaged in blocks of
+    growing length. Each regressor has the length of the signal.
+
+    Samples before the first one equal it. ``reach`` may be at most the length of the signal.
     """
     count = signal.size
     padded = np.concatenate([np.full(count, signal[0]), signal])
@@ -113,7 +117,10 @@ def past_regressors(signal: Floats, first: int, reach: int, *, dense: int = DENS
 
 
 def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
-    """Return the first-stage F statistic, with the long-run variance of the residuals."""
+    """Return the F statistic of the first stage of a two-stage fit, corrected for colored residuals.
+
+    `answers` are the explained parts of an input by run, `missed` the residuals, and `coefficients` is their number.
+    """
     colour = autoregression(missed, DEFAULT_LAGS)
     errors = np.concatenate([np.convolve(e - np.mean(e), colour, "valid") for e in missed])
     level = float(np.mean(errors**2)) / max(float(np.sum(colour)) ** 2, 1e-12)
@@ -122,7 +129,7 @@ def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficie
 
 
 def _columns(moves: Sequence[Floats], shortest: int, dense: int) -> Floats:
-    """Return lagged reference values as regressors, and one constant for every run."""
+    """Return a regressor matrix for all runs: lagged reference samples, then one constant column per run."""
     parts = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in moves]
     levels = np.repeat(np.eye(len(moves)), [r.size for r in moves], axis=0)
     return np.hstack([np.concatenate(parts), levels])
@@ -134,7 +141,7 @@ def _criterion(missed: Floats, coefficients: int) -> float:
 
 
 def run_with_inputs(run: Run, values: Mapping[str, Floats]) -> Run:
-    """Return a run with other values of some inputs, and with additional inputs, which are held."""
+    """Return a copy of a run in which some inputs are replaced or added; added inputs are zero-order holds."""
     return Run.from_arrays(
         step=run.step,
         inputs={**{n: run[n] for n in run.inputs}, **values},
@@ -147,7 +154,7 @@ def run_with_inputs(run: Run, values: Mapping[str, Floats]) -> Run:
 
 
 def mark_reference_fit(fit: Fit, reference: str, findings: Sequence[Finding]) -> Fit:
-    """Return a fit with the reference recorded in its settings and findings."""
+    """Return a fit whose settings and findings name the reference signal that it used."""
     # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
     own = [f for f in fit.findings if f.code != "residuals_not_white"]
     return replace(fit, findings=[*own, *findings], settings={**fit.settings, "reference": reference})

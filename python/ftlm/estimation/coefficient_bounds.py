@@ -1,4 +1,7 @@
-"""Bounds of coefficients by an active set: a coefficient beyond its bound is fixed there, and the others refitted."""
+"""Bounds on coefficients, imposed by an active-set method.
+
+A coefficient beyond its bound is fixed at the bound, and the others are fitted again.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ FitType = TypeVar("FitType")
 
 
 def check_intervals(bounds: object, *, finite: bool = False) -> None:
-    """Raise ModelError unless each bound is a pair of rising numbers by name; only finite ones if `finite`."""
+    """Raise ModelError unless bounds are pairs (lower, upper) by name, lower < upper; finite ones if `finite`."""
     if not isinstance(bounds, Mapping):
         raise ModelError(f"bounds = {bounds!r} is not a mapping; write {{name: (low, high)}}")
     for name, pair in bounds.items():
@@ -34,7 +37,8 @@ def check_bounds(structure: Structure, bounds: Bounds | None, start: object = No
     Raises
     ------
     ModelError
-        A name that is not a free order or coefficient, no rising pair of numbers, or a start out of its bounds.
+        If a name is not a free order or coefficient, a bound is not a pair of increasing numbers, or an initial guess
+        is out of its bounds.
     """
     check_intervals(bounds or {})
     out, limits = {}, bounds or {}
@@ -75,11 +79,11 @@ def fit_within_bounds(
     bounds: Bounds,
     fit: Callable[[Structure, Mapping[str, float] | None], tuple[FitType, Mapping[str, float]]],
 ) -> tuple[FitType, list[Finding]]:
-    """Return the fit of a structure with its coefficients within bounds, and findings on those on a bound.
+    """Return the fit of a structure with its coefficients within bounds, and a finding on each active bound.
 
-    An active set: coefficients beyond their bounds are fixed there. Then each is released in turn and refitted from its
-    bound; the refit is kept if it satisfies all bounds. `fit` takes a structure and the only initial guess, or None for
-    automatic ones, and returns a fit and its estimates by name.
+    An active-set method fixes coefficients beyond their bounds at the bounds. Then it releases each of them in turn and
+    fits again from the bound; the refit is kept if it satisfies all bounds. `fit` takes a structure and the only
+    initial guess, or None for automatic ones, and returns a fit and its estimates by name.
     """
 
     def violations(values: Mapping[str, float]) -> dict[str, float]:

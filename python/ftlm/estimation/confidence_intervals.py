@@ -48,10 +48,11 @@ def with_intervals(
     progress: Callable[[int, int], None] | None = None,
     loss: Loss = "squares",
 ) -> tuple[JointFit, list[Finding]]:
-    """Return a joint fit with the requested intervals, and findings about them.
+    """Return a joint fit to which the requested confidence intervals are added, and findings about them.
 
-    ``"auto"`` profiles the parameters whose Wald interval is inaccurate, ``"profile"`` all. If a profile leads to a
-    lower optimum, the fit is repeated from there.
+    ``"quadratic"`` gives Wald intervals. ``"auto"`` computes profile-likelihood intervals for the parameters whose Wald
+    interval is inaccurate, ``"profile"`` for all. If a profile leads to an optimum of lower cost, the fit is repeated
+    from there.
     """
     count = len(joint.names) + joint.initial_terms
     # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
@@ -138,8 +139,8 @@ def profile_intervals(
 ) -> ProfileResult:
     """Compute profile-likelihood intervals of some parameters of a fit in the core.
 
-    Results do not depend on the number of threads. A parameter that the data do not determine has the whole line as its
-    interval.
+    Results do not depend on the number of threads. The interval of a parameter that is not identifiable is unbounded on
+    both sides.
 
     Parameters
     ----------
@@ -152,15 +153,15 @@ def profile_intervals(
     threads, progress
         Number of threads, and a callback with (bounds found, total bounds).
     budget
-        Number of simulations for all bounds, including those of lower optima, and the least one with which a bound is
-        started; None for no limit.
+        Two numbers of simulations: the maximum for all bounds together, and the remainder below which no further bound
+        is searched. None for no limit.
     evaluations
-        Largest number of evaluations of the descent to the optimum around which intervals are searched.
+        Maximum number of evaluations with which the optimum is minimized again before the search.
 
     Raises
     ------
     KeyboardInterrupt
-        Ctrl-C, within one refit.
+        On Ctrl-C, after at most one refit.
     """
     answer = _core.profile_intervals(
         problem.core,
@@ -187,7 +188,7 @@ def profile_intervals(
 
 
 def half_width(level: float) -> float:
-    """Return the half-width of an interval of this probability, in standard deviations."""
+    """Return the half-width, in standard deviations, of a normal confidence interval of this probability."""
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 

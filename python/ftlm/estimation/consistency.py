@@ -1,4 +1,4 @@
-"""Consistency test: whether segments of a run, or several runs, share one model (parameter constancy)."""
+"""Consistency test: whether segments of a run, or several runs, share the same parameters."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ class ParameterDifference:
     parts
         Indices of the two segments.
     difference_in_errors
-        Difference in its standard errors; for profile-likelihood intervals from the facing bounds. NaN if the parameter
-        is not identifiable from one segment.
+        Difference divided by its standard error. With profile-likelihood intervals, the bounds that face each other
+        give the standard error. NaN if the parameter is not identifiable from one segment.
     disjoint
         Whether the 95 % intervals do not overlap.
     """
@@ -63,7 +63,7 @@ class ParameterDifference:
 
 @dataclass(frozen=True)
 class Consistency(ReportMixin):
-    """Segments of a run, or runs, identified separately, and whether they share one model.
+    """Result of a consistency test: separate fits of segments, and whether they agree with one model.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Consistency(ReportMixin):
     cross_validation
         Fit in percent of each segment's model (first) on each segment (second), by output.
     delays
-        Findings on runs that the model of another one explains with their inputs shifted by some rows.
+        Findings on runs that the model of another run explains once their inputs are shifted by some samples.
     """
 
     names: tuple[str, ...]
@@ -152,7 +152,7 @@ class Consistency(ReportMixin):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Limitations of the comparison: parameters that are not identifiable, and findings on each segment."""
+        """Findings that limit the conclusion: parameters that are not identifiable, then those of each segment."""
         out = []
         if self.not_identifiable and self.consistent is not None:
             out.append(make_finding("not_told_by_part", parameter=", ".join(self.not_identifiable)))
@@ -166,7 +166,7 @@ class Consistency(ReportMixin):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
+        """Findings as sentences."""
         return texts(self.findings)
 
     def numbers_table(self) -> Table:
@@ -218,7 +218,7 @@ class Consistency(ReportMixin):
         return Page("Parts of a run", [first, *sections], lead)
 
     def to_frame(self) -> Any:
-        """Return the parameters as a pandas frame by parameter and segment."""
+        """Return a pandas DataFrame of the estimates, indexed by parameter and segment."""
         rows = [
             {
                 "parameter": name,
@@ -274,7 +274,7 @@ def _cell(value: Cell) -> str:
 
 
 def values_of(result: Identification) -> dict[str, float]:
-    """Return all parameters with a standard error, by name."""
+    """Return the estimates of all parameters that have a standard error, by name."""
     return {n: p.value for n, p in result.parameters.items() if not p.fixed}
 
 
@@ -292,20 +292,20 @@ def consistency(
 ) -> Consistency:
     """Identify segments of a run separately and test whether they share one model.
 
-    If the structure is right, every segment gives the same parameters. Segments are inconsistent if the 95 % intervals
-    of some parameter do not overlap, or if the parameters together differ by more than their covariances explain (99
-    %). Then the plant changed, or the structure lacks an effect that only some segments excite.
+    If the structure is right, every segment gives the same parameters within their errors. Segments are inconsistent if
+    the 95 % intervals of one parameter do not overlap, or if a chi-squared test of all parameters rejects a common
+    value at 99 %. Then the plant changed, or the structure lacks an effect that only some segments excite.
 
     Parameters
     ----------
     runs
         One run, which is split into segments of equal length, or several runs, one segment each.
     structure
-        Structure to identify. Each segment with a nonzero start has its own initial terms or history.
+        Structure to identify. Each segment that starts in motion has its own initial conditions.
     segments
         Number of segments of one run, by default 2; not used with several runs.
     method, offset, m, threads
-        See :func:`ftlm.identify`; a method that gives standard errors, without a store and a start.
+        See :func:`ftlm.identify`. The method must give standard errors, and have neither a `store` nor a `start`.
     progress
         Callback with (segments done, total segments).
 
@@ -317,12 +317,12 @@ def consistency(
     Raises
     ------
     ModelError
-        Fewer than two segments, a number of segments with several runs, a method without standard errors, or no free
-        parameter.
+        If there are fewer than two segments, `segments` is given with several runs, the method gives no standard
+        errors, or no parameter is free.
     DataError
-        A run too short to split, runs that do not fit together, or a segment that cannot be identified.
+        If a run is too short to split, runs differ in names or units, or a segment cannot be identified.
     ConvergenceError
-        A segment whose fit fails.
+        If the fit of a segment fails.
     """
     every = as_runs(runs)
     count = None if segments is None else check_integer("segments", segments, DEFAULT_SEGMENTS)
@@ -358,7 +358,7 @@ def consistency(
 
 
 def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequence[Identification]) -> list[Finding]:
-    """Return findings on runs to which another run's model fits as well as their own once the inputs are shifted."""
+    """Return findings on runs that another run's model fits equally well once inputs are shifted in time."""
     findings = []
     for (k, piece), (j, result) in itertools.product(enumerate(pieces), enumerate(results)):
         inputs = [n for n in result.model.structure.signals if n in piece.inputs]
@@ -386,13 +386,13 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
 
 
 def _shift_rows(samples: Floats, rows: int) -> Floats:
-    """Return samples some rows later, or earlier if negative; the first or last value is repeated."""
+    """Return samples delayed by a number of rows, or advanced if negative; end values fill the gap."""
     at = np.clip(np.arange(samples.size) - rows, 0, samples.size - 1)
     return np.asarray(samples[at])
 
 
 def split_run(run: Run, parts: int) -> list[Run]:
-    """Split a run into segments of equal length, up to one sample."""
+    """Split a run into consecutive segments whose lengths differ by at most one sample."""
     if parts * MIN_RUN_SAMPLES > run.length:
         raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer")
     ends = [k * run.length // parts for k in range(parts + 1)]
@@ -414,9 +414,9 @@ def _segment_names(pieces: Sequence[Run]) -> list[str]:
 
 
 def _cross_validated_fit(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
-    """Return the fit of one segment's model on another segment; empty if the simulation is not finite.
+    """Return the fit in percent, by output, of one segment's model on another segment; {} if the simulation fails.
 
-    The initial conditions are those of the other segment's own fit.
+    Initial conditions are those identified on the other segment.
     """
     if result is own:
         return dict(result.fit)
@@ -453,13 +453,13 @@ def differences(results: Sequence[Identification]) -> list[ParameterDifference]:
 
 
 def is_identifiable(result: Identification, name: str) -> bool:
-    """Whether a parameter is identifiable from a segment: finite standard error, and an interval with a finite end."""
+    """Whether a parameter has a finite standard error and an interval with at least one finite bound."""
     low, high = result.intervals[name]
     return 0.0 < result.standard_errors[name] < math.inf and (low > -math.inf or high < math.inf)
 
 
 def is_quadratic(result: Identification, name: str) -> bool:
-    """Whether both bounds of an interval are close to those of the Wald interval."""
+    """Whether both bounds of a parameter's interval are close to those of the Wald interval."""
     value, usual = values_of(result)[name], NORMAL_95 * result.standard_errors[name]
     low, high = result.intervals[name]
     return is_identifiable(result, name) and all(
@@ -468,10 +468,11 @@ def is_quadratic(result: Identification, name: str) -> bool:
 
 
 def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int]:
-    """Return the chi-squared distance of all parameters from their mean, and its degrees of freedom.
+    """Return the chi-squared statistic of all parameters about their weighted mean, and its degrees of freedom.
 
-    Parameters without an approximately quadratic cost in every segment are left out, because their covariance says
-    little. Each is scaled by its standard errors, so that units do not determine the numerical rank.
+    Parameters whose interval in some segment is not close to the Wald interval are omitted, because their covariance is
+    inaccurate. Parameters are scaled by their standard errors, so that units do not affect the numerical rank. The
+    statistic is None without a covariance.
     """
     joints = [r.joint for r in results if r.joint is not None]
     if len(joints) < len(results):

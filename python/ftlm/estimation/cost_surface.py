@@ -25,7 +25,7 @@ OPTIMUM_EVALUATIONS = 20
 
 @check_arguments
 def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
-    """Return the two most correlated orders of a joint fit, and their correlation.
+    """Return the names of the two most correlated free orders of a joint fit, and their correlation coefficient.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
     Returns
     -------
     tuple or None
-        None with fewer than two free orders, or without a known correlation.
+        (name, name, correlation); None with fewer than two free orders, or if no correlation is finite.
     """
     if result.joint is None:
         return None
@@ -52,7 +52,7 @@ def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
 def output_error_landscape(
     result: Identification, orders: tuple[str, str] | None = None, *, refit: bool = True
 ) -> Landscape | None:
-    """Compute the cost of an output-error fit over two orders, four standard errors around the optimum.
+    """Compute the cost of an output-error fit on a grid of two orders, within four standard errors of the optimum.
 
     Parameters
     ----------
@@ -61,18 +61,20 @@ def output_error_landscape(
     orders
         Names of the two orders; by default the most correlated ones.
     refit
-        Whether all other parameters follow by one linear step from the optimum; otherwise they stay fixed.
+        Whether the other parameters are minimized at each grid point, to first order; otherwise they stay at the
+        optimum.
 
     Returns
     -------
     Landscape or None
-        Scores are 1 plus the increase of the sum of squares, weighted by the noise. For white residuals the 95 % region
-        of both orders ends at 7. None if two orders have no finite standard error.
+        Grid with scores: 1 plus the increase of the sum of squares over the noise variance. For white residuals, the
+        joint 95 % region of both orders is where the score is below 7. None if there are no two orders with a finite
+        standard error.
 
     Raises
     ------
     ModelError
-        A name that is not a free order.
+        If a name is not a free order.
     """
     joint, task, pair = result.joint, result.task, orders
     pair_choice = correlated_orders(result)

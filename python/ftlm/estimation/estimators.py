@@ -1,4 +1,4 @@
-"""Estimators of whole structures: joint output error, external instruments, order search with linear methods."""
+"""Estimators of whole structures: joint output error, external instruments, and order search with linear methods."""
 
 from __future__ import annotations
 
@@ -59,12 +59,15 @@ MIN_PULSES_PER_SAMPLE = 2
 def fit_with_instruments(
     joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]
 ) -> JointFit:
-    """Fit so that the residuals are uncorrelated with instruments simulated from noise-free inputs.
+    """Return a joint fit whose output-error residuals are uncorrelated with instruments from noise-free inputs.
 
-    The residuals e are those of the measured runs. The instruments are the sensitivities for `answers`, the parts of
-    the inputs explained by the reference, which contain no noise. Orthogonality removes the bias by noise feedback,
-    whatever the accuracy of `answers` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9).
-    Gauss-Newton starts from the fit to `answers`. The covariance is robust to colored residuals.
+    `joint` is the initial fit, to the runs in `answers`. Those are the measured `runs` with each input replaced by the
+    part that the reference explains, which contains no noise.
+
+    The residuals are those of the measured runs. The instruments are the sensitivities of the outputs to the
+    parameters, computed with `answers`. Orthogonality of both removes the bias caused by feedback of noise, whatever
+    the accuracy of `answers` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9). The
+    equations are solved by Gauss-Newton. The covariance is robust to colored residuals.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
@@ -112,10 +115,11 @@ def fit_with_instruments(
 
 
 def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], answers: Sequence[Run]) -> float:
-    """Return the largest bias of a parameter by feedback, in its standard errors.
+    """Return the largest bias that feedback of noise causes in a parameter, in standard errors of the parameter.
 
-    `answers` are the inputs without the part that feedback from the residuals explains. They serve as instruments, and
-    the bias is the first Gauss-Newton step of :func:`fit_with_instruments`; infinite if that step does not exist.
+    `answers` are the runs with inputs from which the part that depends on past residuals is removed. They serve as
+    instruments, and the bias is the first Gauss-Newton step of :func:`fit_with_instruments`. It is infinite if that
+    step cannot be computed.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)
@@ -131,7 +135,10 @@ def feedback_bias(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], an
 
 
 def _evaluate_moments(data_objective: Objective, clean: Objective, values: Floats) -> tuple[Iterate, Floats, Floats]:
-    """Return residuals, sensitivities on measured inputs, and sensitivities on noise-free inputs."""
+    """Return the evaluated residuals, their Jacobian on measured inputs, and the Jacobian on noise-free inputs.
+
+    Both Jacobians have shape (parameters, residuals).
+    """
     orders, coefficients, inputs = data_objective.problem.split(values.tolist())
     start = Iterate(orders, coefficients, "instruments", {}, inputs)
     at = data_objective.minimize(start, 1, plain=True)
@@ -160,7 +167,7 @@ MAX_IV_PULSES = 1 << 14
 
 
 def loss_setting(joint: JointFit) -> dict[str, Any]:
-    """Return the loss and its summary as settings; empty for squares."""
+    """Return the robust loss and its summary as entries of `Fit.settings`; {} for squared residuals."""
     return {} if joint.robust is None else {"loss": "huber", **asdict(joint.robust)}
 
 
@@ -179,8 +186,9 @@ def estimate_output_error(
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
-    `answers` are the inputs explained by a reference and serve as instruments. With `alone`, `begin` is the only
-    initial guess. `joint_fit` is the joint fit of the task if it exists.
+    `answers` are runs with the part of each input that a reference explains; they serve as instruments. `begin` is an
+    additional initial guess, completed by the values in `more`; with `alone` it is the only one. `joint_fit` is a joint
+    fit of the same task, if one was computed before.
     """
     # An order with one value is known.
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -250,7 +258,7 @@ def estimate_output_error(
 
 
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
-    """Return the covariance of the numbers of a model; None where a direction is not identifiable."""
+    """Return the covariance of all orders and coefficients of the model; None if one is not identifiable."""
     jacobian = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
     with np.errstate(invalid="ignore", over="ignore"):
         # Of directions that the runs do not see covariances are not numbers, or beyond them.
@@ -267,7 +275,7 @@ def estimate_order_search(
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> Fit:
-    """Search the orders on the order grid, then estimate the coefficients by the same linear method."""
+    """Search the orders on a grid, then estimate the coefficients at the best orders by the same linear method."""
     searches = (
         run_order_searches(task, settings, m, threads, progress, store, executor) if task.structure.order_names else {}
     )
@@ -277,7 +285,7 @@ def estimate_order_search(
 def fit_at_best_orders(
     task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
 ) -> Fit:
-    """Estimate the coefficients at the best orders of searches by the linear method of the settings."""
+    """Estimate the coefficients at the best orders of completed order searches, by a linear method."""
     method, structure = settings.coefficients, task.structure
     orders = {n: v for search in searches.values() for n, v in search.orders.items()}
     rank = 1
@@ -323,7 +331,7 @@ def fit_at_best_orders(
 def prior_findings(
     task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
 ) -> list[Finding]:
-    """Return a finding on each search whose prior covariance makes the best simulation nearly zero."""
+    """Return a finding on each order search in which the prior covariance makes the best simulation nearly zero."""
     if settings.coefficients != "multi-innovation" or settings.prior_covariance is None:
         return []
     if settings.criterion != "output-error":
@@ -345,7 +353,7 @@ def prior_findings(
 
 
 def fixed_orders(task: Task) -> set[str]:
-    """Return the orders with one grid value, which are not estimated."""
+    """Return the names of orders with a single grid value, which are not estimated."""
     parts = task.structure.independent_groups().values() if task.structure.order_names else []
     axes = [(task.part_order_grid(part) or OrderGrid()).values(part) for part in parts]
     return {n for values in axes for n, v in values.items() if len(v) == 1}
@@ -360,7 +368,10 @@ def run_order_searches(
     store: str | os.PathLike[str] | None,
     executor: Executor | None,
 ) -> dict[str, SearchResult]:
-    """Run the order searches of all independent groups of equations, with one checkpoint file."""
+    """Run an order search for each independent group of equations, all with one checkpoint file.
+
+    The results are keyed by output, or by ``"stage"`` for a search of coupled equations.
+    """
     jobs = {
         name: make_job(task.runs, part, task.part_order_grid(part), settings, m=m, threads=threads, progress=progress)
         for name, part in task.structure.independent_groups().items()
@@ -376,10 +387,11 @@ def run_order_searches(
 
 
 def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: SearchResult) -> int:
-    """Return the rank of the kept row whose coupled simulation has the highest likelihood.
+    """Return the rank of the table row whose orders give the most likely simulation of all equations together.
 
-    The table ranks equations separately, which hardly distinguishes neighboring orders. The criterion is the sum of ln
-    NR over outputs, the likelihood of white noise of unknown variance.
+    The order search ranks candidates by simulations in which measured outputs enter each equation. Those hardly
+    distinguish neighboring orders. The criterion here is the sum of ln NR over outputs, which is the negative log
+    likelihood of white noise of unknown variance up to constants.
     """
     best, rank = math.inf, 1
     for row in search.table:
@@ -397,7 +409,7 @@ def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: Se
 
 
 def fitted_model(joint: JointFit, structure: Structure) -> Model:
-    """Return a fit as a model with its initial conditions and the covariance of its parameters."""
+    """Return the model of a joint fit, with its initial conditions and the covariance of its parameters."""
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
     identified_structure = (

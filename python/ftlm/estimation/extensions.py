@@ -1,7 +1,8 @@
-"""Tests of extensions of an equation that would explain its colored residuals, and of other initial conditions.
+"""Tests whether an extended structure, or other initial conditions, explain the colored residuals of a fit.
 
-Extensions are a drift of the level, another intersample behavior of an input (``"zoh"`` or ``"foh"``), a lag, a delay
-or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared input, and a load step.
+The extensions are a linear drift of an output, another intersample behavior of an input (``"zoh"`` or ``"foh"``), a
+lag, a delay or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared input, and a load
+step.
 """
 
 from __future__ import annotations
@@ -90,12 +91,12 @@ MIN_GAIN_CHANGE_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 
 @dataclass(frozen=True)
 class Extension:
-    """Structure that extends the fitted one.
+    """Structure with an additional effect, which is compared with the fitted structure.
 
     Parameters
     ----------
     code
-        Code of the finding that reports it.
+        Code of the finding that reports the extension.
     structure
         The extended structure.
     parameter_count
@@ -107,10 +108,10 @@ class Extension:
     near
         Fit with the same parameters from whose optimum, on its grid, the extension is fitted instead.
     local_start
-        Values at which the extension hardly changes the fit. If a fit from there does not lower the criterion, the
-        initial guesses are skipped: a multistart takes much longer.
+        Parameter values at which the extended model nearly equals the fitted one. If a local fit from these values does
+        not lower the criterion, the slower multistart from `starts` is skipped.
     term_text
-        Additional terms as text, for the remedy.
+        Additional terms as text, for the message.
     runs
         Runs with a load as an additional input, or with another intersample behavior; None for the given ones.
     load_time
@@ -134,7 +135,7 @@ class Extension:
 
 @dataclass(frozen=True)
 class FittedExtension:
-    """Extension with its fit and the criterion of one-step predictions of its residuals."""
+    """Extension with its fit and its score, the Schwarz criterion of one-step predictions of the residuals."""
 
     extension: Extension
     fit: JointFit
@@ -143,21 +144,23 @@ class FittedExtension:
 
 @dataclass(frozen=True)
 class ExtensionTests:
-    """Findings on what a structure lacks, and whether a fit with dry friction was compared."""
+    """Result of :func:`run_extension_tests`: findings, and whether a structure with dry friction was tested."""
 
     findings: list[Finding]
     friction_tested: bool = False
 
 
 def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
-    """Fit extensions if residuals are colored, and name one that clearly lowers their one-step prediction error.
+    """Fit extended structures if residuals are colored; report the best one if it clearly predicts better.
 
-    Colored noise and a response that the structure lacks both color residuals. Noise has the same one-step prediction
-    error, the variance of the innovations of an autoregression, whichever structure is fitted. A missing response
-    raises it. The extension is named if its residuals depend neither on an input nor on the direction of motion.
+    Residuals are colored by noise, or by a response that the structure lacks. An autoregression of the residuals
+    separates the two: its innovation variance does not depend on the structure for pure noise, but a missing response
+    raises it. An extension is reported only if its own residuals depend neither on an input nor on the direction of
+    motion.
 
-    Structures with friction, limits or free delays are not tested. Those of several equations or with a coefficient law
-    are tested for drift and intersample behavior alone, those with non-linear terms for intersample behavior alone.
+    Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
+    with a coefficient law are tested only for drift and intersample behavior. Structures with other nonlinear terms are
+    tested only for intersample behavior.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     colored = any(not o.whiteness.passed or o.follows_direction for o in tests.outputs.values())
@@ -195,9 +198,9 @@ def _extension_findings(
     names: Sequence[str],
     about: Mapping[str, str],
 ) -> list[Finding]:
-    """Return the finding of the best extension, or ``dynamics_missing`` if its residuals still fail a test.
+    """Return the finding on the best extension, or ``dynamics_missing`` if its residuals fail a residual test.
 
-    Another intersample behavior that changes no parameter is not reported.
+    An extension by another intersample behavior is reported only if it changes a parameter by over one standard error.
     """
     missing = [make_finding("dynamics_missing", input=enumerate_names(names), **about)] if names else []
     extension, refit = best.extension, best.fit
@@ -231,14 +234,14 @@ def _extension_findings(
 
 
 def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, ...]:
-    """Return the inputs of a linear structure of one equation without a coefficient law; none for others."""
+    """Return the inputs of a linear structure of one equation without a coefficient law; () for other structures."""
     if len(structure.equations) > 1 or structure.coefficient_law or not structure.is_linear:
         return ()
     return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
 
 
 def _drift_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the linear structure with levels of the outputs that change linearly; none if its offsets were given."""
+    """Return the structure extended by a linear drift of each output; [] if nonlinear or if an offset was requested."""
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
     count = (2 if structure.offset == "none" else 1) * len(structure.equations) * len(runs)
@@ -246,7 +249,7 @@ def _drift_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list
 
 
 def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the structure with the other intersample behavior of each input that changes in most rows.
+    """Return one extension for each input that changes in most samples: its other intersample behavior.
 
     Samples alone do not distinguish a staircase from a smooth signal. The wrong assumption acts like a delay of half a
     sample, which biases the parameters.
@@ -264,7 +267,7 @@ def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -
 def _intersample_findings(
     extension: Extension, joint: JointFit, refit: JointFit, runs: Runs, about: Mapping[str, str]
 ) -> list[Finding]:
-    """Return a finding on another intersample behavior if a parameter then differs by over one standard error."""
+    """Return a finding on another intersample behavior if it changes a parameter by over one standard error."""
     change = _largest_change(joint, refit)
     if not abs(change["other_value"] - change["value"]) > change["error"]:
         return []
@@ -274,9 +277,9 @@ def _intersample_findings(
 
 
 def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
-    """Return the smallest ratio over outputs of the sums of squares, and the parameter that differs most.
+    """Return the residual variance of a refit relative to a fit, and the parameter that changed most.
 
-    The difference is measured in standard errors of the first fit.
+    The ratio is the smallest over outputs. Changes are measured in standard errors of the first fit.
     """
     ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
     values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
@@ -287,7 +290,7 @@ def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
 
 
 def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[JointFit, Runs]:
-    """Return the first samples of long runs, and the fit to them; shorter runs and their fit unchanged."""
+    """Return a fit and runs cut to a maximum number of samples; short runs and their fit are returned unchanged."""
     length = MAX_EXTENSION_SAMPLES // len(runs)
     if all(run.length <= length for run in runs):
         return joint, runs
@@ -296,7 +299,7 @@ def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[J
 
 
 def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list[str]:
-    """Return names that are neither parameters nor signals: `base`, or with a number."""
+    """Return `count` names that no parameter or signal has, built from `base` with numbers if necessary."""
     reserved_names = {*structure.order_names, *structure.coefficient_names, *structure.signals, *run.signals}
     numbered = (f"{base}{k}" for k in itertools.count(1))
     names = itertools.chain([base] if count == 1 else [], numbered)
@@ -304,9 +307,10 @@ def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list
 
 
 def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> FittedExtension | None:
-    """Return the fit of an extension with the least residuals; None if no fit is found.
+    """Return the fit of an extension from its best initial guess; None if every fit fails.
 
-    A local fit that does not lower ``own_criterion``, that of the fit without the extension, is final.
+    ``own_criterion`` is the criterion without the extension. If the local fit does not lower it, no other initial guess
+    is tried.
     """
     extension_runs = extension.runs or runs
 
@@ -328,9 +332,9 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
 
 
 def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
-    """Return the extension of least criterion, or None if none is below that of the structure itself.
+    """Return the extension with the lowest criterion; None if none is below that of the original structure.
 
-    An extension further down the list must be better by `MIN_CRITERION_GAP`.
+    Extensions are listed by preference. A later one must be better than an earlier one by `MIN_CRITERION_GAP`.
     """
     best: FittedExtension | None = None
     for item in fits:
@@ -358,7 +362,7 @@ def _delay_findings(
 
 
 def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
-    """Return the extensions of a structure of one equation, those that are preferred first."""
+    """Return the extensions of the input dynamics of a structure of one equation, preferred ones first."""
     (equation,) = structure.equations
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
     delays = {n: structure.delay.get(n, 0.0) for n in names}
@@ -423,9 +427,9 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
 
 
 def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the structure with Coulomb friction: −fc sign(D y) for a position y, and −fc tanh(s y) for a speed y.
+    """Return the structure with Coulomb friction: -fc sign(D y) if y is a position, -fc tanh(s y) if y is a speed.
 
-    The second form is left out if y has one sign only, which would make it nearly constant.
+    The second form is omitted if y never changes sign, because the friction is then nearly constant.
     """
     (item,) = structure.equations
     (name,) = _unused_names("fc", 1, structure, runs[0])
@@ -458,11 +462,11 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
 
 
 def _load_step_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the structure with a constant load from some row on; none for several runs or irregular rows.
+    """Return the structure with a constant load that sets in at an unknown time; [] for several or irregular runs.
 
-    The load is fitted with its step at each of seven rows. From the best of these fits, and from the fit without a
-    load, the step moves to the row at which the response to a load explains most of the residuals, and the model is
-    fitted again, until the row does not change.
+    The model is fitted with the load step at each of seven times. The search continues from the best of these fits and
+    from the fit without a load: the step moves to the time at which a load explains most of the residuals, and the
+    model is fitted again, until the time does not change.
     """
     (item,), (run, *others) = structure.equations, runs
     if others or run.sample_times is not None:
@@ -503,7 +507,7 @@ def _load_step_extensions(structure: Structure, joint: JointFit, runs: Runs) -> 
 
 
 def _load_response(item: Equation, structure: Structure, joint: JointFit, run: Run) -> Floats:
-    """Return the response of a fitted model to a constant load from row 0 on, at rows 1 to N - 1."""
+    """Return the response of a fitted model to a constant unit load from sample 0 on, at samples 1 to N - 1."""
     own = (t for t in item.terms if t.signal == item.output)
     alone = replace(item, terms=(*own, Term("load", Order(0.0), 1.0)))
     single = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
@@ -516,7 +520,10 @@ def _load_response(item: Equation, structure: Structure, joint: JointFit, run: R
 
 
 def _load_row(residuals: Floats, response: Floats) -> int | None:
-    """Return the row from which on a load explains most of the residuals of the rows 1 to N - 2 of a run."""
+    """Return the sample index from which a constant load explains most of the residuals; None if not computable.
+
+    `residuals` and `response` cover samples 1 to N - 2 and start with the same sample.
+    """
     series = np.nan_to_num(residuals)
     load = response[: series.size]
     power, edge = np.cumsum(load**2)[::-1], max(int(MIN_LOAD_SHARE * series.size), 1)
@@ -530,7 +537,10 @@ def _load_row(residuals: Floats, response: Floats) -> int | None:
 
 
 def _with_lag(item: Equation, coefficient: str) -> Equation:
-    """Return an equation with a further lag: its order raised by 1, and a term of its former order."""
+    """Return an equation whose dynamics have one further lag.
+
+    The order of the left-hand side rises by 1, and its former derivative becomes a term with the named coefficient.
+    """
     raised = Order(item.order.constant + 1.0, item.order.weights)
     return replace(item, order=raised, terms=(Term(item.output, item.order, coefficient), *item.terms))
 
@@ -541,17 +551,17 @@ def _with_terms(item: Equation, terms: Sequence[Term]) -> Equation:
 
 
 def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
-    """Return a term of an input whose order is 1 above the highest one of this input."""
+    """Return a new term of an input, of an order 1 above the input's highest order in the equation."""
     highest = max((t.order for t in item.terms if t.signal == name), key=lambda order: order.constant)
     return Term(name, Order(highest.constant + 1.0, highest.weights), coefficient)
 
 
 def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, added_parameters: int) -> float:
-    """Return the Schwarz criterion of one-step predictions of the residuals by autoregressions of up to 25 lags.
+    """Return the Schwarz criterion of one-step predictions of the residuals by an autoregression of at most 25 lags.
 
-    Least squares ignores the color of the noise. One generalized least-squares step first removes the part of the
-    residuals that errors of the parameters explain. Of the parameters, those of the autoregressions and
-    ``added_parameters`` are counted.
+    The fit minimizes squared residuals and ignores their color. One generalized least-squares step therefore first
+    removes the part of the residuals that parameter errors explain. The penalty counts the coefficients of the
+    autoregressions and ``added_parameters``.
     """
     total, samples = 0.0, 0
     sensitivities = output_sensitivities(joint, structure, runs)
@@ -593,7 +603,7 @@ def _passes_residual_tests(extension_fit: FittedExtension, default_runs: Runs) -
 
 
 def undetermined_start_findings(fit: Fit) -> list[Finding]:
-    """Return a finding if other initial conditions explain the runs as well and give another gain."""
+    """Return a finding if other initial conditions fit the runs equally well but give another steady-state gain."""
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
         return []
@@ -634,12 +644,12 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:
-    """Return initial conditions as text."""
+    """Return initial conditions as text, such as "in motion with a nonzero level"."""
     return ("at rest" if initial == "rest" else "in motion") + (" with a nonzero level" if offset == "level" else "")
 
 
 def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return the finite steady-state gains of a fit by output and input, with their standard errors."""
+    """Return (gain, standard error) at steady state by output and input; entries that are not finite are omitted."""
     try:
         states = steady_states(fitted_model(joint, structure))
     except FtlmError:

@@ -1,4 +1,4 @@
-"""Result of one estimator, before validation."""
+"""Result of one estimator, without the assessment that `identify` adds."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ ProgressCallback = Callable[[int, int], None] | None
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of one estimator, before validation.
+    """Result of one estimator, without the assessment that `identify` adds.
 
     Parameters
     ----------
     task
-        Task as the estimator used it.
+        Runs and structure, with the decided offset and initial conditions.
     method
         Name of the estimator.
     model
@@ -33,14 +33,14 @@ class Fit:
     parameters
         Number of free parameters.
     settings
-        Settings that the result depends on, besides the task.
+        Options of the estimator by name, for the summary.
     findings
         Findings of the estimator itself.
     searches, errors, joint, covariance
         Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
         model parameters, if the estimator gives them.
     at_optimum
-        Whether the parameters minimize a criterion of the residuals, as the offset test assumes.
+        Whether the parameters minimize a criterion of the residuals. The offset test requires it.
     """
 
     task: Task
@@ -59,7 +59,10 @@ class Fit:
 def make_model(
     task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any
 ) -> Model:
-    """Return the structure of the task as a model with all parameters fixed."""
+    """Return a model of a structure with fixed orders and coefficients, which records its method and runs.
+
+    `m` is the number of block pulses; `about` adds entries to the record.
+    """
     units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
     steps = {run.step for run in task.runs}
     step_entry = {"step": steps.pop()} if len(steps) == 1 else {}
@@ -78,12 +81,12 @@ def check_no_friction(structure: Structure, method: str) -> None:
 
 
 def initial_terms_text(initial: Initial) -> str:
-    """Return decided initial terms as text for the settings."""
+    """Return chosen initial conditions as text for the summary."""
     if isinstance(initial, History):
         return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
     return initial if isinstance(initial, str) else f"t^{list(initial)}"
 
 
 def offset_setting(structure: Structure) -> dict[str, str]:
-    """Return the offset as a setting; empty without an offset."""
+    """Return the offset option of a structure as an entry of `Fit.settings`; {} without an offset."""
     return {} if structure.offset == "none" else {"offset": structure.offset}

@@ -29,36 +29,39 @@ from ftlm.utils.validation import Floats, check_known, real_number
 
 @dataclass(frozen=True)
 class FreeProblem:
-    """Structure with decided initial terms and its free parameters, as the core takes it.
+    """Estimation problem: a structure with chosen initial terms, and its free parameters.
 
-    Orders are affine functions of free orders. Coefficients are products of free coefficients.
+    The class wraps the problem of the compiled core.
+
+    Every order of the equations is an affine function of free orders. Every coefficient is a product of free
+    coefficients.
     """
 
     structure: Structure
 
     @cached_property
     def core(self) -> _core.JointProblem:
-        """Estimation problem of the core, built from the structure."""
+        """Same problem as an object of the compiled core."""
         return _core.JointProblem(core_arguments(self.structure))
 
     @cached_property
     def orders(self) -> tuple[str, ...]:
-        """Free orders."""
+        """Names of the free orders."""
         return tuple(self.core.orders)
 
     @cached_property
     def coefficients(self) -> tuple[str, ...]:
-        """Free coefficients, including those of a coefficient law."""
+        """Names of the free coefficients, including the factors of a coefficient law."""
         return tuple(self.core.coefficients)
 
     @cached_property
     def products(self) -> Mapping[str, tuple[float, tuple[str, ...]]]:
-        """Coefficients that a coefficient law gives: sign and factors by name."""
+        """Coefficients that follow from a coefficient law: (sign, names of the factors) by name."""
         return {name: (sign, tuple(factors)) for name, sign, factors in self.core.products}
 
     @cached_property
     def bounds(self) -> tuple[tuple[float, float], ...]:
-        """Bounds of the free orders."""
+        """Bounds (low, high) of each free order."""
         return tuple(self.core.bounds[: len(self.orders)])
 
     @property
@@ -72,29 +75,29 @@ class FreeProblem:
         return [*self.orders, *self.coefficients, *(item.name for item in self.inputs)]
 
     def split(self, values: Sequence[float]) -> tuple[list[float], list[float], list[float]]:
-        """Split values into those of orders, coefficients and input parameters."""
+        """Split a vector of all free parameters into orders, coefficients and input parameters."""
         flat = list(map(float, values))
         first, second = len(self.orders), len(self.orders) + len(self.coefficients)
         return flat[:first], flat[first:second], flat[second:]
 
     @classmethod
     def of(cls, structure: Structure) -> FreeProblem:
-        """Return the problem of a structure; raises at once if the core does not support it."""
+        """Return the problem of a structure; raise ModelError if the core does not support the structure."""
         problem = cls(structure)
         _ = problem.core
         return problem
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:
-        """Bounds of all free parameters. Coefficients are unbounded, except that friction must dissipate."""
+        """Bounds of all free parameters: infinite for coefficients, except that friction must dissipate energy."""
         return self.core.bounds
 
     def feasible_point(self, at: Floats, towards: Floats) -> Floats:
-        """Return the last feasible point on the line from a feasible point to another one."""
+        """Return the last point within all constraints on the line from a feasible point to another point."""
         return self.core.feasible(at, towards)
 
     def coefficients_by_name(self, values: Sequence[float]) -> dict[str, float]:
-        """Return every coefficient of the structure by name, from the free ones."""
+        """Return all coefficients of the structure by name, from the values of the free ones."""
         free = dict(zip(self.coefficients, map(float, values), strict=True))
         out: dict[str, float] = {}
         for name in self.structure.coefficient_names:
@@ -103,7 +106,7 @@ class FreeProblem:
         return out
 
     def number_jacobian(self, orders: Sequence[float], coefficients: Sequence[float]) -> Floats:
-        """Return derivatives of the model parameters (rows) by the free parameters (columns).
+        """Return the Jacobian of the model's orders and coefficients (rows) by the free parameters (columns).
 
         Rows are, for each equation, alpha, then order and coefficient of each term, then the friction coefficient if
         present (followed by fs and vs of a Stribeck term). Input parameters have no rows.
@@ -136,7 +139,7 @@ class FreeProblem:
 
 
 def core_arguments(structure: Structure) -> Any:
-    """Return a structure with decided initial terms as keyword data of the core."""
+    """Return the arguments, by keyword, from which the compiled core builds a structure with chosen initial terms."""
     signals, hints = record_signals(structure), structure.hints or Hints()
     states = structure.filter_states(structure.initial)
     # What is free does not hang on an offset that is still to be decided.
@@ -191,15 +194,15 @@ MAX_WARM_STARTS = 9
 
 
 def warm_starts(problem: FreeProblem, guess: Mapping[str, float]) -> list[dict[str, float]]:
-    """Return warm starts from values by name.
+    """Return complete initial guesses from values of some free parameters by name.
 
-    A coefficient without a value starts at 0, so its term has no effect at first. An order without a value starts at
-    each integer within its bounds.
+    A coefficient without a value is 0 in each guess, so its term has no effect at first. An order without a value takes
+    each integer within its bounds, and every combination gives one guess.
 
     Raises
     ------
     ModelError
-        A name that is not free, nothing that is, or a value that is none or out of its bounds.
+        If a name is not a free parameter, no value is given, or a value is not a number within its bounds.
     """
     bounds = dict(zip(problem.names, problem.all_bounds, strict=True))
     check_known("start value", guess, problem.names)
@@ -224,15 +227,15 @@ def warm_starts(problem: FreeProblem, guess: Mapping[str, float]) -> list[dict[s
 
 
 def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float]) -> dict[str, float]:
-    """Return the values that a model of the same outputs gives to the free parameters of a problem.
+    """Return the values that a model of the same outputs assigns to the free parameters of a problem, by name.
 
-    `more` are values that the model has under a coefficient law. A fixed order of the model is used for the free order
-    of the term with the same coefficient.
+    `more` adds values of the factors of a coefficient law. A fixed order of the model gives a value to the free order
+    of the term that has the same coefficient.
 
     Raises
     ------
     ModelError
-        The model has other outputs.
+        If the model has an output that the problem lacks.
     """
     check_known("output of start", model.outputs, problem.structure.outputs)
     values = {**model.orders, **model.coefficients, **more}
@@ -259,7 +262,7 @@ COLLINEARITY_TOLERANCE = 1e-9
 
 
 def describe_collinear_inputs(runs: Sequence[Run], structure: Structure) -> str | None:
-    """Return a message that names two proportional inputs of one equation and order, or None."""
+    """Return a message that names two proportional inputs which enter one equation with the same order, or None."""
     for item in structure.equations:
         linear = [t for t in item.terms if t.nonlinear is None]
         driving = [

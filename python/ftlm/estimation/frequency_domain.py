@@ -72,48 +72,48 @@ def identify_frequency(
     """Identify orders, coefficients and delays from a measured frequency response or impedance.
 
     The equations are written as for runs over time: ``"D^alpha y = a0 y + b0 u"`` has the response b0 / ((jω)^α - a0),
-    and ``"D^alpha U = a U + r D^alpha I + b I"`` is a resistor in series with a depressed arc. Linear least squares on
-    a grid of orders gives the initial guesses. Levenberg-Marquardt with exact derivatives then fits all parameters to
-    the complex response.
+    and ``"D^alpha U = a U + r D^alpha I + b I"`` is the equation of a resistor in series with a depressed arc. Linear
+    least squares on a grid of orders gives the initial guesses. Levenberg-Marquardt with exact derivatives then fits
+    all parameters to the complex response.
 
     Parameters
     ----------
     data
-        One record or several: other outputs and inputs, or other frequency bands.
+        One measured response, or several of different signals or frequency bands.
     structure
         Structure to identify; see :func:`ftlm.equation`. Several outputs are simulated together from the inputs.
         Or the circuit of an impedance, such as ``"R0-p(R1,CPE1)-W1"``; see :class:`ftlm.Circuit`.
     weights
-        ``"deviation"``: residuals divided by the standard deviations of the records. ``"relative"``: divided by the
-        magnitude of the response at each frequency, for noise proportional to it. ``"uniform"``: unweighted. ``"auto"``
-        (default): deviation if all records state one, otherwise relative. An array, for one record: a standard
-        deviation of real and imaginary part for each frequency.
+        Scale by which residuals are divided. ``"deviation"``: the standard deviations of the records. ``"relative"``:
+        the magnitude of the response at each frequency, for noise proportional to it. ``"uniform"``: 1. ``"auto"``
+        (default): ``"deviation"`` if all records state one, otherwise ``"relative"``. For one record, an array gives
+        the standard deviation of the real and of the imaginary part at each frequency.
     orders, fixed, delay
-        See :func:`ftlm.equation`: grids of orders bound them, too; a delay (low, high) is estimated. A circuit has
-        fixed parameters alone.
+        See :func:`ftlm.equation`. A grid of orders also gives their bounds, and a delay (low, high) in seconds is
+        estimated. A circuit takes only `fixed`.
     start
         Additional initial guess by name; missing values are 1, and 0 for a delay.
     bounds
         (lower, upper) of coefficients and orders by name; infinite for an open side. A coefficient that ends on a bound
-        is fixed there and has no interval, and a finding names it.
+        is fixed at the bound, has no confidence interval, and is named by a finding.
     progress
-        Callback with (parts done, total parts).
+        Callback with (parts of the fit done, total parts).
 
     Returns
     -------
     FrequencyIdentification
-        Printable result; ``.model`` simulates over time, plots and saves.
+        Printable result. Its ``.model`` can be simulated over time, plotted and saved.
 
     Raises
     ------
     DataError
-        Invalid data, signals that the equations do not have, too few frequencies for the free parameters, or a response
-        of 0 under relative weights.
+        If the data are invalid, a signal is not one of the equations, there are too few frequencies for the free
+        parameters, or a response is 0 with relative weights.
     ModelError
-        Nothing is free; friction, saturation or dead zone, offset, sensor filter or coefficient law; unknown weights or
-        names.
+        If nothing is free, the structure has a friction term, saturation, dead zone, offset, sensor filter or
+        coefficient law, or a name or weight is unknown.
     ConvergenceError
-        No initial guess has a finite response.
+        If no initial guess has a finite response.
     """
     if isinstance(structure, str) and "=" not in structure:
         structure = Circuit(structure)
@@ -143,7 +143,7 @@ def identify_frequency(
 
 
 def _log_result(result: FrequencyIdentification) -> FrequencyIdentification:
-    """Log the verdict and the findings of a result, and return it."""
+    """Write the verdict and the findings of a result to the log, and return the result."""
     PACKAGE_LOGGER.info("identified: %s", result.verdict)
     for item in result.findings:
         PACKAGE_LOGGER.warning("%s", item)
@@ -188,7 +188,7 @@ def _fit_response(
     *,
     alone: bool,
 ) -> FrequencyIdentification:
-    """Fit a response problem from automatic initial guesses and the given one, or from that `alone`."""
+    """Fit a response problem from automatic initial guesses and the user's; with `alone`, only from the user's."""
     count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
     if count <= numbers:
         raise DataError(
@@ -257,7 +257,13 @@ def _structure(
     fixed: Mapping[str, float] | None,
     delay: Mapping[str, float | tuple[float, float]] | None,
 ) -> Structure:
-    """Return the structure to identify; raise for nonlinear terms, offsets, sensor filters and laws."""
+    """Return the structure to identify, parsed if it is text.
+
+    Raises
+    ------
+    ModelError
+        If it has nonlinear terms, an offset, a sensor filter or a coefficient law.
+    """
     target = equation(structure) if isinstance(structure, str) else structure
     if not isinstance(target, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; give an equation: 'D^alpha y = a0 y + b0 u'")
@@ -286,7 +292,16 @@ def _structure(
 
 
 def _match_records(records: Sequence[FrequencyData], structure: Structure) -> list[FrequencyData]:
-    """Return the records with their signal names; raise if signals or equations have no counterpart."""
+    """Return the records with missing signal names filled in from the structure.
+
+    Raises
+    ------
+    DataError
+        If a record has a signal that the equations lack, its signal is ambiguous, or an equation or input has no
+        record.
+    ModelError
+        If the equations have no input.
+    """
     outputs = structure.outputs
     inputs = tuple(s for s in structure.signals if s not in outputs)
     if not inputs:
@@ -319,7 +334,7 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
 
 
 def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, list[Floats]]:
-    """Return the kind of weights and the factor of each residual."""
+    """Return the kind of weights, and for each record an array of factors by which its residuals are multiplied."""
     if not isinstance(weights, str):
         if len(records) > 1:
             raise ModelError(
@@ -355,7 +370,7 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
 
 
 def _given_deviations(record: FrequencyData, weights: object) -> Floats:
-    """Return standard deviations given by the user in place of those of a record."""
+    """Return the user's standard deviations as an array with one value per frequency; raise DataError if invalid."""
     deviations = as_floats("weights", weights)
     if deviations.shape != record.frequency.shape:
         raise DataError(
@@ -365,7 +380,7 @@ def _given_deviations(record: FrequencyData, weights: object) -> Floats:
 
 
 def _subsample_data(record: FrequencyData, weight: Floats) -> tuple[FrequencyData, Floats]:
-    """Return a record and its weights, subsampled evenly to the number of frequencies of the multistart."""
+    """Return a record and its weights at a limited number of frequencies, spread evenly over the sorted ones."""
     if record.frequency.size <= MAX_MULTISTART_FREQUENCIES:
         return record, weight
     order = np.argsort(record.frequency, kind="stable")
@@ -376,7 +391,13 @@ def _subsample_data(record: FrequencyData, weight: Floats) -> tuple[FrequencyDat
 
 
 def _user_start(problem: ResponseProblem, start: Mapping[str, float] | None) -> list[Floats]:
-    """Return the initial guess of the user, if any."""
+    """Return a list of the user's initial guess, completed by defaults; empty if there is none.
+
+    Raises
+    ------
+    ModelError
+        If a name is unknown, or a value is not finite or out of its bounds.
+    """
     if start is None:
         return []
     if not isinstance(start, Mapping):
@@ -394,7 +415,7 @@ def _user_start(problem: ResponseProblem, start: Mapping[str, float] | None) -> 
 
 @dataclass(frozen=True)
 class ResponseFit:
-    """Optimum of a response problem: parameters, sum of squares, convergence, active constraints."""
+    """Optimum of a response problem: parameters, sum of squares, convergence and active constraints."""
 
     values: Floats
     cost: float
@@ -418,19 +439,19 @@ def _fit(problem: ResponseProblem, values: Floats) -> ResponseFit:
 
 
 def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFit) -> ResponseFit:
-    """Fit a problem from the optimum of another problem with the same parameters."""
+    """Fit a problem, starting from the optimum of another problem that has the same parameters."""
     return _fit(problem, problem.in_problem_units(other.in_seconds(end.values)))
 
 
 def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) -> float:
-    """Return by how much the log likelihood falls from one sum of squares to a larger one."""
+    """Return the decrease of the log likelihood when the sum of squares rises from `best` to `cost`."""
     if kind == "deviation":
         return (cost - best) / 2.0
     return 0.5 * count * math.log(max(cost, 1e-300) / max(best, 1e-300))
 
 
 def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
-    """Return distinct optima of the multistart that are nearly as likely as the best."""
+    """Return other optima of the multistart that are nearly as likely as the best one and have other responses."""
     ranked = sorted(fits, key=lambda f: f.cost)
     optima, series = [], [problem.residuals(ranked[0].values, jacobian=False)[0]]
     for fit in ranked[1:]:
@@ -448,7 +469,7 @@ def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: st
 def _is_bound_significant(
     problem: ResponseProblem, records: Sequence[FrequencyData], best: ResponseFit, kind: str
 ) -> bool:
-    """Whether exponents above their bound explain an impedance better than chance does, at 99 %."""
+    """Whether exponents above their upper bound would fit an impedance significantly better, at 99 %."""
     free = ResponseProblem(problem.structure, records, [r.weight for r in problem.records], bound_exponents=False)
     unbounded = _fit(free, best.values)
     count = 2 * sum(r.frequency.size for r in problem.records)
@@ -531,7 +552,10 @@ def _result(
 
 
 def _information(problem: ResponseProblem, cost: float, kind: str) -> InformationCriteria:
-    """Return information criteria of normal residuals, whose level is a parameter unless deviations are stated."""
+    """Return AIC, AICc and BIC for normal residuals.
+
+    The noise level counts as a parameter unless standard deviations are given.
+    """
     sizes = [math.log(w) for record in problem.records for w in record.weight.tolist()]
     count = 2 * len(sizes)
     if kind == "deviation":
@@ -543,7 +567,10 @@ def _information(problem: ResponseProblem, cost: float, kind: str) -> Informatio
 
 
 def _frequency_order(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
-    """Return indices that sort the residuals of each record by frequency."""
+    """Return indices that sort the residual vector of a response problem by frequency within each record.
+
+    The vector has all real parts, then all imaginary parts.
+    """
     places, at = [], 0
     for record in records:
         places.append(at + np.argsort(record.frequency, kind="stable"))
@@ -553,7 +580,7 @@ def _frequency_order(records: Sequence[FrequencyData]) -> NDArray[np.intp]:
 
 
 def _series(records: Sequence[FrequencyData], residuals: Floats) -> list[Floats]:
-    """Return real and imaginary parts of the residuals of every record, in the order of `residuals`."""
+    """Split a residual vector into the real part of each record, then the imaginary part of each record."""
     ends = np.cumsum([r.frequency.size for r in records])
     half = residuals.size // 2
     return [*np.split(residuals[:half], ends[:-1]), *np.split(residuals[half:], ends[:-1])]
@@ -582,7 +609,7 @@ def _model(
     standard: Mapping[str, float],
     findings: Sequence[Finding],
 ) -> Model:
-    """Return the model with its estimate, as stored in its file."""
+    """Return the identified model with its estimate (covariance, standard errors, findings), as its file stores it."""
     orders = {n: round(values_by_name[n], 9) for n in problem.orders}
     late = {free.signal: values_by_name[free.name] for free in problem.structure.free_inputs}
     structure = problem.structure.with_delays(late).with_orders(orders)
@@ -618,7 +645,7 @@ def _model(
 
 
 def _student(degrees: int) -> float:
-    """Return the 97.5 % quantile of Student's t by a series, accurate to 1 % from 4 degrees of freedom."""
+    """Return the 97.5 % quantile of Student's t distribution by a series, within 1 % from 4 degrees of freedom on."""
     z, n = NormalDist().inv_cdf(0.975), float(degrees)
     terms = [(z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384]
     return z + sum(t / n ** (k + 1) for k, t in enumerate(terms))

@@ -1,4 +1,4 @@
-"""Charts of measured and modeled frequency responses: Bode, Nyquist and relative residuals."""
+"""Result of a frequency-domain fit, its validation, and charts of measured and modeled responses."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ CURVE_POINTS = 160
 
 
 def curve_frequencies(record: FrequencyData) -> Floats:
-    """Return the frequencies of a smooth curve with those of a record among them.
+    """Return frequencies [rad/s] for a smooth curve, which include those of a record.
 
-    One frequency lies between each two measured ones, so that every measured point is drawn as a separate dot.
+    At least one frequency lies between neighboring measured ones, so that each measured point is drawn as a dot.
     """
     frequencies = np.unique(record.frequency)
     between = np.sqrt(frequencies[1:] * frequencies[:-1])
@@ -54,12 +54,12 @@ def curve_frequencies(record: FrequencyData) -> Floats:
 
 
 def _place_of(model: Model, record: FrequencyData) -> tuple[int, int]:
-    """Return the places of a record's output and input among those of the model."""
+    """Return the indices of a record's output and input in the frequency response of the model."""
     return model.outputs.index(record.output), response_inputs(model, coupled=True).index(record.input)
 
 
 def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats) -> Complex:
-    """Return the response of the model between the signals of a record."""
+    """Return the complex response of a model at `omega` [rad/s], from the input to the output of a record."""
     if isinstance(model, Circuit):
         return model.impedance(omega)
     response: Complex = frequency_response(model, omega)[_place_of(model, record)]
@@ -69,7 +69,10 @@ def model_response(model: Model | Circuit, record: FrequencyData, omega: Floats)
 def model_curve(
     model: Model | Circuit, record: FrequencyData, omega: Floats
 ) -> tuple[Complex, Floats | None, Floats | None]:
-    """Return the model response, and half-widths of the 95 % bands of its gain [dB] and phase [degrees]."""
+    """Return a model's complex response and the half-widths of its 95 % bands of gain [dB] and phase [degrees].
+
+    The half-widths are None for a circuit, and if the model has no covariance.
+    """
     response = model_response(model, record, omega)
     if isinstance(model, Circuit) or covariance_of(model) is None:
         return response, None, None
@@ -80,7 +83,7 @@ def model_curve(
 def frequency_chart(
     title: str, label: str, omega: Floats, lines: Sequence[tuple[str, Floats]], half_width: Floats | None
 ) -> LineChart:
-    """Return a chart over frequency: a model's curve with its 95 % band, and any measured points."""
+    """Return a chart of named lines over frequency, the first one with a band of the given half-width."""
     values = lines[0][1]
     return LineChart(
         omega,
@@ -98,7 +101,10 @@ def frequency_chart(
 
 
 def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineChart, LineChart]:
-    """Return gain and phase of a record and the model with its 95 % band; of an impedance the magnitude over Hz."""
+    """Return the gain chart and the phase chart of a record and the model with its 95 % band.
+
+    An impedance is drawn as magnitude over frequency in Hz.
+    """
     omega = curve_frequencies(record)
     response, wide, turned = model_curve(model, record, omega)
     phase = np.degrees(np.unwrap(np.angle(response)))
@@ -135,7 +141,7 @@ def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineCh
 
 
 def nyquist_chart(model: Model | Circuit, record: FrequencyData) -> PlaneChart:
-    """Return the Nyquist chart of a record and the model; impedances have -Im upwards."""
+    """Return the Nyquist chart of a record and the model; the vertical axis of an impedance is -Im Z."""
     response, measured = model_response(model, record, curve_frequencies(record)), record.response
     unit = f" [{record.unit}]" if record.unit else ""
     impedance = is_impedance(record)
@@ -149,13 +155,13 @@ def nyquist_chart(model: Model | Circuit, record: FrequencyData) -> PlaneChart:
 
 
 def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figure]:
-    """Return Nyquist and Bode charts of a record and the model, the Nyquist chart of an impedance first."""
+    """Return the Nyquist and Bode charts of a record and the model; for an impedance the Nyquist chart comes first."""
     bode, nyquist = record_charts(model, record), nyquist_chart(model, record)
     return [nyquist, *bode] if is_impedance(record) else [*bode, nyquist]
 
 
 def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> LineChart:
-    """Return the chart of the residuals relative to the measured response, by frequency."""
+    """Return the chart of residuals over frequency, in percent of the magnitude of the measured response."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
     response = model_response(model, record, omega)
@@ -182,7 +188,7 @@ VALIDATION_ERROR_RATIO, MIN_VALIDATION_ERROR = 3.0, 0.02
 
 @dataclass(frozen=True)
 class ResponseError:
-    """Error of a model on one measured response.
+    """Relative error of a model on one measured frequency response.
 
     Parameters
     ----------
@@ -206,7 +212,7 @@ class ResponseError:
 
 @dataclass(frozen=True)
 class FrequencyValidation:
-    """Validation of a model on responses that it was not fitted to.
+    """Validation of a model on frequency responses that it was not fitted to.
 
     Parameters
     ----------
@@ -215,7 +221,7 @@ class FrequencyValidation:
     errors
         Error on each response.
     verdict
-        Verdict that includes this validation.
+        Verdict on the model that takes this validation into account.
     """
 
     data: tuple[FrequencyData, ...]
@@ -245,20 +251,21 @@ class FrequencyIdentification:
     values, standard_errors, intervals
         Orders, coefficients and delays by name, their standard errors and 95 % intervals; infinite if not identifiable.
     names, covariance
-        Covariance matrix and the names of its rows.
+        Covariance matrix, and the names of its rows and columns.
     chi_squared
-        Mean square of the residuals in stated standard deviations, 1 for a correct model; None if none are stated.
+        Mean square of the residuals divided by the stated standard deviations; about 1 for a correct model. None if no
+        standard deviations are stated.
     converged
         Whether the fit converged.
     start_counts
-        Number of initial guesses that reached this optimum, and total number.
+        Number of initial guesses from which this optimum was reached, and total number.
     white
-        Whether the residuals are white over frequency (99 %).
+        Whether a whiteness test over frequency passes at 99 %.
     findings
         Findings about the model.
     information
-        AIC, AICc and BIC, which compare circuits or equations that were fitted to the same records with the same
-        weights; None if unknown. Real and imaginary parts are samples.
+        AIC, AICc and BIC. They compare circuits or equations fitted to the same records with the same weights. Real and
+        imaginary parts count as separate samples. None if unknown.
     """
 
     system: Model | Circuit
@@ -278,17 +285,17 @@ class FrequencyIdentification:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
+        """Findings as sentences."""
         return texts(self.findings)
 
     @property
     def circuit(self) -> Circuit:
-        """Circuit with its identified values.
+        """Circuit that was identified, with the estimated element values.
 
         Raises
         ------
         ModelError
-            Equations were identified.
+            If equations were identified.
         """
         if isinstance(self.system, Model):
             raise ModelError("equations were identified, no circuit; use .model")
@@ -296,12 +303,12 @@ class FrequencyIdentification:
 
     @cached_property
     def model(self) -> Model:
-        """Model that was identified; of a circuit its exact equation.
+        """Model that was identified; for a circuit the fractional equation with the same impedance.
 
         Raises
         ------
         ModelError
-            A circuit that is not an equation with powers of s.
+            If the impedance of the circuit is not a ratio of powers of s.
         """
         if isinstance(self.system, Model):
             return self.system
@@ -338,7 +345,7 @@ class FrequencyIdentification:
         Raises
         ------
         DataError
-            A record has other signals.
+            If a record has signals that the model lacks.
         """
         others = tuple(assign_signals(self.system, record) for record in as_frequency_data(data))
         errors = tuple(error_of(self.system, record) for record in others)
@@ -346,7 +353,7 @@ class FrequencyIdentification:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Orders, coefficients and delays by name, with standard errors, intervals and units."""
+        """Orders, coefficients and delays by name, each with its standard error, 95 % interval and unit."""
         coefficients = self.system.values if isinstance(self.system, Circuit) else self.system.coefficients
         values = {**self.values, **coefficients}
         return parameter_estimates(
@@ -355,7 +362,7 @@ class FrequencyIdentification:
 
     @property
     def fit(self) -> dict[str, float]:
-        """Fit in percent, by output: 100 minus the root mean square error relative to the measured responses."""
+        """Fit in percent by output: 100 minus the root mean square error in percent of the measured response."""
         squares: dict[str, list[float]] = {}
         for error in self.errors:
             squares.setdefault(error.output, []).append(error.rms**2)
@@ -365,19 +372,19 @@ class FrequencyIdentification:
     fit_percent = fit
 
     def to_frame(self) -> Any:
-        """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""
+        """Return a pandas DataFrame of the parameters: value, standard error, 95 % interval, unit, nominal value."""
         return parameter_frame(
             self.parameters.values(), self.system.structure.reference if isinstance(self.system, Model) else {}
         )
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on the model without a validation; :meth:`validate` returns the one with it.
+        """Verdict on the model without validation data; :meth:`validate` returns a verdict with them.
 
-        "do not use": parameters that are not identifiable, an error of half of a response or more, or an unstable
-        model. "with care": residuals that are not white or exceed the stated standard deviations, uncertain parameters,
-        a fit that did not converge or ended on a bound, a validation error above 2 % and three times the estimation
-        error, or no validation.
+        It is "do not use" if a parameter is not identifiable, the error is half of a response or more, or the model is
+        unstable. It is "with care" if residuals are not white or exceed the stated standard deviations, a parameter is
+        uncertain, the fit did not converge or ended on a bound, or there is no validation. A validation error above 2 %
+        and three times the estimation error also gives "with care".
         """
         return self._assess(None)
 
@@ -419,7 +426,7 @@ class FrequencyIdentification:
 
     @check_arguments
     def summary(self, validation: FrequencyValidation | None = None) -> str:
-        """Return the summary: verdict, equations, parameters, modes, errors and warnings."""
+        """Return the summary as text: verdict, equations, parameters, modes, errors and warnings."""
         from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 
         judgement = self.verdict if validation is None else validation.verdict
@@ -463,7 +470,7 @@ class FrequencyIdentification:
         return [*lines, "  (± is one standard error, in brackets the 95 % interval)"]
 
     def figures(self) -> list[Figure]:
-        """Return Bode and Nyquist charts with the measured points, and residual charts."""
+        """Return Bode and Nyquist charts of model and measured points for each record, and residual charts."""
         model = self.system
         return [f for r in self.data for f in (*response_figures(model, r), relative_residual_figure(model, r))]
 
@@ -471,7 +478,7 @@ class FrequencyIdentification:
     def report(
         self, path: str | os.PathLike[str], *, validation: FrequencyValidation | None = None, force: bool = False
     ) -> Path:
-        """Write an HTML page that opens offline: verdict, equations, parameters, Bode and Nyquist charts.
+        """Write an HTML page with verdict, equations, parameters, Bode and Nyquist charts; it opens offline.
 
         Parameters
         ----------
@@ -485,7 +492,7 @@ class FrequencyIdentification:
         Raises
         ------
         DataError
-            The file exists and ``force`` is not set, or cannot be written.
+            If the file exists and ``force`` is False, or it cannot be written.
         """
         from ftlm.report.html_report import behavior_figures, behavior_tables, first_findings, title_of, verdict_box
 
@@ -572,7 +579,10 @@ class FrequencyIdentification:
 
 
 def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyData:
-    """Return a record with the output and input names of the model it is compared with."""
+    """Return a record with the output and input names of a model; raise DataError if the model lacks one of them.
+
+    A name that the record lacks is filled in if the model has only one such signal.
+    """
     if isinstance(model, Circuit):
         return replace(record, output=record.output or "U", input=record.input or "I", unit=record.unit or "Ω")
     inputs = response_inputs(model, coupled=True)
@@ -589,7 +599,7 @@ def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyDa
 
 
 def error_of(model: Model | Circuit, record: FrequencyData) -> ResponseError:
-    """Return the error of a model on one record."""
+    """Return the relative error of a model on one measured frequency response."""
     size = np.abs(record.response)
     missed = np.abs(model_response(model, record, record.frequency) - record.response) / np.where(
         size > 0, size, np.max(size) or 1.0

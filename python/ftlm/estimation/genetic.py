@@ -1,4 +1,4 @@
-"""Genetic algorithm (PyGAD) and differential evolution (SciPy) as baselines."""
+"""Genetic algorithm (PyGAD) and differential evolution (SciPy) as baselines for comparison."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ MAX_DEFAULT_EVALUATIONS = 1_000_000
 
 @dataclass(frozen=True)
 class GeneticRun:
-    """Result of the genetic algorithm: the best candidate, and error and evaluations of each seed.
+    """Result of the genetic algorithm: the best candidate, and the error and number of evaluations of each seed.
 
-    Errors are criterion (45), or RMSE (46) for the norm ``"l2"``. Under an order law they are the sum over outputs,
-    each divided by the standard deviation of the output.
+    The error is the sum of absolute simulation errors (45) of the paper, or the RMSE (46) for the norm ``"l2"``. Under an
+    order law it is summed over outputs, each divided by the standard deviation of the output.
     """
 
     orders: dict[str, float]
@@ -74,9 +74,9 @@ class GeneticRun:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Linear map from genes to the candidates of one equation: genes @ weights + constants.
+    """Linear map from genes to candidates of one equation: ``genes @ weights + constants``.
 
-    Columns are alpha, orders and coefficients.
+    A candidate is a row with alpha, the orders and the coefficients of the equation.
     """
 
     points: _core.Points
@@ -86,7 +86,7 @@ class _Rows:
     scale: float
 
     def candidates(self, genes: Floats, *, repaired: bool) -> Floats:
-        """Return the rows for the core; `repaired` limits each order to the largest that alpha allows."""
+        """Return the candidates for the core; with `repaired`, orders are limited to the largest that alpha allows."""
         rows = genes @ self.weights + self.constants
         if repaired:
             highest = rows[:, :1] - np.where(self.own, ORDER_RESOLUTION, 0.0)
@@ -96,14 +96,14 @@ class _Rows:
 
 
 class GeneticProblem:
-    """Genetic coding of a structure and the evaluation of candidates.
+    """Genes of a structure, one per free order and coefficient, and the evaluation of candidates.
 
     Parameters
     ----------
     records, structure, settings
         See :func:`genetic_search`.
     threads
-        Number of threads that simulate.
+        Number of threads that simulate candidates.
     """
 
     def __init__(
@@ -158,21 +158,21 @@ class GeneticProblem:
         return _Rows(points, weights, constants, own, scale)
 
     def _candidates(self, structure: Structure, records: list[Record], values: Mapping[str, tuple[float, ...]]) -> int:
-        """Return the size of the order grid; under an order law an upper bound of it."""
+        """Return the number of candidates of the order grid; under an order law an upper bound of this number."""
         if self.law:
             return math.prod(len(v) for v in values.values())
         orders = order_grid_tuple(structure.equations[0], records[0].signals, values)
         return _core.order_grid_size(orders, list(records[0].inputs))
 
     def round_orders(self, genes: Floats) -> Floats:
-        """Round the orders to the order resolution."""
+        """Return genes whose orders are rounded to the resolution with which candidates are evaluated."""
         tidied = np.array(genes, dtype=np.float64)
         n = len(self.order_names)
         tidied[:, :n] = np.round(tidied[:, :n] / ORDER_RESOLUTION) * ORDER_RESOLUTION
         return tidied
 
     def errors(self, genes: Floats, limit: float) -> Floats:
-        """Return the error of each row of genes, or infinity above the limit."""
+        """Return the error of each row of genes; infinite if it exceeds the limit."""
         tidied, total = self.round_orders(genes), np.zeros(genes.shape[0])
         for part in self.rows:
             rows = np.ascontiguousarray(part.candidates(tidied, repaired=not self.law))
@@ -180,7 +180,7 @@ class GeneticProblem:
         return np.where(total <= limit, total, np.inf)
 
     def values_by_name(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
-        """Return orders and coefficients by name."""
+        """Return orders and coefficients of one row of genes, by name."""
         tidied = self.round_orders(genes[None, :])
         n = len(self.order_names)
         values = dict(zip(self.names, tidied[0].tolist(), strict=True))
@@ -216,12 +216,12 @@ def default_bounds(
 
 
 def load_pygad() -> Any:
-    """Import PyGAD, which runs the genetic algorithm."""
+    """Return the PyGAD module; raise ModelError if it is not installed."""
     return optional_module("pygad", "PyGAD", "'ftlm[genetic]'")
 
 
 def load_differential_evolution() -> Any:
-    """Import SciPy's differential evolution."""
+    """Return SciPy's `differential_evolution`; raise ModelError if SciPy is not installed."""
     return optional_module("scipy.optimize", "SciPy", "'ftlm[genetic]'").differential_evolution
 
 
@@ -235,14 +235,15 @@ def genetic_search(
 ) -> GeneticRun:
     """Minimize the simulation error over orders and coefficients of one equation or under an order law.
 
-    The order grid bounds the orders. Its size is the default number of evaluations. Progress counts evaluations over
-    all seeds. The result does not depend on the number of threads.
+    The order grid of the settings bounds the orders, and its size is the default number of evaluations. `progress` is
+    called with (evaluations done, total evaluations) over all seeds. The result does not depend on the number of
+    threads.
 
     Raises
     ------
     ModelError
-        PyGAD is not installed, a record does not start at rest, a bound names no free parameter, or the order grid is
-        so large that `evaluations` must be given.
+        If PyGAD is not installed, a record does not start at rest, a bound names no free parameter, or the order grid
+        is so large that `evaluations` must be given.
     """
     pygad = load_pygad()
     if records[0].offset != "none":
@@ -284,7 +285,7 @@ def genetic_search(
 
 
 def _seconds(problem: GeneticProblem, population: int, evaluations: int) -> tuple[float, float]:
-    """Return the shortest and longest expected time [s], extrapolated from the first generation."""
+    """Return the shortest and the longest expected run time [s], extrapolated from the first generation."""
     low, high = np.array([problem.bounds[n] for n in problem.names]).T
     genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
     start_time = time.perf_counter()
@@ -301,11 +302,11 @@ def _evolve(
     evaluations: int,
     listener: Callable[[int], None],
 ) -> _ParentThreshold:
-    """Run the genetic algorithm from one seed until its evaluations are spent.
+    """Run the genetic algorithm from one seed until its evaluations are used up.
 
-    Real-coded genes, simulated binary crossover, polynomial mutation and truncation selection; survivors are the
-    parents of the next generation. A candidate is abandoned once its partial error excludes it from the parents, which
-    changes no generation.
+    Genes are real numbers. The operators are simulated binary crossover, polynomial mutation and truncation selection.
+    The simulation of a candidate stops once its partial error excludes it from the parents, which does not change the
+    result.
     """
     parents = max(2, round(PARENT_FRACTION * population))
     threshold = _ParentThreshold(parents)
@@ -362,7 +363,7 @@ def simulated_binary_crossover(parents: Floats, size: tuple[int, int], random: A
 
 
 def polynomial_mutation(children: Floats, low: Floats, high: Floats, random: Any) -> Floats:
-    """Return children after polynomial mutation, about one gene each (Deb and Goyal 1996)."""
+    """Return children after polynomial mutation of one gene per child on average (Deb and Goyal 1996)."""
     u = random.random_sample(children.shape)
     power = 1.0 / (MUTATION_DISTRIBUTION_INDEX + 1.0)
     move = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
@@ -371,7 +372,10 @@ def polynomial_mutation(children: Floats, low: Floats, high: Floats, random: Any
 
 
 class _ParentThreshold:
-    """Error threshold of the parents: the smallest errors so far, as many as there are parents."""
+    """Largest error with which a candidate can become a parent of the next generation.
+
+    The smallest errors so far are stored, as many as there are parents.
+    """
 
     def __init__(self, parents: int) -> None:
         self._errors = np.full(parents, np.inf)
@@ -409,13 +413,13 @@ def differential_evolution_search(
 ) -> GeneticRun:
     """Minimize the simulation error by differential evolution, with the options of the genetic baseline.
 
-    Seeds, evaluations and bounds come from `settings`. Everything else is the default of SciPy: best1bin, 15 candidates
-    for each gene, no final local search. The number of generations is the largest that the evaluations allow.
+    Seeds, evaluations and bounds come from `settings`. Other options are defaults of SciPy (best1bin, 15 candidates per
+    gene), without the final local search. The number of generations is the largest that the evaluations allow.
 
     Raises
     ------
     ModelError
-        SciPy is not installed, a record does not start at rest, or no candidate has a finite error.
+        If SciPy is not installed, a record does not start at rest, or no candidate has a finite error.
     """
     differential_evolution = load_differential_evolution()
     if records[0].start != (False, []) or records[0].offset != "none":
@@ -465,14 +469,14 @@ def differential_evolution_search(
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class GeneticAlgorithm:
-    """Genetic algorithm on the simulation, the paper's baseline; for comparison only.
+    """Genetic algorithm that minimizes the simulation error: the baseline of the paper, for comparison only.
 
-    Orders and coefficients are searched together. It needs PyGAD (``pip install 'ftlm[genetic]'``).
+    Orders and coefficients are searched together. The method requires PyGAD (``pip install 'ftlm[genetic]'``).
 
     Parameters
     ----------
     order_grid
-        Bounds of the orders, and the number of candidates that `evaluations` refers to; see :func:`ftlm.order_grid`.
+        Grid whose limits bound the orders and whose size is the default of `evaluations`; see :func:`ftlm.order_grid`.
     norm
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     seeds
@@ -482,15 +486,15 @@ class GeneticAlgorithm:
     population
         Candidates of one generation, at least 8.
     bounds
-        (low, high) of coefficients by name. By default ±2 times the value that the manufacturer states. Without one, ±4
-        times the coefficient with which its term alone would be as large as the output, at the middle of the intervals
-        of the orders.
+        (low, high) of coefficients by name. By default ±2 times the nominal value in the structure. Without a nominal
+        value, ±4 times the coefficient at which the term alone would be as large as the output, at the midpoints of the
+        order intervals.
 
     Raises
     ------
     ModelError
-        No seeds or too many, a population outside [8, 100000], evaluations of less than two generations, bounds that
-        are not an interval, an invalid order grid or norm.
+        If there are no seeds or too many, `population` is outside [8, 100000], `evaluations` are fewer than two
+        generations, a bound is not an interval, or the order grid or norm is invalid.
     """
 
     name: ClassVar[str] = "genetic"

@@ -1,4 +1,4 @@
-"""Identification: fit with a decision about offsets, checks of the fit, many identifications."""
+"""Identification: fit of a structure with a decision about offsets, checks of the fit, and batches of runs."""
 
 from __future__ import annotations
 
@@ -105,9 +105,12 @@ MAX_OFFSET_TEST_SAMPLES = 400_000
 def fit_with_offset_decision(
     runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit], hypotheses: Hypotheses
 ) -> Fit:
-    """Fit a structure; under ``offset="auto"`` with a constant if the offset test is significant.
+    """Return the fit of a structure; ``offset="auto"`` adds a constant per equation if it is significant.
 
-    The constant is fitted first, because a fit that lacks a needed constant may end anywhere.
+    `estimate` fits a structure without further decisions.
+
+    The structure with the constant is fitted first, because a fit that lacks a necessary constant may end at any wrong
+    optimum.
     """
     if structure.offset != "auto":
         fit = _fit_with_level_decision(structure, hypotheses)
@@ -135,25 +138,29 @@ def fit_with_offset_decision(
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Fits under several initial conditions, of which one is chosen.
+    """Functions that fit a structure under several initial conditions, of which one is chosen.
 
     Parameters
     ----------
     fit
-        Fits a structure.
+        Function that fits a structure.
     complete
-        Returns the fit of a structure with all its intervals from its joint fit; None if :attr:`fit` has them.
+        Function that adds all confidence intervals to a joint fit of a structure; None if :attr:`fit` already gives
+        them.
     """
 
     fit: Callable[[Structure], Fit]
     complete: Callable[[Structure, JointFit | None], Fit] | None = None
 
     def take(self, structure: Structure, fit: Fit) -> Fit:
-        """Return the complete fit of a structure."""
+        """Return the fit of the chosen hypothesis with all its confidence intervals."""
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
-        """Return the fit of a structure from an optimum under other initial conditions; None if it is not accepted."""
+        """Return a fit of a structure with other initial conditions, started from an existing optimum.
+
+        The result is None if `accepts` rejects the fit.
+        """
         joint, runs = fit.joint, fit.task.runs
         if joint is None or self.complete is None:
             refit = self.fit(structure)
@@ -167,7 +174,7 @@ class Hypotheses:
 
 
 def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
-    """Fit a structure, with a level of the outputs if the runs prefer one, and with findings on offsets."""
+    """Return the fit of a structure, with a constant level added to each output if the runs prefer one."""
     fit = hypotheses.fit(structure)
     restart = _fit_in_motion(fit, structure, hypotheses)
     if restart is not None:
@@ -191,10 +198,11 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
 
 
 def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
-    """Return the fit with initial values of runs whose first rows look like rest, if the runs clearly refute it.
+    """Return a fit with unknown initial values if the runs clearly refute rest despite quiet first samples.
 
-    A few quiet rows do not distinguish slow motion from rest. White residuals do not refute rest. Oscillating
-    residuals refute it only if the fit with initial values has white residuals.
+    A few quiet samples do not distinguish slow motion from rest. If the residuals of the fit from rest are white, rest
+    is kept. If they oscillate, the fit with initial values is chosen only if its residuals are white. None if rest is
+    kept.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.offset == "none" and structure.is_linear
@@ -231,10 +239,11 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
 
 
 def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, has_level: bool) -> Fit | None:
-    """Return the best fit with a level of the outputs, from rest or in motion, if the runs prefer it; else None.
+    """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
 
-    Two fits are compared with the noise color of the fit with the larger residuals. If the means of the outputs show a
-    level, the optimum moves far and the fit is new; otherwise it starts from the optimum without a level.
+    The likelihoods of two fits are compared under the noise color of the fit with the larger residuals. If the output
+    means suggest a level, the optimum moves far and automatic initial guesses are used. Otherwise the fit starts from
+    the optimum without a level.
     """
     if fit.joint is None:
         return None
@@ -268,9 +277,10 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
 
 
 def _suggests_level(fit: Fit) -> bool:
-    """Whether nonzero initial conditions may stand in for a level of the output, so that one is fitted from new starts.
+    """Whether a level of an output is so likely that it is fitted from automatic initial guesses.
 
-    The mean or the residuals of an output are large against its deviation: the optimum with a level may be far away.
+    This holds if initial conditions were estimated, and the mean or the residuals of an output are large relative to
+    its standard deviation. The optimum with a level may then be far away.
     """
     joint = fit.joint
     if joint is None or not _has_estimated_initial_conditions(fit):
@@ -285,7 +295,7 @@ def _suggests_level(fit: Fit) -> bool:
 
 
 def _may_hide_level(fit: Fit) -> bool:
-    """Whether colored residuals of a fit that is not from rest may make the offset test miss a level."""
+    """Whether estimated initial conditions and colored residuals may keep the offset test from detecting a level."""
     joint = fit.joint
     if joint is None or not _has_estimated_initial_conditions(fit):
         return False
@@ -295,12 +305,12 @@ def _may_hide_level(fit: Fit) -> bool:
 
 
 def _has_estimated_initial_conditions(fit: Fit) -> bool:
-    """Whether `identify`, free to choose the initial conditions, chose nonzero ones."""
+    """Whether nonzero initial conditions were chosen automatically (``initial="auto"``)."""
     return fit.joint is not None and fit.joint.initial != "rest" and fit.task.structure.initial == "auto"
 
 
 def _history_offset_findings(fit: Fit) -> list[Finding]:
-    """Return a finding if a constant explains the data as well as a history of initial terms.
+    """Return a finding if a constant in the equations explains the data as well as the initial terms do.
 
     A constant is part of the model, whereas initial terms hold for one run only.
     """
@@ -316,7 +326,7 @@ def _history_offset_findings(fit: Fit) -> list[Finding]:
 
 
 def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
-    """Return an input with a free coefficient that is constant on every run, or None."""
+    """Return the name of an input with a free coefficient that is constant in every run, or None."""
     for item in structure.equations:
         for term in item.terms:
             plain = term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
@@ -326,7 +336,7 @@ def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
 
 
 def fit_offset_test(fit: Fit) -> OffsetTest | None:
-    """Return the offset test at a fit, with or without an offset; None if not available."""
+    """Return the offset test at the parameters of a fit; None if the fit does not allow the test."""
     structure = replace(fit.task.structure, offset="none")
     if fit.joint is not None:
         values = fit.joint.values_by_name
@@ -361,57 +371,61 @@ def identify(
 ) -> Identification:
     """Identify a structure from measured runs.
 
-    Output error estimates continuous orders and coefficients together, with confidence intervals and automatic
-    initialization. The equation-error methods search free orders on the order grid: each equation by itself, or all
-    together under an order law. They then estimate the coefficients at these orders.
+    The output-error method estimates continuous orders and coefficients together, with confidence intervals and
+    automatic initialization. The equation-error methods search free orders on an order grid, for each equation
+    separately or for all together under an order law. They then estimate the coefficients at the best orders.
 
     Parameters
     ----------
     runs
-        One run or several with the same names and units, in one fit; each keeps its own initial terms.
+        One run, or several runs with the same names and units. All are fitted together, and each has its own initial
+        terms.
     structure
-        What to identify; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
+        Structure to identify; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
     method
         Method of estimation with its options: :class:`ftlm.OutputError`, :class:`ftlm.InstrumentalVariables`,
-        :class:`ftlm.MultiInnovation`, :class:`ftlm.LeastSquares` or :class:`ftlm.GeneticAlgorithm`. A name stands for
-        the defaults: ``"output-error"``, ``"instrumental-variables"``, ``"multi-innovation"``, ``"least-squares"`` or
-        ``"genetic"``.
+        :class:`ftlm.MultiInnovation`, :class:`ftlm.LeastSquares` or :class:`ftlm.GeneticAlgorithm`. A name selects the
+        method with default options: ``"output-error"``, ``"instrumental-variables"``, ``"multi-innovation"``,
+        ``"least-squares"`` or ``"genetic"``.
     initial
-        Start of every run: ``"auto"``, ``"rest"``, ``"caputo"``, ``"history"`` or exponents of t, as in
-        :func:`ftlm.equation`. Default that of the structure. With ``"auto"``, runs of an unstable plant under control,
-        which no simulation of a whole run follows, are split into pieces with their own initial values.
+        Initial conditions of every run: ``"auto"``, ``"rest"``, ``"caputo"``, ``"history"`` or exponents of t, as in
+        :func:`ftlm.equation`; by default those of the structure. With ``"auto"``, runs of an unstable plant under
+        control may be split into pieces with their own initial values, because a simulation of a whole run diverges.
     offset
-        ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
-        friction that the model lacks; ``"level"``: a constant that is added to each output; ``"ramp"``: a constant and
-        a linear drift. Each run has its own, in ``.comparison.offsets``, also in validation. It is not separately
-        identifiable from a history of nonzero initial conditions. A run that rests at its own level before an input
-        changes has a level by default. ``"auto"``: a constant if it is significant at 99 %, with the statistic in
-        ``.settings["offset_test"]``; it fits once with the constant and, if it is not significant, once without.
-        Default that of the structure. A finding reports a missing constant that would explain much.
+        ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor bias, a load or
+        unmodeled friction. ``"level"``: an unknown constant that is added to each output. ``"ramp"``: such a constant
+        and a linear drift. ``"auto"``: a constant in the equations if it is significant at 99 %, with the statistic in
+        ``.settings["offset_test"]``; the structure is fitted with the constant and, if it is not significant, again
+        without. Default: that of the structure. Each run has its own values, which are in ``.comparison.offsets``. An
+        offset cannot be distinguished from initial terms for a nonzero past (``"history"``). A run that rests at a
+        level before an input changes gets ``"level"`` by default. A finding reports a missing constant with a large
+        effect.
     bounds
-        (lower, upper) of parameters by name, in place of those of the method, such as ``{"a": (0, 10)}``.
+        (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
     m
-        Block pulses per run; default 2 048, or what the runs carry (a power of two for Haar rows). Without `m`,
-        instrumental variables search on these and estimate on all samples (at most 16 384 pulses).
+        Number of block pulses per run; by default 2048, or fewer for shorter runs (a power of two for Haar rows).
+        Without `m`, instrumental variables use the default for the order search and all samples, at most 16384, for the
+        estimation.
     threads, progress
-        Threads, by default all cores; and a function that is called with (work done, total work).
+        Number of threads, by default all cores; and a callback with (work done, total work).
 
     Returns
     -------
     Identification
-        Prints its summary; ``.model`` simulates, compares and saves, ``.validate`` and ``.report`` follow.
+        Result that prints its summary. Its ``.model`` can be simulated and saved; ``.validate`` compares it with other
+        runs, and ``.report`` writes an HTML page.
 
     Raises
     ------
     DataError
-        Runs that do not fit the structure, or a constant output; a missing or constant reference; a checkpoint file of
-        other searches, in use, damaged, or not writable.
+        If runs lack a signal of the structure, an output is constant, the reference is missing or constant, or the
+        checkpoint file belongs to another search, is in use, is damaged or cannot be written.
     ModelError
-        An unknown method, an order grid without or with too many candidates, settings out of range, options of an
-        order search without a free order, a store with ``offset="auto"``, an initial guess without free parameters,
-        with unknown ones, or out of bounds.
+        If the method is unknown, the order grid has no or too many candidates, an option is out of range, options of an
+        order search are given without a free order, `store` is given with ``offset="auto"``, or the initial guess has
+        no free parameter, an unknown one, or a value out of bounds.
     ConvergenceError
-        Linearly dependent regressors at the given orders, or an executor that has lost its workers.
+        If regressors are linearly dependent at the given orders, or the executor has lost its workers.
     """
     several = as_runs(runs)
     estimator = resolve_method(method)
@@ -455,7 +469,7 @@ def _fit_runs(
     threads: int | None,
     progress: Callable[[int, int], None] | None,
 ) -> Fit:
-    """Fit a structure by a method, with decisions about the start of the runs and about offsets."""
+    """Return the fit of a structure by a method, after decisions about initial conditions and offsets."""
 
     def estimate(
         request: Structure,
@@ -489,15 +503,15 @@ def identify_pieces(
 ) -> Identification:
     """Identify an unstable plant under control from pieces of its runs, each with its own initial values.
 
-    So an error of the simulation cannot grow beyond one piece. White noise in the feedback does not bias output error
-    if the plant has a delay of a sample.
+    The simulation of an unstable model diverges, but its error cannot grow beyond one piece. White measurement noise in
+    the feedback does not bias output error if the plant has a delay of a sample.
 
     Parameters
     ----------
     runs
         Whole runs.
     structure
-        What to identify; ``"caputo"`` replaces its initial conditions.
+        Structure to identify. Its initial conditions are replaced by ``"caputo"``.
     duration
         Shortest duration of a piece [s].
     method
@@ -508,7 +522,7 @@ def identify_pieces(
     Returns
     -------
     Identification
-        Later comparisons of its model split other runs in the same way.
+        Result whose model splits other runs in the same way when it is compared with them.
     """
     pieces = as_runs([piece for run in runs for piece in run.split(duration)])
     request = replace(structure, initial="caputo")
@@ -522,7 +536,7 @@ def identify_pieces(
 
 
 def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
-    """Raise ModelError if ``offset="auto"``, which may fit twice, is not possible."""
+    """Raise ModelError if the method or its options do not allow ``offset="auto"``, which may fit twice."""
     if structure.has_friction:
         raise ModelError(
             f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the test of "
@@ -538,7 +552,10 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
 
 
 def assess_fit(fit: Fit) -> Identification:
-    """Assess a fit on its own runs: equation and output error, residual tests, information criteria, findings."""
+    """Return an identification: a fit with its errors, residual tests, information criteria and findings.
+
+    All of them are computed on the estimation runs.
+    """
     runs, model = as_runs(fit.task.runs), fit.model
     free = simulate_runs(model, runs)
     comparison = compare_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
@@ -621,7 +638,10 @@ def assess_fit(fit: Fit) -> Identification:
 
 
 def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
-    """Return what computes the sensitivities of a joint fit of a linear structure, or None."""
+    """Return a function that computes output sensitivities to the parameters; None if the fit does not allow it.
+
+    It is available for joint fits of linear structures.
+    """
     joint, structure = fit.joint, fit.task.structure
     if joint is None or not joint.names or structure.has_friction:
         return None
@@ -630,9 +650,12 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
-    """Replace findings of colored residuals and of a poor fit by findings of noise if no input explains them.
+    """Return a finding, replaced by a milder one if the residuals are noise that no input explains.
 
-    Residual tests leave the first and the last row out: a fit that is poor by these alone has an outlier there.
+    Findings on colored residuals and on a poor fit are replaced.
+
+    Residual tests omit the first and the last sample. If the fit is poor only because of these, the finding says that
+    they are outliers.
     """
     if item.code == "explains_little" and tests.outputs[item.output].nr <= MAX_NORMALIZED_RESIDUAL:
         inner = 100.0 * (1.0 - tests.outputs[item.output].nr)
@@ -644,14 +667,14 @@ def _noise_finding(item: Finding, tests: Residuals) -> Finding:
 
 
 def _coupling_finding(item: Finding, structure: Structure) -> Finding:
-    """Replace a finding of residuals correlated with an unused input by a finding of a missing coupling."""
+    """Return a finding, changed to ``coupling_missing`` if it reports an input that no equation uses."""
     if item.code != "residuals_follow_input" or item.input in structure.signals:
         return item
     return msgspec.structs.replace(item, code="coupling_missing")
 
 
 def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Finding]:
-    """Return a finding on the effects that a flexible link omits, if residual tests fail."""
+    """Return a finding on the effects that the flexible-link model neglects, if residual tests fail."""
     if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in LEFT_OUT_CODES for f in findings):
         return []
     parts = [] if structure.has_friction else ["dry friction of the hubs"]
@@ -662,7 +685,7 @@ def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Find
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
-    """Return the residual tests with the bias of a joint fit that detected feedback can cause."""
+    """Return the residual tests, with the bias of the parameters that detected feedback can cause."""
     fed = {
         signal: test.response
         for o in tests.outputs.values()
@@ -688,7 +711,10 @@ def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
 
 
 def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
-    """Return findings of failed residual tests; a joint fit already reports colored residuals."""
+    """Return findings of failed residual tests.
+
+    Colored residuals of a joint fit are omitted, because its own findings report them.
+    """
     if has_loop_noise_model(fit.settings):
         # The loop is known, or its noise is; it is not part of what the model was estimated from.
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
@@ -701,7 +727,7 @@ def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
 def _estimate(
     fit: Fit, comparison: Comparison, criteria: InformationCriteria | None, findings: tuple[Finding, ...]
 ) -> Estimate:
-    """Return the estimate that the model file stores."""
+    """Return the estimate that a model file stores: parameters, errors, fit and findings."""
     joint, values, errors = fit.joint, dict(fit.model.orders), {}
     if joint is not None:
         values = joint.values_by_name
@@ -728,11 +754,11 @@ class BatchResult:
     Parameters
     ----------
     name
-        Names of its runs.
+        Names of the runs of the item.
     result
-        The identification, or None.
+        Identification; None if it failed.
     error
-        The error that stopped it, or None.
+        Error that stopped the identification, or None.
     """
 
     name: str
@@ -746,7 +772,7 @@ class BatchResult:
 def identify_one(
     runs: Run | Sequence[Run], structure: Structure, options: dict[str, Any]
 ) -> tuple[Identification | None, FtlmError | None]:
-    """Identify one item and return its result or error."""
+    """Identify one item of a batch, and return (result, None) or (None, error)."""
     try:
         return identify(runs, structure, **options), None
     except FtlmError as error:
@@ -776,14 +802,14 @@ def identify_many(
     structure
         Structure to identify, the same for all.
     method, offset, m
-        See :func:`ftlm.identify`; the method without a store.
+        See :func:`ftlm.identify`; the method must not have a `store`.
     threads
-        Threads of one identification; with an executor one by default.
+        Number of threads of one identification; by default all cores, or one with an executor.
     progress
         Callback with (runs done, total runs).
     executor
         Any :class:`concurrent.futures.Executor`, such as processes or ``dask.distributed.Client(…).get_executor()``.
-        Each run is sent to one worker. None: one after the other in this process.
+        Each item is sent to one worker. With None the items are identified one after the other in this process.
 
     Returns
     -------
@@ -793,8 +819,8 @@ def identify_many(
     Raises
     ------
     ModelError
-        No runs, an item that is not a run, a method that is not known, or one with a store, or with an executor besides
-        that of this call.
+        If there are no runs, an item is not a run, or the method is unknown, has a `store`, or has its own executor as
+        well.
     KeyboardInterrupt
         Ctrl-C.
     """
@@ -841,7 +867,7 @@ def identify_many(
 
 
 def _future_result(future: Future[Any]) -> tuple[Identification | None, FtlmError | None]:
-    """Return the result of a worker, or a ConvergenceError if the executor failed."""
+    """Return the (result, error) pair of a worker; the error is a ConvergenceError if the executor failed."""
     try:
         pair: tuple[Identification | None, FtlmError | None] = future.result()
     except (Exception, CancelledError) as error:

@@ -1,4 +1,7 @@
-"""Coefficients at given orders: least squares, multi-innovation, instrumental variables, streaming."""
+"""Linear estimation of coefficients at given orders: least squares, multi-innovation, instrumental variables.
+
+The module also has the online estimator :class:`Streaming`.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,7 @@ MAX_STEP_BIAS_ERRORS = 0.5
 
 @dataclass(frozen=True)
 class CoefficientFit:
-    """Coefficients at given orders: values, standard errors if known, number of pulses and findings."""
+    """Result of a linear estimation at given orders: coefficients, known standard errors, pulses, findings."""
 
     m: int
     initial: Initial
@@ -60,9 +63,10 @@ class CoefficientFit:
 def estimate_coefficients(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None
 ) -> CoefficientFit:
-    """Estimate the coefficients at given orders by the method that the settings name.
+    """Return the coefficients at given orders, estimated by the linear method that `settings` name.
 
-    Derivatives in non-linear terms are those of the raw signals or of smooth ones, whichever gives the better free run.
+    Nonlinear terms contain derivatives of measured signals. They are computed from the raw and from smoothed signals,
+    and the estimate with the better simulation is returned.
     """
     if settings.coefficients == "instrumental-variables":
         check_linear(structure.equations, "an instrument")
@@ -81,7 +85,10 @@ def estimate_coefficients(
 def _estimate_coefficients(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None, *, smooth: bool
 ) -> tuple[CoefficientFit, list[Record]]:
-    """Estimate the coefficients as :func:`estimate_coefficients`, and return the records too."""
+    """Return the coefficients at given orders, and the block-pulse records that they were estimated from.
+
+    With `smooth`, derivatives in nonlinear terms are those of smoothed signals.
+    """
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar, smooth=smooth)
     fit = CoefficientFit(records[0].m, records[0].initial)
     if settings.coefficients == "instrumental-variables":
@@ -103,7 +110,7 @@ def _estimate_coefficients(
 def _linear(
     item: Equation, records: list[Record]
 ) -> tuple[list[Any], Any, list[bool], list[float | None], InitialTuple]:
-    """Return one equation and its records as arguments of the linear estimators of the core."""
+    """Return one equation and its records as positional arguments of the core's linear estimators."""
     first = records[0]
     fixed, structure = [t.fixed for t in item.terms], structure_tuple(item, first.signals)
     return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
@@ -112,17 +119,17 @@ def _linear(
 def _multi_innovation(
     item: Equation, records: list[Record], settings: SearchSettings, prior: float | None
 ) -> list[float]:
-    """Return the coefficients by the closed form of equation (44)."""
+    """Return the multi-innovation estimate of the coefficients in closed form, equation (44) of the paper."""
     haar = settings.row_basis == "haar"
     (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
     return raw
 
 
 def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Record]) -> None:
-    """Fill in coefficients, standard errors and findings by refined instrumental variables.
+    """Store the refined instrumental-variables estimate of the coefficients, their errors and findings in `fit`.
 
-    Coupled equations are simulated together, so every instrument depends on the inputs alone. The standard errors hold
-    at the given orders.
+    All equations are simulated together, so every instrument depends only on the inputs. The standard errors are
+    conditional on the given orders.
     """
     initial, inputs = records[0].start, list(records[0].inputs)
     groups = [structure.equations] if structure.coupling == "simulated" else [(e,) for e in structure.equations]
@@ -154,9 +161,10 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
 def step_bias_findings(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, fit: CoefficientFit
 ) -> list[Finding]:
-    """Return a finding if the step changes a coefficient by more than its standard error allows.
+    """Return a finding if the discretization changes a coefficient by more than its standard error.
 
-    The scheme has order 2. One third of the change from twice the step therefore remains (Richardson).
+    The coefficients are estimated again with twice the step. The discretization has order 2, so one third of the change
+    is the remaining error (Richardson).
     """
     if not fit.errors or fit.m < 2 * MIN_STEP_TEST_PULSES:
         return []
@@ -177,7 +185,10 @@ def step_bias_findings(
 
 
 def _prior_findings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[Finding]:
-    """Return a finding if the prior covariance, not the data, determines the size of a coefficient."""
+    """Return a finding if the prior covariance, not the data, determines the size of a coefficient.
+
+    `raw` are the coefficients with the prior of the settings, `weak` those with a weak prior.
+    """
     shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
     if worst <= MAX_PRIOR_SHIFT:
@@ -188,18 +199,18 @@ def _prior_findings(output: str, raw: list[float], weak: list[float], settings: 
 
 @dataclass(frozen=True)
 class MultiInnovationTrace:
-    """Convergence of the multi-innovation recursion (44) on one equation.
+    """Coefficients and simulation error after each step of the multi-innovation recursion, equation (44) of the paper.
 
     Parameters
     ----------
     step
-        Steps at which the rest is given, from 1.
+        Numbers of the steps at which values are given, counted from 1.
     coefficients
-        By name, after each of these steps.
+        Coefficients by name, one value for each of these steps.
     error
-        Error (45) of the simulation of the model after each of these steps, at rest; infinite where it diverged.
+        Sum of absolute errors (45) of the model's simulation from rest after each of these steps; infinite if it diverges.
     innovation_length
-        p.
+        Innovation length p.
     """
 
     step: NDArray[np.int64]
@@ -219,32 +230,35 @@ def multi_innovation_trace(
     m: int | None = None,
     every: int = 1,
 ) -> MultiInnovationTrace:
-    """Run the multi-innovation recursion (44) and return coefficients and error (45) after every step.
+    """Run the multi-innovation recursion (44), and return coefficients and simulation error (45) after each step.
+
+    Equation numbers are those of the paper.
 
     Parameters
     ----------
     run
-        One run that starts at rest.
+        Run that starts at rest.
     equation
         One equation whose orders are numbers.
     innovation_length, prior_covariance, row_basis, m
         See :class:`ftlm.MultiInnovation` and :func:`ftlm.identify`.
     every
-        Give every n-th step (and the last).
+        Interval between the steps that are returned; the last step is always returned.
 
     Returns
     -------
-    Trace
-        The last row equals the closed form to rounding.
+    MultiInnovationTrace
+        Trace whose last coefficients equal the closed-form estimate up to rounding.
 
     Raises
     ------
     ModelError
-        More than one equation, free orders, settings out of range.
+        If there is more than one equation, an order is free, or a setting is out of range.
 
     Notes
     -----
-    O(m k^3) for the recursion and one division of series for each step given.
+    The recursion takes O(m k^3) operations for m pulses and k coefficients. Each returned step takes a simulation in
+    addition.
     """
     settings = SearchSettings(
         innovation_length=innovation_length, prior_covariance=prior_covariance, row_basis=row_basis
@@ -286,21 +300,23 @@ def multi_innovation_trace(
 
 @check_arguments
 def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> LineChart:
-    """Draw the simulation error (45) after every step of the recursion (44), as in Figure 4(b).
+    """Return a chart of the simulation error (45) after every step of the recursion (44), as in Figure 4(b).
+
+    Equations and figure are those of the paper.
 
     Parameters
     ----------
     traces
-        (name, trace), such as ("p = 7", …), of one equation and with the same steps.
+        Pairs (label, trace), such as ("p = 7", …). All traces have the same equation and steps.
     title
-        What is shown.
+        Title of the chart.
     log_x
-        Whether the axis of steps is logarithmic, which widens the first ones.
+        Whether the axis of steps is logarithmic, which enlarges the first steps.
 
     Raises
     ------
     DataError
-        No trace, or traces whose steps differ.
+        If there is no trace, or the steps of the traces differ.
     """
     if not traces:
         raise DataError("a convergence chart needs at least one trace; give (name, trace) pairs")
@@ -324,9 +340,10 @@ def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: st
 class Streaming:
     """Online estimator of the coefficients of a structure for a run that starts at rest.
 
-    The cost of a sample does not depend on the length of the run: about a hundred states per signal represent the past.
-    After the last sample the coefficients are those of ``identify(method=MultiInnovation(row_basis="time"))`` at
-    the same orders on the run's own grid, to rounding.
+    The time per sample does not depend on the length of the run, because about a hundred states per signal represent
+    the past. After the last sample the coefficients equal those of
+    ``identify(method=MultiInnovation(row_basis="time"))`` at the same orders, with one block pulse per sampling
+    interval, up to rounding.
 
     Parameters
     ----------
@@ -336,16 +353,17 @@ class Streaming:
     step
         Time between samples [s].
     longest
-        Longest run [s].
+        Maximum duration of a run [s].
     inputs
-        Which of the structure's signals are inputs, held between samples.
+        Names of the input signals, which are constant between samples (zero-order hold).
     innovation_length, prior_covariance
-        p and K0 of (44); by default the prior is weak, as that of :class:`ftlm.MultiInnovation`.
+        Innovation length p and prior covariance K0 in equation (44) of the paper; by default the prior is weak, as in
+        :class:`ftlm.MultiInnovation`.
 
     Raises
     ------
     ModelError
-        A structure that a stream cannot do, settings out of range.
+        If the structure does not meet these conditions, or a setting is out of range.
     """
 
     @check_arguments
@@ -403,23 +421,23 @@ class Streaming:
 
     @check_arguments
     def push(self, samples: Floats) -> None:
-        """Process samples of shape (n, len(signals)), in SI units and in the order of `signals`.
+        """Update the estimate with samples of shape (n, len(signals)), in SI units and in the order of `signals`.
 
         Raises
         ------
         DataError
-            A sample that is not finite.
+            If a sample is not finite.
         ModelError
-            More samples than `longest` holds.
+            If the samples exceed the duration `longest`.
         ConvergenceError
-            The covariance lost its sign to rounding.
+            If rounding errors make the covariance indefinite.
         """
         for recursion in self._recursions:
             recursion.push(samples)
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Coefficients by name, after the newest sample."""
+        """Estimates of the coefficients by name, after the newest sample."""
         pairs = zip(self.structure.equations, self._recursions, strict=True)
         return {
             name: c
@@ -429,7 +447,7 @@ class Streaming:
 
     @property
     def pulses(self) -> int:
-        """Number of rows of (44) so far: samples minus one."""
+        """Number of rows of equation (44) so far, which is the number of samples minus one."""
         return self._recursions[0].pulses
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""Methods of estimation as objects with their options, and the noise model of output error."""
+"""Methods of estimation as classes whose fields are their options, and the noise model of output error."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ LAG_RANK_TOLERANCE = 1e-10
 
 
 def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
-    """Raise ModelError for runs and structures to which a noise model does not apply."""
+    """Raise ModelError if the runs or the structure do not allow an autoregressive noise model."""
     label = parameter("noise", "ar")
     if len(structure.outputs) > 1:
         raise ModelError(f"{label} is of one output, not of {', '.join(structure.outputs)}; fit each one")
@@ -65,12 +65,14 @@ def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
 
 
 def fit_noise_model(fit: Fit, refit: Callable[[Task, JointFit], Fit]) -> Fit:
-    """Fit model and noise model in turn until neither changes, from a fit for white noise.
+    """Return the fit of a model with autoregressive noise, by alternating minimization of model and noise model.
 
-    The noise is v = e / A(q) with white e. A(q) is the autoregression of the residuals v of the simulation, and the
-    model is fitted to the runs filtered by A(q): inputs and output of a linear model commute with it. Both decrease the
+    `fit` is the fit for white noise, from which the iteration starts. `refit` fits a task from a joint fit.
+
+    The noise is v = e / A(q) with white e. One step fits A(q) to the residuals v of the simulation. The other fits the
+    model to runs whose inputs and output are filtered by A(q), which a linear model permits. Both steps decrease the
     sum of squared prediction errors, whose minimum is consistent in a closed loop with a delay (Ljung, System
-    Identification, 1999, chapter 13). The covariance counts the estimated noise model.
+    Identification, 1999, chapter 13). The covariance of the parameters includes the uncertainty of A(q).
     """
     first, runs, plain = fit, fit.task.runs, fit.joint
     if plain is None:
@@ -102,7 +104,7 @@ def fit_noise_model(fit: Fit, refit: Callable[[Task, JointFit], Fit]) -> Fit:
 
 
 def _noise_model(residuals: Sequence[Floats]) -> Floats:
-    """Return A(q) with the least squares of A(q) v; its order has the least Bayesian criterion."""
+    """Return the coefficients of A(q) by least squares from residuals; its order minimizes BIC."""
     order = autoregression(residuals, DEFAULT_LAGS).size - 1
     if order == 0:
         return np.ones(1)
@@ -112,7 +114,10 @@ def _noise_model(residuals: Sequence[Floats]) -> Floats:
 
 
 def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
-    """Return the residuals of all runs at lags 1 to ``order``, one column per lag; NaN before the first."""
+    """Return the residuals of all runs at lags 1 to ``order``, one column per lag.
+
+    Values before the start of a run are NaN.
+    """
     columns = [[np.concatenate([np.full(lag, np.nan), v[:-lag]]) for v in residuals] for lag in range(1, order + 1)]
     return np.stack([np.concatenate(column) for column in columns], axis=1)
 
@@ -149,10 +154,11 @@ def _residuals(fit: Fit, joint: JointFit, runs: Sequence[Run]) -> list[Floats]:
 
 
 def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floats], order: int) -> Floats:
-    """Return the covariance of the parameters that counts the errors of the noise model.
+    """Return the covariance of the parameters, including the uncertainty of the noise model.
 
-    They are independent of those of the model but where feedback makes the inputs follow the noise: there lagged
-    residuals, the sensitivities to A(q), lie along the sensitivities to the parameters.
+    In open loop, the errors of the noise model and of the parameters are independent. Feedback correlates the inputs
+    with past noise. The lagged residuals, which are the sensitivities to A(q), then have a component along the
+    sensitivities to the parameters.
     """
     if order == 0:
         return joint.covariance
@@ -171,7 +177,10 @@ def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floa
 
 
 class EstimationMethod(Protocol):
-    """Method of estimation: a name and a fit. Any object that has both can be passed to :func:`ftlm.identify`."""
+    """Protocol of a method of estimation: an object with a name and a `fit` method.
+
+    Any such object can be passed to :func:`ftlm.identify`.
+    """
 
     name: ClassVar[str]
 
@@ -184,48 +193,50 @@ class EstimationMethod(Protocol):
         threads: int | None,
         progress: ProgressCallback,
     ) -> Fit:
-        """Fit a structure whose offset is decided to checked runs; the other arguments are those of `identify`."""
+        """Fit a structure, whose offset is decided, to checked runs; other arguments are those of `identify`."""
 
 
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class OutputError:
-    """Output error: orders and coefficients of all equations together, maximum likelihood for white noise.
+    """Output-error method: estimates orders and coefficients of all equations together, by maximum likelihood.
+
+    The likelihood is that of white noise.
 
     Orders are continuous, initialization is automatic, and parameters have confidence intervals.
 
     Parameters
     ----------
     loss
-        ``"squares"``, or ``"huber"``, which limits the influence of residuals beyond 1.345 standard deviations.
-        Without outliers it has 95 % of the precision. Fits and errors are still those of all samples.
+        ``"squares"``, or ``"huber"``, which limits the influence of residuals beyond 1.345 standard deviations. Without
+        outliers it has 95 % of the efficiency of least squares. The reported fit and errors count all samples in full.
     intervals
-        ``"quadratic"``: estimate ± 1.96 standard errors, exact for a quadratic cost. ``"profile"``: by profile
-        likelihood for every parameter, some ten to a hundred simulations each. ``"auto"``: by profile likelihood for
-        the parameters whose Wald interval is off by over a tenth, from two simulations each. See
-        :meth:`ftlm.Identification.profile`.
+        Kind of the 95 % intervals. ``"quadratic"``: estimate ± 1.96 standard errors, exact for a quadratic cost.
+        ``"profile"``: profile likelihood for every parameter, ten to a hundred simulations each. ``"auto"``: profile
+        likelihood for parameters whose Wald interval is wrong by over a tenth, which two simulations per parameter
+        check. See :meth:`ftlm.Identification.profile`.
     start
-        Initial guess besides the automatic ones; the fit never ends with a larger cost than a fit from it. An
-        identification or a model of the same outputs, simpler or not, or values of free parameters by name. Missing
-        coefficients start at 0; an order that is free now and was fixed there starts at that value.
+        Additional initial guess: an identification, a model of the same outputs, or values of free parameters by name.
+        The cost of the fit is never larger than that of a fit from this guess alone. A missing coefficient starts at 0.
+        A free order that is fixed in the given model starts at the fixed value.
     reference
-        Name of the reference signal of a closed loop in the runs, such as its set point. It is the instrument:
-        residuals are made orthogonal to the response to the part of every input that follows the reference, which is
-        uncorrelated with the noise in the feedback.
+        Name of a reference signal of a closed loop in the runs, such as its set point. It serves as external
+        instrument: the fit makes residuals orthogonal to sensitivities computed from the part of every input that the
+        reference explains. This part is uncorrelated with the noise that feedback carries into the inputs.
     noise
-        ``"white"``, or ``"ar"`` for y = G u + e / A(q): model and autoregression are estimated together by the
-        prediction-error method. It is consistent in a closed loop if A(q) can describe the noise and the loop has a
-        delay (Ljung, chapter 13). It takes one output, a linear model and uniform samples, and gives intervals of
-        ± 1.96 standard errors.
+        Noise model: ``"white"``, or ``"ar"`` for y = G u + e / A(q), where model and autoregression are estimated
+        together by the prediction-error method. The estimate is consistent in a closed loop if A(q) can describe the
+        noise and the loop has a delay (Ljung, chapter 13). ``"ar"`` requires one output, a linear model and uniform
+        samples; its intervals are ± 1.96 standard errors.
     bounds
         (lower, upper) of coefficients and orders by name; infinite for an open side. A coefficient that ends on a bound
-        is fixed there and has no interval, and a finding names it.
+        is fixed at the bound, has no confidence interval, and is named by a finding.
 
     Raises
     ------
     ModelError
-        A loss, intervals or a noise that are not known, a start or a reference of another type, or profile likelihood
-        or a noise model together with a reference.
+        If `loss`, `intervals` or `noise` is unknown, `start` or `reference` has the wrong type, or a reference is
+        combined with profile likelihood or a noise model.
     """
 
     name: ClassVar[str] = "output-error"
@@ -269,7 +280,10 @@ class OutputError:
         progress: ProgressCallback = None,
         fitted: JointFit | None = None,
     ) -> Fit:
-        """Fit a structure to checked runs; see :func:`ftlm.identify`. `fitted` is a fit of :meth:`hypothesis`."""
+        """Fit a structure to checked runs; see :func:`ftlm.identify`.
+
+        `fitted` is a joint fit from the method of :meth:`hypothesis`, which is completed instead of a new fit.
+        """
         if self.reference is not None and structure.has_friction:
             raise ModelError(
                 f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the "
@@ -314,14 +328,19 @@ class OutputError:
 
     @property
     def hypothesis(self) -> OutputError | None:
-        """Method without profiles for fits of several hypotheses; None if its fits cannot be completed by `fitted`."""
+        """Return this method without profile likelihood, for fits of which only one is completed.
+
+        None if `fit` cannot complete such a fit: with bounds, a noise model or a reference.
+        """
         resumable = self.bounds is None and self.noise == "white" and self.reference is None
         return replace(self, intervals="quadratic") if resumable else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class OrderSearchMethod:
-    """Options of the order search of an equation-error method; without a free order they must be the defaults.
+    """Base class of the equation-error methods, with the options of their order search.
+
+    If no order is free, the options must have their default values.
 
     Parameters
     ----------
@@ -345,7 +364,7 @@ class OrderSearchMethod:
         self.settings()
 
     def settings(self) -> SearchSettings:
-        """Return the settings of the order search and of the coefficients."""
+        """Return the options of the order search and of the coefficient estimation as one object."""
         names = {f.name for f in fields(self)} & {f.name for f in fields(SearchSettings)}
         return SearchSettings(
             coefficients=cast("Coefficients", self.name), **{name: getattr(self, name) for name in names}
@@ -360,7 +379,7 @@ class OrderSearchMethod:
         threads: int | None = None,
         progress: ProgressCallback = None,
     ) -> Fit:
-        """Search the orders, then estimate the coefficients at them; see :func:`ftlm.identify`."""
+        """Search the free orders on a grid, then estimate the coefficients; see :func:`ftlm.identify`."""
         check_no_friction(structure, self.name)
         check_order_grid_names(self.order_grid, structure)
         changed = [f.name for f in fields(OrderSearchMethod) if getattr(self, f.name) != f.default]
@@ -376,9 +395,9 @@ class OrderSearchMethod:
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class LeastSquares(OrderSearchMethod):
-    """Least squares of the equation error: orders from the order grid, coefficients at the best of them.
+    """Least-squares method: minimizes the equation error at the best orders of an order grid.
 
-    It is the limit of multi-innovation for a weak prior. Noise on the outputs biases it.
+    It is the limit of the multi-innovation method for a weak prior. Noise on the outputs biases the estimate.
 
     Parameters
     ----------
@@ -397,7 +416,9 @@ class LeastSquares(OrderSearchMethod):
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class InstrumentalVariables(OrderSearchMethod):
-    """Instrumental variables, refined: orders from the order grid, coefficients without the bias of noise.
+    """Method of refined instrumental variables: coefficients at the best orders of an order grid.
+
+    Noise on the outputs does not bias the coefficients.
 
     Parameters
     ----------
@@ -416,19 +437,20 @@ class InstrumentalVariables(OrderSearchMethod):
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class MultiInnovation(OrderSearchMethod):
-    """Multi-innovation of the paper, (44) in closed form: orders from the order grid, coefficients with a prior.
+    """Multi-innovation method of the paper, equation (44): coefficients with a prior at the best orders of a grid.
 
     Parameters
     ----------
     order_grid, criterion, norm, top, store, executor
         Options of the order search; see :func:`ftlm.search_orders`. Without a free order they must be the defaults.
     innovation_length
-        p of paper (43)-(44): only a weight of the data against the prior.
+        Innovation length p in equations (43)-(44) of the paper. It only weights the data against the prior.
     prior_covariance
-        Diagonal of K0 of paper (43)-(44): one number for all coefficients. By default the prior is weak and does not
-        depend on units: 1e10 over the sum of squares of each coefficient's regressor. The paper's is 1.
+        Diagonal entry of the prior covariance K0 in equations (43)-(44), the same for all coefficients. By default the
+        prior is weak and independent of units: 1e10 over the sum of squares of each coefficient's regressor. The paper
+        uses 1.
     row_basis
-        Coordinates of paper (42): ``"haar"``, for which m is a power of two, or ``"time"``.
+        Basis of the rows in equation (42): ``"haar"`` for Haar wavelets, for which m is a power of two, or ``"time"``.
 
     Raises
     ------
@@ -450,7 +472,7 @@ METHODS_BY_NAME: dict[str, type[Any]] = {
 
 
 def resolve_method(method: str | EstimationMethod) -> EstimationMethod:
-    """Return a method of estimation from its name, or itself; raise ModelError for anything else."""
+    """Return the method of estimation that a name or an object denotes; raise ModelError if there is none."""
     if isinstance(method, str):
         check_choice("method", method, METHODS_BY_NAME)
         estimator: EstimationMethod = METHODS_BY_NAME[method]()
@@ -464,7 +486,7 @@ def resolve_method(method: str | EstimationMethod) -> EstimationMethod:
 
 
 def method_with_options(name: str, options: Mapping[str, Any]) -> EstimationMethod:
-    """Return the method of a name with options by name; raise ModelError for an option that it does not have."""
+    """Return the named method with the given options; raise ModelError for an option that it lacks."""
     check_choice("method", name, METHODS_BY_NAME)
     names = {method: [f.name for f in fields(kind)] for method, kind in METHODS_BY_NAME.items()}
     foreign = [option for option in options if option not in names[name]]

@@ -79,7 +79,7 @@ MAX_LAW_DEVIATION = 0.05
 
 
 def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Finding]:
-    """Return findings on convergence and on parameters that the runs do not determine."""
+    """Return findings on failed convergence and on parameters that are not identifiable from the runs."""
     findings = []
     if not joint.converged:
         findings.append(make_finding("not_converged"))
@@ -127,10 +127,10 @@ def second_optimum_findings(
     errors: Mapping[str, float],
     optima: Sequence[tuple[Floats, float, Mapping[str, float]]],
 ) -> list[Finding]:
-    """Return a finding on the most likely other optimum at values over three standard errors apart.
+    """Return a finding on the most likely other optimum whose parameters differ by over three standard errors.
 
-    Each optimum comes with the fall of the log likelihood and its own standard errors: what it does not determine
-    itself is not a value.
+    An optimum is given as (values, decrease of the log likelihood, standard errors by name). The larger of the standard
+    errors of both optima is used.
     """
     for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
         if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:
@@ -154,7 +154,10 @@ def second_optimum_findings(
 
 
 def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> list[Finding]:
-    """Return a finding on a second optimum among the best candidates of the multistart, fitted to all samples."""
+    """Return a finding if a candidate of the multistart leads to a second, almost equally likely optimum.
+
+    The best candidates are fitted to all samples.
+    """
     errors = [joint.standard_errors[n] for n in joint.names]
     best_cost = min((cost for cost, _ in joint.survivors), default=0.0)
     far = [
@@ -183,7 +186,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
 def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
     """Return other optima that are almost as likely as the best one and simulate other outputs.
 
-    Each comes with the fall of the log likelihood.
+    Each is returned as (values, decrease of the log likelihood).
     """
 
     def fit(values: Floats) -> tuple[Floats, float, Floats]:
@@ -207,7 +210,7 @@ def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> li
 
 
 def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:
-    """Return findings on an unstable optimum and the choice made."""
+    """Return findings on an unstable optimum, which say whether it or a stable one was chosen."""
     if joint.unstable_optimum is None or joint.unstable_optimum.residual_excess <= 0.0:
         # One that costs more than the stable one was none.
         return []
@@ -227,7 +230,7 @@ def _has_bounded_interval(joint: JointFit, name: str) -> bool:
 
 
 def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) -> list[Finding]:
-    """Return a finding on parameters with an unbounded interval."""
+    """Return a finding on parameters whose confidence interval is unbounded, except unidentifiable ones."""
     sides = {
         n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
         for n, p in joint.profiles.items()
@@ -260,7 +263,7 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
 
 
 def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on runs that are assumed to rest before their first row, with the evidence."""
+    """Return findings on runs that are assumed to start from rest, with the evidence for or against it."""
     resolved = resolve_start(runs, structure)
     findings = []
     some_rested = resolved.initial == "auto" and resolved.offset == "level"
@@ -285,9 +288,9 @@ def start_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
 
 
 def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidence) -> list[Finding]:
-    """Return findings on outputs that leave their level in the row in which an input first changes.
+    """Return findings on outputs that respond in the same sample in which an input first changes.
 
-    The change of a held input acts from that row on, and a strictly proper equation answers in the next one.
+    With a zero-order hold the change acts from that sample on, so a strictly proper model responds one sample later.
     """
     row = evidence.rows
     if not 0 < row < run.length - 1 or run.sample_times is not None:
@@ -312,7 +315,7 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
 
 
 def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit, output: str) -> list[Finding]:
-    """Return a finding on outliers, unless a robust loss was used."""
+    """Return a finding on outliers of an output, unless a robust loss was used."""
     if joint.robust is not None:
         return []
     # In the unit of the output.
@@ -354,17 +357,22 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
 
 
 def _simulated_speeds(samples: Floats, residuals: Floats) -> Floats:
-    """Absolute change of the simulated output around each inner sample; measured outliers do not affect it."""
+    """Return the absolute change of the simulated output around each inner sample.
+
+    Outliers of the measured output do not affect it.
+    """
     simulated = interpolate_gaps(samples[1 : 1 + residuals.size] - residuals)
     steps = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
     return np.maximum(steps[:-1], steps[1:])
 
 
 def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
-    """Robust standard deviation of the residuals by row: of all rows, or that of rows of similar speed if larger.
+    """Return a robust standard deviation of the residuals for each sample, from which outliers are judged.
 
-    Noise that grows with speed (an error of timing, a rate, a gain) is no outlier. Nor is all that moves, where a
-    machine stands still for a part of the run.
+    It is that of all samples, or that of samples with similar speed if larger.
+
+    Residuals that grow with speed, such as those of timing or gain errors, are therefore not outliers. Nor are all
+    moving samples outliers if the machine rests during most of the run.
     """
     usual = np.full(residuals.size, robust_deviation(drop_missing(residuals)))
     finite_rows = np.flatnonzero(~np.isnan(residuals))
@@ -376,7 +384,7 @@ def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
 
 
 def _quantization_findings(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> list[Finding]:
-    """Return a finding on an output whose quantization step exceeds its noise."""
+    """Return a finding on an output whose quantization step exceeds its noise standard deviation."""
     steps = [quantization_step(drop_missing(compared_values(run, structure, output))) for run in runs]
     coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > QUANTIZATION_NOISE_RATIO * noise]
     if not coarse:
@@ -386,7 +394,7 @@ def _quantization_findings(runs: Sequence[Run], structure: Structure, output: st
 
 
 def quantization_step(values: Floats) -> float:
-    """Return the step of which all values are multiples; 0 if there is none."""
+    """Return the step of which all differences between values are multiples; 0 if there is none."""
     levels = np.unique(values)
     gaps = np.diff(levels)
     gaps = gaps[gaps > 1e-9 * max(float(np.abs(levels).max()), float(np.ptp(levels)))] if gaps.size else gaps
@@ -423,7 +431,10 @@ def correlation_findings(joint: JointFit) -> list[Finding]:
 
 
 def _are_inseparable(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
-    """Whether two uncertain parameters are correlated, or both have an infinite standard error."""
+    """Whether two parameters cannot be identified separately.
+
+    They are strongly correlated, or both have an infinite standard error.
+    """
     errors = joint.standard_errors
     if not any(math.isfinite(errors[joint.names[k]]) for k in (i, j)):
         return True
@@ -431,19 +442,19 @@ def _are_inseparable(joint: JointFit, correlation: Floats, i: int, j: int) -> bo
 
 
 def excitation_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on equations whose free parameters no run excites."""
+    """Return findings on equations with free parameters that no run excites."""
     lacking = [{f.output: f for f in check_excitation(run, structure)} for run in runs]
     return [item for output, item in lacking[0].items() if all(output in other for other in lacking)]
 
 
 def dead_channel_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on measured outputs that stay constant for a time although they vary otherwise."""
+    """Return findings on measured outputs that are constant during part of a run although they vary otherwise."""
     channels = [(r.with_interpolated_gaps(), n) for r in runs for n in r.outputs if n in structure.signals]
     return [item for run, name in channels for item in find_dead_channel(run, name)]
 
 
 def coefficient_law_findings(model: Model) -> list[Finding]:
-    """Return findings on freely estimated coefficients that violate the coefficient law."""
+    """Return findings on separately estimated coefficients that violate the coefficient law of the structure."""
     law, values = model.structure.coefficient_law, model.coefficients
     findings = []
     for name, sign, factors in law:
@@ -469,10 +480,10 @@ def coefficient_law_findings(model: Model) -> list[Finding]:
 
 
 def discretization_findings(model: Model, comparison: Comparison) -> list[Finding]:
-    """Return findings if the block-pulse scheme itself is unstable with this number of pulses.
+    """Return findings if the block-pulse discretization is unstable at this step although the model is stable.
 
-    A stiff equation with alpha - nu > 1 for an own term gives the scheme a mode at its Nyquist frequency that the model
-    does not have.
+    In a stiff equation, a term of the output with alpha - nu > 1 (order of the equation minus order of the term) gives
+    the discretization an unstable mode at the Nyquist frequency that the model does not have.
     """
     findings = []
     for item in model.equations:
@@ -488,7 +499,7 @@ def discretization_findings(model: Model, comparison: Comparison) -> list[Findin
 
 
 def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> list[Finding]:
-    """Return findings if friction and an offset are collinear (sliding in one direction only)."""
+    """Return findings if a body slides in one direction only, so that friction and an offset are collinear."""
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
 
@@ -504,7 +515,7 @@ def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> 
 
 
 def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
-    """Return findings if no run distinguishes the friction near rest from that at speed."""
+    """Return findings if no run distinguishes friction at low speed from friction at high speed."""
     findings = []
     for item in model.equations:
         near = None if item.friction is None else item.friction.stribeck
@@ -525,10 +536,10 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
 
 
 def stability_findings(model: Model) -> list[Finding]:
-    """Return a finding on poles with a positive real part, which a short run may hide.
+    """Return a finding on poles with a positive real part, whose growth a short run may not show.
 
-    They are a fault where one of them exceeds 0 by more than its standard error allows; where none does, an integrator
-    or a mode that decays slowly explains the run as well.
+    The finding is an error if the real part of a pole is significantly positive. Otherwise an integrator or a slowly
+    decaying mode explains the run as well.
     """
     if not model.structure.is_linear:
         # Friction holds what would grow slowly, and a spring that hardens what would grow; no poles say so.
@@ -541,7 +552,7 @@ def stability_findings(model: Model) -> list[Finding]:
 
 
 def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
-    """Return a finding on the fastest oscillation that has too few samples per period."""
+    """Return a finding if the fastest oscillatory mode has too few samples per period."""
     if not model.structure.is_linear:
         return []
     try:
@@ -560,7 +571,9 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:
-    """Whether an unstable mode is significant at 99 %; True where modes or their errors are not known.
+    """Whether the model has a significantly unstable mode, at 99 %; True if modes or their errors are unknown.
+
+    `coupling` selects the poles, as in :func:`ftlm.modes`.
 
     The standard error of a pole is a first-order approximation. It fails at multiple poles, such as those of a double
     integrator. A mode is therefore not significant if the model is stable without its insignificant terms.
@@ -583,10 +596,10 @@ def _has_significant_growth(model: Model, coupling: str) -> bool:
 
 
 def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
-    """Whether backward elimination of terms of outputs ends in a stable model that a Wald test does not reject.
+    """Whether backward elimination of insignificant output terms leads to a stable model that a Wald test accepts.
 
-    Each elimination moves the remaining parameters to their conditional means, and the statistics add up to that of all
-    eliminated terms (Seber & Wild, Nonlinear Regression, section 5.3). For one term the level is that of a pole.
+    Each elimination moves the remaining parameters to their conditional means. The Wald statistics of the steps add up
+    to that of all eliminated terms (Seber & Wild, Nonlinear Regression, section 5.3).
     """
     covariance = covariance_of(model)
     if covariance is None:
@@ -618,18 +631,18 @@ def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
 
 
 def unstable_poles_text(count: float) -> str:
-    """Text on the number of poles with a positive real part."""
+    """Return the number of poles with a positive real part as text."""
     return f"{int(count)} pole{'s' if count > 1 else ''} with a positive real part"
 
 
 def enumerate_names(names: Sequence[str]) -> str:
-    """Return up to three names in a row, and the number of the others."""
+    """Return a list of names as text: up to three names, then the number of the others."""
     items = names if len(names) <= 3 else [*names[:3], f"{len(names) - 3} more"]
     return " and ".join([", ".join(items[:-1]), items[-1]]) if len(items) > 1 else items[0]
 
 
 def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
-    """Compare simulated and measured outputs of other runs; see :meth:`ftlm.Identification.validate`."""
+    """Compare simulated and measured outputs on other runs; see :meth:`ftlm.Identification.validate`."""
     comparison = compare(result.model, runs)
     findings = [
         *comparison.findings,

@@ -1,4 +1,4 @@
-"""Findings on non-linear terms: where they were seen, how much they act, and runs that forget their parameters."""
+"""Findings on nonlinear terms: their range in the data, their share of the motion, and chaotic sensitivity."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RELATIVE_CHANGE = 1e-7
 
 
 def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
-    """Return findings on the non-linear terms of a model on its runs; empty for a linear model."""
+    """Return findings on the nonlinear terms of a model on its runs; [] for a linear model."""
     finite = all(np.isfinite(samples.outputs).all() for samples in free)
     if not model.structure.has_nonlinear_terms or not finite or any(run.sample_times is not None for run in runs):
         return []
@@ -39,14 +39,17 @@ def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputS
 
 
 def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
-    """Return the samples of inputs as they act, and of the simulated outputs."""
+    """Return samples of all signals by name: simulated outputs, and inputs after saturation and dead zone."""
     limited = apply_input_nonlinearity(run.with_interpolated_gaps(), model.structure)
     simulated = dict(zip(model.outputs, samples.outputs, strict=True))
     return {name: simulated[name] if name in simulated else limited[name] for name in model.structure.signals}
 
 
 def _derive(values: Floats, order: float, step: float) -> Floats:
-    """Return the derivative or integral of samples that are constant before them."""
+    """Return the fractional derivative (integral for a negative order) of samples; `step` is in seconds.
+
+    The signal is constant before the first sample.
+    """
     if order == 0:
         return values
     if order < 0:
@@ -59,7 +62,7 @@ def _channel_values(values: dict[str, Floats], one: Channel, step: float) -> Flo
 
 
 def _term_values(term: Term, values: dict[str, Floats], step: float) -> Floats:
-    """Return the values of a term."""
+    """Return the value of a term at every sample, from samples of the signals."""
     shape = term.nonlinear
     if shape is None:
         inner = values[term.signal]
@@ -70,7 +73,7 @@ def _term_values(term: Term, values: dict[str, Floats], step: float) -> Floats:
 
 
 def _term_findings(item: Equation, runs: Sequence[Run], values: Sequence[dict[str, Floats]]) -> Iterator[Finding]:
-    """Yield a fact on each non-linear term: its share of the highest derivative, and the range of its signals."""
+    """Yield a note on each nonlinear term: its size relative to the highest derivative, and its signals' range."""
     pairs = list(zip(values, (run.step for run in runs), strict=True))
     whole = [sum((_term_values(t, v, h) for t in item.terms), np.zeros(1)) for v, h in pairs]
     size = _rms(whole)
@@ -99,10 +102,10 @@ def _rms(parts: Sequence[Floats]) -> float:
 
 
 def _forgetting_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
-    """Return a finding if the sensitivity of a free run grows exponentially while its output does not.
+    """Return a finding if the sensitivity of a simulated output to a parameter grows exponentially.
 
-    The end of the run then depends too strongly on the parameters, as in chaotic motion, so that a fit to the whole run
-    is not meaningful.
+    The output itself must not grow. As in chaotic motion, the end of the run then depends too strongly on the
+    parameters for a meaningful fit to the whole run.
     """
     numbers = parameter_vector(model)
     worst: tuple[float, float, str] | None = None

@@ -1,4 +1,4 @@
-"""Nuisance parameters: tests whether the data require offsets and initial terms."""
+"""Tests of whether the data require nuisance parameters: offsets and initial terms."""
 
 from __future__ import annotations
 
@@ -68,13 +68,14 @@ class OffsetTest:
     Parameters
     ----------
     statistic
-        Score statistic under colored residuals; chi-squared distributed without an offset.
+        Score statistic, valid for colored residuals; chi-squared distributed if there is no offset.
     degrees
         Number of identifiable constants over all equations and runs; 0 if none is identifiable.
     share
         Fraction of the residual sum of squares that the constants explain.
     size
-        Root-mean-square effect relative to the standard deviation of the output; far below 1 it is rounding.
+        Root-mean-square effect of the constants relative to the standard deviation of the output. A very small effect
+        may be rounding error.
     """
 
     statistic: float
@@ -83,18 +84,18 @@ class OffsetTest:
     size: float
 
     def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = NEGLIGIBLE_RESIDUAL_SHARE) -> bool:
-        """Whether the statistic is significant at `level` and the effect is larger than `size`."""
+        """Whether the statistic is significant at `level`, and the effect on the output is larger than `size`."""
         return self.degrees > 0 and self.size > size and self.statistic > chi_squared(self.degrees, level)
 
     @property
     def statistic_text(self) -> str:
-        """Statistic and 99 % limit as text."""
+        """Test statistic and its 99 % limit as text."""
         limit = chi_squared(self.degrees, SIGNIFICANCE_LEVEL)
         return f"chi-squared {self.statistic:.4g} of {self.degrees}, 99 % limit {limit:.4g}"
 
     @property
     def decision(self) -> str:
-        """Decision of ``offset="auto"`` as text."""
+        """Decision of ``offset="auto"`` as text, for the settings of a fit."""
         if not self.degrees:
             return "none: it is not separately identifiable from the other parameters"
         if self.exceeds():
@@ -105,7 +106,11 @@ class OffsetTest:
 def evaluate_at_point(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
 ) -> tuple[Objective, Iterate]:
-    """Evaluate the output error at given parameters, with output weights from the residuals."""
+    """Return the output-error objective and its evaluation at given parameters.
+
+    Output weights are the reciprocal RMS residuals, and `every` is the number of block pulses per sample. Raise
+    ConvergenceError if the residuals of an output are 0.
+    """
     structure = resolve_start(runs, structure)
     problem = FreeProblem.of(replace(structure, initial=resolve_common_initial_conditions(runs, structure)))
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
@@ -131,11 +136,11 @@ def evaluate_at_point(
 def offset_test(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = DEFAULT_PULSES_PER_SAMPLE
 ) -> OffsetTest | None:
-    """Test for an unknown constant in each equation and run, at given parameters; None if not computable.
+    """Test at given parameters for an unknown constant in each equation and run; None if not computable.
 
-    The response to a constant input is added to the sensitivities of all free parameters, initial terms projected out,
-    with coefficient 0. This is a score test that is insensitive to errors of the other parameters (Neyman's C(alpha)),
-    so any consistent estimate will do. Its variance uses an autoregressive model of the residuals.
+    The score is the projection of the residuals on the responses to a constant in each equation, orthogonal to the
+    sensitivities to all free parameters and initial terms. Errors of these do not affect it (Neyman's C(alpha) test),
+    so any consistent estimate is sufficient. Its variance follows from an autoregressive model of the residuals.
     """
     reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
     one = next(n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names)
@@ -191,9 +196,9 @@ def offset_test(
 
 
 def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[Run]) -> dict[str, list[Floats]]:
-    """Return d(residuals)/d(parameters) of each output, per run, with shape (parameters, samples); {} if not finite.
+    """Return the sensitivities of residuals to parameters by output, an array (parameters, samples) for each run.
 
-    Their projection on the initial terms is subtracted.
+    The projection on the initial terms is subtracted. The result is {} if a sensitivity is not finite.
     """
     try:
         grid, point = evaluate_at_point(runs, structure, joint.values_by_name, max(joint.refinement, 1))
@@ -204,7 +209,10 @@ def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[R
 
 
 def without_offset_equivalents(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
-    """Return Caputo's initial terms without powers of t that act like an offset; others unchanged."""
+    """Return initial terms without those that act like an offset; only ``"caputo"`` is changed.
+
+    A power of t is such a term if the response to a constant contains it.
+    """
     if initial != "caputo":
         return initial
     exponents: set[float] = set()
@@ -215,7 +223,7 @@ def without_offset_equivalents(initial: Initial, structure: Structure, values: M
 
 
 def _residual_blocks(grid: Objective) -> list[list[tuple[int, int]]]:
-    """Return first and last index of the residuals of every output, by run."""
+    """Return, for each run, the (start, stop) indices of each output's block in the residual vector."""
     blocks, at = [], 0
     for _, count in grid.counts:
         own = []
@@ -227,7 +235,7 @@ def _residual_blocks(grid: Objective) -> list[list[tuple[int, int]]]:
 
 
 def _colored_covariance(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:
-    """Return the covariance of projections onto directions under autoregressive noise of each output."""
+    """Return the covariance of the projections of noise onto directions; each output's noise is autoregressive."""
     total: Floats = np.zeros((directions.shape[1], directions.shape[1]))
     scale = noise.size / max(degrees, 1)
     for output in range(len(blocks[0])):
@@ -248,7 +256,7 @@ def _colored_covariance(directions: Floats, noise: Floats, blocks: list[list[tup
 
 
 def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str]) -> list[Finding]:
-    """Return a finding if an offset that was not requested would explain the residuals."""
+    """Return a finding if an offset that the user did not request would explain part of the residuals."""
     if test is None or not test.exceeds(UNREQUESTED_OFFSET_LEVEL, size=MIN_OFFSET_SIZE_RATIO):
         return []
     numbers = {"share": 100 * min(test.share, 1), "test": test.statistic_text}
@@ -258,11 +266,11 @@ def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str])
 def errors_with_orders(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float]
 ) -> dict[str, float] | None:
-    """Return standard errors of orders and coefficients from an order search; None if not computable.
+    """Return standard errors of orders and coefficients after an order search, by name; None if not computable.
 
-    Refined instruments make instrumental variables as precise as output error at the optimum. The errors are therefore
-    those of output error with free orders, robust to colored residuals. The distance from the grid point to the optimum
-    is added as an error.
+    Refined instrumental variables are as efficient as output error. The standard errors are therefore those of output
+    error with free orders, robust to colored residuals. The distance from the grid point to the optimum is added as a
+    further error.
     """
     try:
         grid, point = evaluate_at_point(runs, replace(structure, coefficient_law=()), values, DEFAULT_PULSES_PER_SAMPLE)
@@ -289,9 +297,10 @@ def fit_with_initial_conditions(
 ) -> JointFit:
     """Fit a structure to runs with unknown initial conditions, and select the initial terms.
 
-    With `alone`, the first known value set is the only initial guess. A fit with a history (past inputs) is kept unless
-    Caputo initial terms leave residuals as small. A fit from rest is kept unless a history improves it significantly.
-    The result states which terms were fitted.
+    `start` are the initial conditions suggested by the data. A fit with a history (powers of t that represent past
+    inputs) is kept unless the fewer Caputo initial terms leave equally small residuals. A fit from rest is kept unless
+    a history improves it significantly. The result names the fitted terms in ``initial``. With `alone`, the first of
+    `guesses` is the only initial guess.
     """
 
     def fit_initial_terms(
@@ -324,13 +333,16 @@ def fit_with_initial_conditions(
 
 
 def fit_score(joint: JointFit, reference: JointFit, levels: int = 0) -> float:
-    """Return the criterion of a fit's start (:func:`start_score`); `levels` are numbers beside its initial terms."""
+    """Return the information criterion of a fit, by which initial conditions are compared; lower is better.
+
+    The noise color is that of the fit `reference`. `levels` are constants that are counted like initial terms.
+    """
     own, others = _pooled_residuals(joint), _pooled_residuals(reference)
     return start_score(own, joint.initial_terms + levels, others)
 
 
 def has_colored_residuals(joint: JointFit) -> bool:
-    """Whether residuals have the color of a structure or of a start that leaves something out."""
+    """Whether the residuals have the color that a missing term or a wrong initial condition produces."""
     inflation = (variance_inflation(drop_missing(series)) for series in _pooled_residuals(joint))
     return max(inflation) > START_SETTINGS.white_inflation
 
@@ -338,13 +350,13 @@ def has_colored_residuals(joint: JointFit) -> bool:
 def has_white_residuals(joint: JointFit) -> bool:
     """Whether the residuals of every output are white.
 
-    Unlike :func:`has_colored_residuals`, this detects oscillation.
+    Unlike :func:`has_colored_residuals`, this test detects oscillating residuals.
     """
     return all(is_white(drop_missing(series)) for series in _pooled_residuals(joint))
 
 
 def _pooled_residuals(joint: JointFit) -> list[Floats]:
-    """Return the residuals of each output in its unit, all runs together."""
+    """Return the residuals of each output in its unit, concatenated over all runs."""
     return [noise * np.concatenate([part[o] for part in joint.residuals]) for o, noise in joint.noise.items()]
 
 
@@ -372,9 +384,9 @@ def refit_if_accepted(
 ) -> JointFit | None:
     """Return the refit of a linear structure with other initial conditions or offsets; None if rejected or failed.
 
-    First, at most `MAX_SCREENING_EVALUATIONS` are made from the optimum. The residuals that they leave, multiplied by
-    `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of the complete fit. `refit` is called only if
-    `accepts` accepts this estimate, and its result must be accepted, too.
+    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The remaining
+    residuals, multiplied by `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of a complete fit. `refit`
+    makes the complete fit only if `accepts` accepts this estimate. Its result must also be accepted.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
@@ -402,13 +414,13 @@ def refit_if_accepted(
 def refit_from(
     joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss = "squares", *, refine: bool = False
 ) -> JointFit:
-    """Fit another structure from an earlier optimum; without `refine` on the coarsest grid that it allows."""
+    """Return the fit of another structure, started from an optimum; without `refine` on the coarsest grid."""
     values = joint.values_by_name
     return fit_output_error(runs, structure, start=values, loss=loss, refine=refine)
 
 
 def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
-    """Return a fit with Caputo terms and a constant if it replaces a history, otherwise None."""
+    """Return a fit with Caputo initial terms and a constant if it fits as well as one with a history, else None."""
     request = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
@@ -422,14 +434,14 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
 
 
 def _fit_needs_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
-    """Whether a fit with few initial terms has significantly larger residuals than one with a history."""
+    """Whether a fit with few initial terms has significantly larger residuals than one with many."""
     ours, theirs = _pooled_residuals(few), _pooled_residuals(many)
     sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in structure.outputs]
     return needs_history(structure, ours, theirs, sizes, (few.initial_terms, many.initial_terms))
 
 
 def _has_nonzero_start(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
-    """Whether the residuals of a fit from rest require nonzero initial conditions."""
+    """Whether the runs, at the parameters of a fit from rest, require nonzero initial conditions."""
     problem = FreeProblem.of(structure)
     numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
     return is_in_motion(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs), runs)

@@ -1,4 +1,4 @@
-"""Output-error objective on sampled runs: residuals, minimization and covariance."""
+"""Output-error objective on sampled runs: evaluation of residuals, minimization, and covariance of the parameters."""
 
 from __future__ import annotations
 
@@ -30,16 +30,19 @@ def sample_run(
     decimation: int = 1,
     shares: Floats | None = None,
 ) -> _core.Experiment:
-    """Convert a run for the core, with `every` pulses per sampling interval and each `decimation`-th sample.
+    """Return a run as an object of the core, with block pulses and samples at the given resolution.
 
-    `shares` are the robust weights of the compared samples, one row an output. Missing samples have weight 0.
+    `weights` are the reciprocal noise standard deviations of the outputs, `every` is the number of block pulses per
+    sampling interval, and every `decimation`-th sample is compared.
+
+    `shares` are the robust weights of the compared samples, of shape (outputs, samples). Missing samples have weight 0.
     """
     return recording(run, problem.structure).experiment(every, decimation, list(weights), shares)
 
 
 @dataclass
 class Iterate:
-    """Point in parameter space with its origin and the result of its evaluation by the core."""
+    """Point in parameter space, the initial guess it came from, and its evaluation by the core."""
 
     orders: list[float]
     coefficients: list[float]
@@ -49,17 +52,17 @@ class Iterate:
 
     @property
     def values(self) -> Floats:
-        """Orders, coefficients and input parameters."""
+        """Vector of orders, coefficients and input parameters."""
         return np.array(self.orders + self.coefficients + self.inputs)
 
     @property
     def cost_per_residual(self) -> float:
-        """Cost per residual: 1 at the noise level if the weights are right."""
+        """Mean squared weighted residual, which is 1 if the weights are the reciprocal noise standard deviations."""
         return 2.0 * float(self.outcome["cost"]) / len(self.outcome["residuals"])
 
     @property
     def has_converged(self) -> bool:
-        """Whether the gradient vanishes, apart from active bounds; False at another constraint."""
+        """Whether the gradient vanishes, apart from active bounds; False at any other active constraint."""
         return bool(self.outcome["status"] == "converged")
 
 
@@ -74,10 +77,12 @@ def minimize_cost(
     tolerance: float = COST_REDUCTION_TOLERANCE,
     prefer_stable: bool = False,
 ) -> Iterate:
-    """Minimize the cost by Levenberg-Marquardt; parameters with an index in `fixed` stay fixed.
+    """Minimize the output-error cost by Levenberg-Marquardt; parameters with an index in `fixed` stay constant.
 
-    With `prefer_stable`, no step leads from a stable model to an unstable one. Initial states of bodies with friction
-    are not projected out and continue from the last values.
+    `attempt` is the initial point, and `evaluations` is the maximum number of evaluations. Coefficients are varied as
+    logarithms where their signs permit it; with `plain` they are varied themselves.
+
+    With `prefer_stable`, no step leads from a stable model to an unstable one.
     """
     states = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     outcome = problem.core.minimize(
@@ -96,10 +101,13 @@ def minimize_cost(
 
 @dataclass(frozen=True)
 class Objective:
-    """Output-error objective on sampled runs: problem, output weights, pulses per sample, decimation.
+    """Output-error objective: an estimation problem and runs at a given resolution.
 
-    `robust_weights` holds the weights of a robust loss by run, one row an output. With `prefer_stable`, no step leads
-    from a stable model to an unstable one.
+    `weights` are the reciprocal noise standard deviations of the outputs, `every` is the number of block pulses per
+    sampling interval, and every `decimation`-th sample is compared.
+
+    `robust_weights` are the weights of a robust loss: for each run an array (outputs, samples). With `prefer_stable`,
+    no optimization step leads from a stable model to an unstable one.
     """
 
     problem: FreeProblem
@@ -112,12 +120,12 @@ class Objective:
 
     @property
     def recordings(self) -> list[_core.Recording]:
-        """Runs in the form that the core samples."""
+        """Runs as objects of the core, before they are sampled."""
         return [recording(run, self.problem.structure) for run in self.runs]
 
     @cached_property
     def experiments(self) -> list[_core.Experiment]:
-        """Runs in the form that the core compares with."""
+        """Runs as sampled objects of the core, with which simulations are compared."""
         shares = [None] * len(self.runs) if self.robust_weights is None else self.robust_weights
         return [
             sample_run(run, self.problem, self.weights, every=self.every, decimation=self.decimation, shares=share)
@@ -146,11 +154,14 @@ class Objective:
         )
 
     def evaluate(self, attempt: Iterate) -> Iterate:
-        """Evaluate residuals and cost at a point, without derivatives."""
+        """Return the residuals and the cost at a point, without derivatives."""
         return self.minimize(attempt, 0)
 
     def residuals(self, attempt: Iterate) -> list[dict[str, Floats]]:
-        """Return unweighted residuals in noise deviations by run and output; NaN for missing samples."""
+        """Return residuals divided by noise standard deviations, by run and output, without robust weights.
+
+        Missing samples are NaN.
+        """
         residuals = np.asarray(attempt.outcome["residuals"])
         parts, at = [], 0
         for shares, count in self.counts:
@@ -165,36 +176,33 @@ class Objective:
 
     @property
     def counts(self) -> list[tuple[Floats | None, int]]:
-        """Robust weights and number of compared samples of each run."""
+        """Robust weights and number of compared samples for each run."""
         return [(e.robust_weights, e.compared_count) for e in self.experiments]
 
     @property
     def residual_weights(self) -> Floats:
-        """Robust weight of every residual, in the order of the core."""
+        """Robust weight of every residual, in the order of the core's residual vector."""
         outputs = len(self.problem.structure.outputs)
         return np.concatenate(
             [np.ones(outputs * count) if shares is None else shares.ravel() for shares, count in self.counts]
         )
 
     def rms_residuals(self, attempt: Iterate) -> dict[str, float]:
-        """Return the root mean square of the weighted residuals by output, over all runs.
-
-        Infinite on overflow.
-        """
+        """Return the root mean square of the weighted residuals by output, over all runs; infinite on overflow."""
         with np.errstate(over="ignore"):
             return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled_residuals(attempt).items()}
 
     def pooled_residuals(self, attempt: Iterate) -> dict[str, Floats]:
-        """Return the weighted residuals by output, all runs concatenated, missing samples left out."""
+        """Return the weighted residuals by output, concatenated over all runs, without missing samples."""
         parts = self.residuals(attempt)
         return {o: drop_missing(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
 
 
 def covariance(attempt: Iterate, grid: Objective) -> Floats:
-    """Return the covariance of the parameters, robust to autocorrelation if residuals are not white.
+    """Return the covariance matrix of the parameters at an optimum, robust to colored residuals.
 
-    Nothing is truncated: a parameter in a direction that the data do not determine has infinite variance. Under a
-    robust loss the covariance is that of an M-estimator.
+    A parameter that is not identifiable has infinite variance; no small singular values are truncated. With a robust
+    loss the matrix is the covariance of an M-estimator.
     """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
     shares = None if grid.robust_weights is None else grid.residual_weights
@@ -202,7 +210,9 @@ def covariance(attempt: Iterate, grid: Objective) -> Floats:
 
 
 def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) -> Floats:
-    """Return the covariance from a Jacobian (one row per parameter), residual series and their sum of squares.
+    """Return the covariance of parameters from a Jacobian of shape (parameters, residuals) and the residuals.
+
+    `series` are the residuals of each run and output, and `squares` is their sum of squares.
 
     Missing residuals are NaN. Covariances with a parameter of infinite variance are NaN.
     """
@@ -210,7 +220,11 @@ def covariance_of(jacobian: Floats, series: Sequence[Floats], squares: float) ->
 
 
 def propagated_errors(slopes: Floats, spread: Floats) -> Floats:
-    """Return standard errors by first-order propagation, infinite if a variance involved is infinite."""
+    """Return standard errors of functions of the parameters, to first order.
+
+    `slopes` are the derivatives (functions, parameters), and `spread` is the covariance. The error is infinite if a
+    function depends on a parameter of infinite variance.
+    """
     unidentifiable = np.isinf(np.diag(spread))
     columns = slopes[:, ~unidentifiable]
     variance = np.einsum("ij,jk,ik->i", columns, spread[np.ix_(~unidentifiable, ~unidentifiable)], columns)

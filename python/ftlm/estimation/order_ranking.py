@@ -1,4 +1,4 @@
-"""Order search with the verdict that an identification at its best orders gets."""
+"""Order search whose result has the verdict of an identification at the best orders."""
 
 from __future__ import annotations
 
@@ -49,51 +49,52 @@ def search_orders(
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Search the orders of an equation, or of coupled equations under an order law, exhaustively over a grid.
+    """Search the orders of an equation over a grid, or of coupled equations under an order law; all are compared.
 
-    Each candidate gets coefficients from the equation error, then a score. The table equals that of a full evaluation
-    of every candidate, bit for bit for any number of threads on one kind of processor (paper Table 2, steps 5-7).
+    For each candidate, the coefficients are estimated from the equation error, and the candidate gets a score (Table 2
+    of the paper, steps 5-7). The table of best candidates equals that of a full evaluation of every candidate. It is
+    the same bit for bit for any number of threads on processors of one kind.
 
     Parameters
     ----------
     runs
-        One run or several with the same names and units; scores add up.
+        One run, or several runs with the same names and units, whose scores are added.
     equation
         Structure with free orders; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
     order_grid
-        Intervals and increment; see :func:`ftlm.order_grid`.
+        Intervals and increment of the orders; see :func:`ftlm.order_grid`.
     criterion
-        ``"output-error"``: the simulation, each equation driven by the measured other outputs. ``"equation-error"``:
-        measured signals on the right-hand side; it prefers near-identities.
+        Error that is scored. ``"output-error"``: that of a simulation of each equation, whose inputs include the
+        measured other outputs. ``"equation-error"``: that of the equation with measured signals on the right-hand side.
+        It prefers equations that are nearly identities, in which a signal predicts itself.
     coefficients
-        ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``:
-        refined instrumental variables for every candidate, which noise on the outputs does not bias. Measured outputs
-        that drive an equation are replaced by their projections on what the inputs excite, as instruments and in the
-        score.
+        Estimator of the coefficients: ``"multi-innovation"`` (closed form of equation (44)), ``"least-squares"``, or
+        ``"instrumental-variables"`` for refined instrumental variables, which noise on the outputs does not bias. With
+        instrumental variables, measured outputs that enter another equation are replaced by their projections on
+        filtered inputs.
     norm
-        ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
+        ``"l1"`` for the sum of absolute errors (45) of the paper, or ``"l2"`` for the RMSE (46).
     innovation_length, prior_covariance, row_basis
-        p and K0 of paper (43)-(44), and whether rows come in Haar coordinates (``"haar"``) or in the order of time
-        (``"time"``). Without K0 the prior is weak in any units; see :class:`ftlm.MultiInnovation`. Of
-        ``"multi-innovation"`` alone; with other coefficients a change of them is refused.
+        Options of ``"multi-innovation"``; see :class:`ftlm.MultiInnovation`. With another estimator they must have
+        their default values.
     m
-        Block pulses per run; default 2 048, or what the runs carry.
+        Number of block pulses per run; by default 2048, or fewer for shorter runs.
     top
-        Rows of the table.
+        Number of rows of the table.
     threads
-        Threads; default all cores.
+        Number of threads, by default all cores.
     progress
-        Called about twenty times a second with (candidates done, candidates in all).
+        Callback with (candidates done, total candidates), called about twenty times a second.
     pruning
-        Whether to leave a candidate once it cannot be kept, by a proved bound of its score or by its partial sum;
-        False is brute force, with the same table.
+        Whether a candidate is excluded as soon as a lower bound or the partial sum of its score exceeds the worst score
+        in the table. False evaluates every candidate in full, with the same table.
     store
-        File in which finished work is kept, on disk within a second; the same call goes on with it after a power cut,
-        and so does :func:`resume_search`.
+        Checkpoint file, to which finished work is written within a second. After an interruption, the same call or
+        :func:`resume_search` continues from it.
     executor
-        Any :class:`concurrent.futures.Executor` to work for this search: threads, processes, or a cluster's, such as
-        ``dask.distributed.Client(…).get_executor()``. The result is the same to the last bit on processors of one kind.
-        `threads` are those of one task then, one by default.
+        :class:`concurrent.futures.Executor` that evaluates candidates in threads, in processes or on a cluster, such as
+        ``dask.distributed.Client(…).get_executor()``. The result does not change on processors of one kind. `threads`
+        then counts the threads of one task, by default one.
 
     Returns
     -------
@@ -103,22 +104,22 @@ def search_orders(
     Raises
     ------
     DataError
-        Runs that do not fit, or a constant output; a store of another search, in use, damaged, or that cannot be
-        written.
+        If runs lack a signal of the equation, an output is constant, or the checkpoint file belongs to another search,
+        is in use, is damaged or cannot be written.
     ModelError
-        Nothing to search, a grid without or with too many candidates, settings out of range, an option that these
-        coefficients do not use; what needs more memory than the machine has left, or than ``FTLM_MEMORY`` allows.
+        If no order is free, the grid has no or too many candidates, an option is out of range or not used by
+        `coefficients`, or the search needs more memory than is free or than ``FTLM_MEMORY`` allows.
     ConvergenceError
-        An executor that has lost its workers.
+        If the executor has lost its workers.
     KeyboardInterrupt
-        Ctrl-C, within half a second.
+        On Ctrl-C, within half a second.
 
     Notes
     -----
-    One Gram matrix of distinct regressors serves all candidates. Each costs a k x k solve and a lower bound of its
-    score from a few inner products. Candidates that the bound does not exclude are simulated, likely ones first, until
-    their partial sum exceeds the threshold. Candidates are generated by index, so memory does not grow with their
-    number.
+    All candidates share one Gram matrix of the distinct regressors. For k coefficients, a candidate takes the solution
+    of k linear equations, and a lower bound of its score from a few inner products. Candidates that the bound does not
+    exclude are simulated, promising ones first, until their partial sum exceeds the threshold. Candidates are generated
+    from their index, so memory does not grow with their number.
     """
     settings: dict[str, Any] = {
         "criterion": criterion,
@@ -154,7 +155,7 @@ def with_verdict(
     *,
     m: int | None = None,
 ) -> SearchResult:
-    """Return an order search with the verdict and the findings that :func:`ftlm.identify` gives at rank 1."""
+    """Return an order search with the verdict and the findings of an identification at its best orders."""
     name = "stage" if structure.has_order_law else structure.outputs[0]
     first = replace(search, table=search.table[:1])
     try:
@@ -167,10 +168,10 @@ def with_verdict(
 
 
 def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]:
-    """Return a finding on rows whose score exceeds that of rank 1 by no more than noise explains.
+    """Return a finding on table rows whose score is not significantly larger than that of rank 1.
 
-    With N independent samples the squares of the truth exceed those of the best of k free orders by a chi-squared
-    number with k degrees of freedom, divided by N. Colored residuals count as fewer samples.
+    For N independent residuals, the sum of squares at the true k free orders exceeds that at the best ones by a
+    relative amount of chi-squared with k degrees of freedom, divided by N. Colored residuals count as fewer samples.
     """
     samples = min(sum(map(_independent_samples, o.residuals)) for o in residuals.outputs.values())
     best, distinct = search.table[0], search.distinct_rows
@@ -192,7 +193,7 @@ def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]
 
 
 def _independent_samples(residuals: Floats) -> float:
-    """Number of independent samples with the information of a series of correlated ones."""
+    """Return the number of independent samples that carry as much information as a series of correlated ones."""
     samples = drop_missing(residuals)
     if samples.size < 2 or is_constant([samples]):
         return float(samples.size)

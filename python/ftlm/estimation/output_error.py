@@ -1,4 +1,4 @@
-"""Joint output-error fit: multistart, optimum with its statistics, and the free parameters in model files."""
+"""Joint output-error fit: multistart, optimum with its statistics, and free parameters stored in model files."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ Noise = Literal["white", "ar"]
 
 @dataclass(frozen=True)
 class UnstableOptimum:
-    """Unstable optimum compared with the best stable optimum.
+    """Comparison of an unstable optimum with the best stable optimum.
 
     Parameters
     ----------
     is_accepted
-        Whether the fit is the unstable optimum, because the data require it or no stable one exists.
+        Whether the unstable optimum was chosen, because the data require it or no stable optimum exists.
     residual_excess
-        Relative excess of the root-mean-square residuals of the stable optimum. Infinite if there is none; negative if
-        the unstable point is not an optimum.
+        Relative excess of the RMS residuals of the stable optimum over those of the unstable one. Infinite if there is
+        no stable optimum; negative if the unstable point is not an optimum.
     at_stability_limit
-        Whether the stable point lies on the stability limit and is not an optimum of its own.
+        Whether the stable point lies on the stability limit, so that it is an optimum only under this constraint.
     """
 
     is_accepted: bool
@@ -54,22 +54,23 @@ class UnstableOptimum:
 
 @dataclass(frozen=True)
 class ProfileInterval:
-    """Interval of a parameter on which the profiled cost rises by no more than the noise explains.
+    """Profile-likelihood interval of a parameter.
 
-    At each value all other parameters are refitted.
+    It contains the values at which the cost, minimized over all other parameters, rises by no more than the noise
+    explains.
 
     Parameters
     ----------
     low, high
-        Ends, in the unit of the parameter; infinite if the cost does not reach the threshold within the bounds, or
-        within the range of finite simulations.
+        Bounds of the interval, in the unit of the parameter. A bound is infinite if the cost does not reach the
+        threshold within the bounds of the parameter or within the range of finite simulations.
     level
         Confidence level.
     points
-        (value, rise) of every refit. The rise is that of the sum of squares over the noise variance, so its root counts
-        standard deviations. It is corrected for colored residuals as standard errors are.
+        (value, rise) of every refit. The rise is the increase of the sum of squares divided by the noise variance, so
+        its square root counts standard deviations. Like standard errors, it is corrected for colored residuals.
     evaluations
-        Number of simulations.
+        Number of simulations used.
     """
 
     low: float
@@ -80,7 +81,7 @@ class ProfileInterval:
 
     @property
     def is_open(self) -> bool:
-        """Whether the interval is unbounded on either side."""
+        """Whether the interval is unbounded on at least one side."""
         return not (math.isfinite(self.low) and math.isfinite(self.high))
 
     @check_arguments
@@ -97,14 +98,14 @@ OUTLIER_DEVIATIONS = 5.0
 
 @dataclass(frozen=True)
 class RobustLossSummary:
-    """Number of residuals that a robust loss downweighted, and number of outliers.
+    """Numbers of residuals with reduced weight and of outliers in a fit with a robust loss.
 
     Parameters
     ----------
     downweighted_count
-        Residuals beyond 1.345 standard deviations, which are downweighted (18 % of normal noise).
+        Number of residuals beyond 1.345 standard deviations, which have reduced weight (18 % of normal noise).
     outliers
-        Residuals beyond five standard deviations.
+        Number of residuals beyond five standard deviations.
     samples
         Total number of residuals.
     """
@@ -122,50 +123,49 @@ SAME_COST = 1e-3
 
 @dataclass(frozen=True)
 class JointFit:
-    """Optimum of the joint output error.
+    """Optimum of a joint output-error fit of all equations to all runs, with its statistics.
 
     Parameters
     ----------
     orders, coefficients
-        Free orders and free coefficients by name; under a coefficient law those that the law leaves free.
+        Estimated free orders and free coefficients by name. With a coefficient law, these are its independent factors.
     covariance
-        Covariance of orders, coefficients and input parameters, robust to colored residuals. Variances are infinite for
-        parameters that the data do not determine, and their covariances NaN.
+        Covariance matrix of orders, coefficients and input parameters, in this order, robust to colored residuals.
+        Parameters that are not identifiable have infinite variances, and NaN covariances.
     noise
-        Standard deviation of the residuals by output; under a robust loss from their median absolute value.
+        Standard deviation of the residuals by output; with a robust loss, estimated from their median absolute value.
     cost
         Half the sum of squared weighted residuals.
     samples
         Number of residuals, without missing samples.
     refinement
-        Block pulses per sampling interval on the finest grid. The estimates are extrapolated from it and the
-        next coarser one.
+        Number of block pulses per sampling interval on the finest grid. The estimates are extrapolated from this grid
+        and the next coarser one to step 0.
     step_converged
         Whether halving the step moved every estimate by less than a tenth of its standard error.
     converged
-        Whether the gradient vanishes, apart from active bounds. False if the evaluations ran out, no step lowered the
-        cost, or the path left the range that the grid can represent.
+        Whether the gradient vanishes, apart from active bounds. False if the maximum number of evaluations was reached,
+        no step lowered the cost, or the iterates left the range that the time grid can represent.
     starts
-        Coarse cost (per residual) and origin of every initial guess, best first.
+        (cost per residual on a coarse grid, origin) of every initial guess, best first.
     survivors
-        Coarse cost (per residual) and parameters of the distinct best candidates of the multistart.
+        (cost per residual on a coarse grid, parameters) of the distinct best candidates of the multistart.
     residuals
-        Residuals in noise standard deviations by run and output; NaN for missing samples.
+        Residuals divided by the noise standard deviation, for each run by output; NaN for missing samples.
     products
-        Coefficients that the coefficient law gives: sign and factors by name.
+        Coefficients that follow from a coefficient law: (sign, names of the factors) by name.
     inputs
-        Estimated delays [s], saturations and dead zones by name, such as ``delay_u`` and ``sat_u``; last in the
-        covariance.
+        Estimated delays [s], saturations and dead zones by name, such as ``delay_u`` and ``sat_u``.
     initial, initial_terms
-        Fitted initial terms, and their number of coefficients over all runs.
+        Kind of the fitted initial terms, and the number of their coefficients over all runs.
     robust
         Summary of a robust loss; None for squares.
     robust_weights
-        Robust weight of each sample by run, one row an output.
+        Robust weights of the samples, an array (outputs, samples) for each run.
     finest_grid_values
         Parameters at the optimum of the finest grid, in the order of the covariance.
     origin
-        Origin of the fit if it had no multistart.
+        Description of the initial guess if there was no multistart.
     profiles
         95 % profile-likelihood intervals of the parameters that have one.
     unstable_optimum
@@ -202,7 +202,7 @@ class JointFit:
 
     @property
     def origin_text(self) -> str:
-        """Description of the initial guess that led to this optimum, and of the cost of the next optimum."""
+        """Text on the initial guess that led to this optimum, and on the cost of the second-best optimum."""
         if not self.starts:
             return f"from {self.origin}"
         level, origin = self.starts[0]
@@ -213,7 +213,7 @@ class JointFit:
 
     @property
     def derived_errors(self) -> dict[str, float]:
-        """Standard errors of the coefficients that the coefficient law gives, to first order."""
+        """Standard errors, to first order, of the coefficients that follow from a coefficient law, by name."""
         block = slice(len(self.orders), len(self.orders) + len(self.coefficients))
         out, spread = {}, self.covariance[block, block]
         for name, (sign, factors) in self.products.items():
@@ -234,13 +234,13 @@ class JointFit:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Standard error of each parameter."""
+        """Standard errors of the parameters by name."""
         with np.errstate(invalid="ignore"):
             return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % interval of each parameter: profile likelihood if available, else ± 1.96 standard errors."""
+        """95 % intervals of the parameters by name: profile likelihood if available, else ± 1.96 standard errors."""
         errors = self.standard_errors
         pairs = self.values_by_name.items()
         quadratic = {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in pairs}
@@ -248,7 +248,7 @@ class JointFit:
 
     @property
     def correlation(self) -> Floats:
-        """Correlation matrix of the parameters; NaN for variances that are 0 or not finite."""
+        """Correlation matrix of the parameters; NaN in rows of parameters whose variance is 0 or not finite."""
         with np.errstate(divide="ignore", invalid="ignore"):
             spread = np.sqrt(np.diag(self.covariance))
             scaled: Floats = self.covariance / np.outer(spread, spread)
@@ -258,14 +258,14 @@ class JointFit:
 def run_multistart(
     runs: Sequence[Run], structure: Structure, threads: int, progress: Callable[[int, int], None] | None
 ) -> _core.JointMultistart:
-    """Run the multistart of a structure. Later fits of the same structure to the same runs may reuse it."""
+    """Run the multistart of a structure, and return its state for later fits of the same structure and runs."""
     problem = _check_sample_count(runs, structure)
     recordings = [recording(run, structure) for run in runs]
     return _core.joint_multistart(problem.core, recordings, (threads, memory_limit()), progress, stop_flag())
 
 
 def _check_sample_count(runs: Sequence[Run], structure: Structure) -> FreeProblem:
-    """Return the problem of a structure; raise DataError if the runs have too few samples for it."""
+    """Return the estimation problem of a structure; raise DataError if the runs have too few samples."""
     problem = FreeProblem.of(structure)
     values = [compared_values(run, structure, output) for run in runs for output in structure.outputs]
     samples = sum(max(drop_missing(samples_of_output).size - 2, 0) for samples_of_output in values)
@@ -279,7 +279,7 @@ def _check_sample_count(runs: Sequence[Run], structure: Structure) -> FreeProble
 
 
 def output_deviations(runs: Sequence[Run], structure: Structure) -> list[float]:
-    """Return the standard deviation of each output, as the root of the mean variance over all runs."""
+    """Return the standard deviation of each output: the square root of its mean variance over all runs."""
     return [math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in structure.outputs]
 
 
@@ -296,20 +296,21 @@ def fit_output_error(
     near: JointFit | None = None,
     multistart: _core.JointMultistart | None = None,
 ) -> JointFit:
-    """Fit all equations of a structure to all runs by output error, with automatic initialization.
+    """Return the joint output-error fit of all equations of a structure to all runs.
 
-    A coefficient law of the structure is imposed, and its initial terms must be decided. `start` gives values of all
-    free parameters by name and replaces the automatic initial guesses; `guesses` adds to them. `near` is a fit of the
-    same structure to nearly the same runs, whose grid and weights are reused. `multistart` is the result of an earlier
-    multistart. Without `refine` the grid is not refined below the samples. Progress is called with (parts done, total
-    parts). The loss ranks optima on all samples, but not the initial guesses.
+    A coefficient law of the structure is imposed. The structure must not have ``initial="auto"``. `start` gives values
+    of all free parameters by name and replaces the automatic initial guesses, whereas `guesses` adds to them. `near` is
+    a fit of the same structure to nearly the same runs, whose grid and weights are reused. `multistart` is the result
+    of an earlier multistart. Without `refine`, the time step is not refined below the sampling interval. `progress` is
+    called with (parts done, total parts). The loss compares optima on all samples; initial guesses are compared by
+    squared residuals.
 
     Raises
     ------
     DataError
-        Fewer samples than free parameters.
+        If there are fewer samples than free parameters.
     ConvergenceError
-        No initial guess has a finite simulation or a finite sum of squares.
+        If no initial guess has a finite simulation or a finite sum of squares.
     """
     problem, outputs = _check_sample_count(runs, structure), structure.outputs
     given_near = None
@@ -364,7 +365,7 @@ def fit_output_error(
 
 
 def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:
-    """Return a fit in the form in which the core takes up its objective."""
+    """Return a fit as keyword data, from which the core restores its objective and optimum."""
     # If an unstable optimum was left, its valley is not that of the fit.
     steady = joint.unstable_optimum is not None and not joint.unstable_optimum.is_accepted
     return {
@@ -379,7 +380,7 @@ def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:
 
 
 def start_from_values(problem: FreeProblem, values: Mapping[str, float]) -> Iterate:
-    """Return an initial guess from values by name."""
+    """Return an initial guess as an iterate, from parameter values by name."""
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     return Iterate(orders, coefficients, "given start", {}, inputs)
 
@@ -389,7 +390,7 @@ ORDER_BOUND_MARGIN = 0.5
 
 
 def parameter_set(joint: JointFit, structure: Structure) -> FitParameters:
-    """Return the free parameters of a joint fit, with their covariance and noise."""
+    """Return the free parameters of a joint fit with their covariance and noise, as a model file stores them."""
     orders = [order for e in structure.equations for order in (e.order, *(t.order for t in e.terms))]
     spread = joint.covariance
     return FitParameters(
@@ -403,12 +404,12 @@ def parameter_set(joint: JointFit, structure: Structure) -> FitParameters:
 
 
 def parameter_set_of(model: Model) -> FitParameters:
-    """Return the set of free parameters that a model file stores.
+    """Return the free parameters, with covariance and noise, that a model file stores.
 
     Raises
     ------
     ModelError
-        The model was not estimated, comes from another method, or its file does not list the free parameters.
+        If the model was not estimated by output error, or its file does not list the free parameters.
     """
     free = None if model.estimate is None else model.estimate.free
     if free is None or isinstance(free, UnsetType):
@@ -421,12 +422,12 @@ def parameter_set_of(model: Model) -> FitParameters:
 
 
 def problem_of(model: Model) -> tuple[FreeProblem, list[float]]:
-    """Return the estimation problem of a model for a run that starts at rest, and its parameter values.
+    """Return the estimation problem of a fitted model for runs that start at rest, and its parameter values.
 
     Raises
     ------
     ModelError
-        The model does not list its free parameters, or its orders do not fit its equations.
+        If the model does not list its free parameters, or the list contradicts its equations.
     """
     parameter_set, estimate = parameter_set_of(model), model.estimate
     values = {} if estimate is None else estimate.values

@@ -1,4 +1,4 @@
-"""Residuals of measured frequency responses with exact derivatives by orders, coefficients and delays, and starts."""
+"""Residuals of measured frequency responses with exact derivatives, and initial guesses."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ MAX_EXPONENT = 1.0
 
 
 def exponent_bound(name: str) -> str:
-    """Description of the upper bound of an exponent in an impedance."""
+    """Return a description of the upper bound of an exponent of an impedance, for messages."""
     return f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
 
 
 def is_impedance(record: FrequencyData) -> bool:
-    """Whether a record is an impedance, by its unit."""
+    """Whether the unit of a record is that of an impedance."""
     return record.unit.endswith("Ω")
 
 
@@ -46,9 +46,9 @@ class ResponseRecord:
 
 
 class ResponseProblem:
-    """Structure and measured responses in scaled time, so that the parameters are near 1.
+    """Estimation problem of a structure from measured responses, in a time unit in which parameters are near 1.
 
-    Time is counted in 1/`unit` of a second. Parameters have the order of `names`: free orders, free coefficients, free
+    The time unit is 1/`unit` seconds. Parameter vectors have the order of `names`: free orders, free coefficients, free
     delays.
     """
 
@@ -87,11 +87,11 @@ class ResponseProblem:
         self.term_of = {t.coefficient: (e, t) for e in structure.equations for t in e.terms}
 
     def with_records(self, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> ResponseProblem:
-        """Return the problem of other records."""
+        """Return the same problem for other measured responses and weights."""
         return ResponseProblem(self.structure, records, weights)
 
     def default_start(self) -> dict[str, float]:
-        """Return values of orders and coefficients for an initial guess that does not name them."""
+        """Return default values of orders and coefficients by name, which complete a user's initial guess."""
         usual = dict.fromkeys(self.coefficients, 1.0)
         for name in self.orders:
             grid = self.structure.order_values.get(name, (1.0,))
@@ -99,7 +99,7 @@ class ResponseProblem:
         return usual
 
     def sort_groups(self, values: Floats) -> Floats:
-        """Return values in which exchangeable parts have a fixed order; equations have none."""
+        """Return the parameters unchanged: equations, unlike circuits, have no exchangeable groups to sort."""
         return values
 
     def initial_guesses(self) -> list[Floats]:
@@ -107,7 +107,7 @@ class ResponseProblem:
         return initial_guesses(self)
 
     def order_at(self, order: Order, values: Floats) -> float:
-        """Return the value of an order."""
+        """Return the value of an order of the equations at given parameters."""
         return order.constant + math.fsum(w * float(values[self._place[n]]) for n, w in order.weights)
 
     def in_problem_units(self, values: Floats) -> Floats:
@@ -119,7 +119,7 @@ class ResponseProblem:
         return self._convert_time_unit(values, 1.0)
 
     def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-        """Return intervals of parameters [in seconds] of given half-widths by name."""
+        """Return (low, high) by name from half-widths by name; parameters are in SI units (seconds)."""
         return {n: (v - widths[n], v + widths[n]) for n, v in zip(self.names, values.tolist(), strict=True)}
 
     def _convert_time_unit(self, values: Floats, way: float) -> Floats:
@@ -133,7 +133,7 @@ class ResponseProblem:
         return out
 
     def jacobian_in_seconds(self, values: Floats, jacobian: Floats) -> Floats:
-        """Convert a Jacobian by scaled parameters to one by parameters in seconds."""
+        """Convert a Jacobian by parameters in the problem's time unit to one by parameters in seconds."""
         out = jacobian.copy()
         log = np.log(self.unit)
         for name, at in self._coefficient.items():
@@ -149,19 +149,22 @@ class ResponseProblem:
         return out
 
     def coefficient(self, term: Term, item: Equation, values: Floats) -> float:
-        """Return the coefficient of a term in scaled time."""
+        """Return the coefficient of a term of an equation, in the time unit of this problem."""
         if isinstance(term.coefficient, str):
             return term.factor * float(values[self._coefficient[term.coefficient]])
         power = self.order_at(item.order, values) - self.order_at(term.order, values)
         return float(term.fixed or 0.0) * math.pow(self.unit, -power)
 
     def shift(self, signal: str, values: Floats) -> float:
-        """Return the delay of an input in scaled time."""
+        """Return the delay of an input, in the time unit of this problem."""
         at = self._delay.get(signal)
         return self.known_delays.get(signal, 0.0) if at is None else float(values[at])
 
     def responses(self, values: Floats, *, jacobian: bool = True) -> list[tuple[Complex, Complex | None]]:
-        """Return the model response at every record, and its derivatives by all parameters (one column each)."""
+        """Return, for each record, the complex model response and its Jacobian of shape (frequencies, parameters).
+
+        The Jacobian is None without `jacobian`.
+        """
         return [self._response(record, values, jacobian) for record in self.records]
 
     def _response(self, record: ResponseRecord, values: Floats, jacobian: bool) -> tuple[Complex, Complex | None]:
@@ -219,7 +222,7 @@ class ResponseProblem:
         return response, out
 
     def residuals(self, values: Floats, *, jacobian: bool = True) -> tuple[Floats, Floats]:
-        """Return the weighted residuals, real parts before imaginary parts, and their Jacobian.
+        """Return the weighted residuals, all real parts before all imaginary parts, and their Jacobian.
 
         Without `jacobian` the Jacobian has no columns.
         """
@@ -236,7 +239,7 @@ class ResponseProblem:
         return np.concatenate([flat.real, flat.imag]), np.concatenate([matrix.real, matrix.imag])
 
     def constraints(self) -> tuple[Floats, Floats, list[str]]:
-        """Return the constraints ``rows @ values <= limits`` of orders and delays, with descriptions."""
+        """Return linear constraints ``rows @ values <= limits`` of orders and delays, with a description of each."""
         rows: list[Floats] = []
         limits: list[float] = []
         words: list[str] = []
@@ -281,7 +284,7 @@ class ResponseProblem:
         return table, np.array(limits), words
 
     def search_ranges(self) -> dict[str, tuple[float, ...] | tuple[float, float]]:
-        """Return the grid values of each free order, or the interval of its default search."""
+        """Return for each free order its grid values if it has any, else the interval (low, high) to search."""
         out: dict[str, tuple[float, ...] | tuple[float, float]] = {}
         for name in self.orders:
             if name in self.structure.order_values:
@@ -293,7 +296,7 @@ class ResponseProblem:
         return out
 
     def _highest(self) -> float:
-        """Return the highest order of the default search."""
+        """Return the upper limit of orders without grid values, in the search for initial guesses."""
         orders = [o for e in self.structure.equations for o in (e.order, *(t.order for t in e.terms))]
         return max([MAX_DEFAULT_SEARCH_ORDER, *(o.constant for o in orders if not o.names)])
 
@@ -330,7 +333,7 @@ def initial_guesses(problem: ResponseProblem) -> list[Floats]:
 
 
 def _points(problem: ResponseProblem) -> Floats:
-    """Return the grid points of orders and delays, one row each, with coefficients 0."""
+    """Return feasible grid points of orders and delays, of shape (points, parameters); coefficients are 0."""
     axes = list(problem.search_ranges().values())
     has_values = [n in problem.structure.order_values for n in problem.orders]
     delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
@@ -364,13 +367,13 @@ def _points(problem: ResponseProblem) -> Floats:
 
 
 def _product(sides: Sequence[Sequence[float] | Floats]) -> Floats:
-    """Return every point of a grid, one row each; a grid without axes has one point."""
+    """Return the Cartesian product of grid axes, of shape (points, axes)."""
     rows = list(itertools.product(*sides))
     return np.array(rows, dtype=np.float64).reshape(len(rows), len(sides))
 
 
 def halton(count: int, width: int) -> Floats:
-    """Return a Halton sequence in the unit box: radical inverses in the first primes."""
+    """Return the first `count` points of the Halton sequence in the unit cube of dimension `width`."""
     primes = [p for p in range(2, 300) if all(p % q for q in range(2, int(p**0.5) + 1))][:width]
     out = np.zeros((count, width))
     for k, base in enumerate(primes):
@@ -383,7 +386,10 @@ def halton(count: int, width: int) -> Floats:
 
 
 def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Floats]:
-    """Return the coefficients at the most promising points, one equation after the other."""
+    """Return promising initial guesses: grid points to which linear least squares add the coefficients.
+
+    The equations are solved one after another, and the points are sorted by their total cost.
+    """
     slow = points[np.unique(np.linspace(0, len(points) - 1, min(MAX_CORNER_POINTS, len(points))).astype(int))]
     points, corners = (
         np.concatenate([points, np.repeat(slow, CORNERS_PER_POINT, axis=0)]),
@@ -405,10 +411,13 @@ def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Float
 
 
 def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
-    """Return corner frequencies imposed on the slowest own term, for points after the first; else NaN.
+    """Return one corner frequency for each grid point, at which the slowest output term is fixed.
 
-    If noise hides a small arc, reweighted least squares are biased and own terms are far too small or too large. With
-    the slowest own term fixed, the remaining bias is small.
+    It is NaN for the `first` points. Each entry of `slow` has several further points, with corner frequencies spread
+    over the measured band.
+
+    If noise hides a small arc of an impedance, iteratively reweighted least squares are biased, and the coefficients of
+    output terms are far too small or too large. If the slowest output term is fixed, the remaining bias is small.
     """
     every = np.concatenate([r.frequency for r in problem.records])
     frequencies = np.geomspace(every.min(), every.max(), CORNERS_PER_POINT)
@@ -416,7 +425,7 @@ def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> F
 
 
 def _subsample_record(record: ResponseRecord) -> ResponseRecord:
-    """Return a record subsampled to the number of frequencies that an initial guess needs."""
+    """Return a record at the limited number of frequencies that an initial guess needs."""
     order = np.argsort(record.frequency, kind="stable")
     if order.size > MAX_START_FREQUENCIES:
         order = order[np.linspace(0, order.size - 1, MAX_START_FREQUENCIES).astype(int)]
@@ -433,7 +442,10 @@ def _equation(
     points: Floats,
     corners: Floats,
 ) -> tuple[Floats, Floats]:
-    """Return the coefficients of one equation at every point, and their cost."""
+    """Return the coefficients of one equation at every grid point by reweighted least squares, and their cost.
+
+    `place` is the index of the equation, and `corners` are those of :func:`_corner_frequencies`.
+    """
     item = problem.structure.equations[place]
     alpha = _orders(problem, item.order.constant, item.order.weights, points)
     columns: dict[str, list[Complex]] = {n: [] for n in names}
@@ -487,7 +499,11 @@ def _equation(
 
 
 def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[str, Floats] | None:
-    """Return the free own term that acts at the lowest frequencies, and its order gap."""
+    """Return the coefficient of the output term that dominates at low frequencies, and its order difference.
+
+    The difference is alpha minus the order of the term at each point. Only terms with a free coefficient are
+    considered; None if there are none.
+    """
     own = [t for t in item.terms if t.signal == item.output and isinstance(t.coefficient, str) and t.factor == 1]
     if not own:
         return None
@@ -498,7 +514,7 @@ def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[
 
 
 def _least_squares(matrix: Complex, right: Complex) -> Floats:
-    """Return real least-squares solutions of complex equations; undetermined directions are 0."""
+    """Return real least-squares solutions of a batch of complex linear systems, of minimum norm."""
     lengths = np.sqrt(np.sum(np.abs(matrix) ** 2, axis=1))
     unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
     scaled = np.nan_to_num(matrix / unit[:, None, :])
@@ -523,7 +539,11 @@ def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
 
 
 def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, late: Complex) -> Complex | float:
-    """Return the factor of a term: a measured response, the delayed input, or 0."""
+    """Return the frequency response of a signal to the record's input.
+
+    It is the measured response of an output, the factor `late` of a delay for the input itself, and 0 for other
+    signals.
+    """
     outputs = problem.structure.outputs
     if name not in outputs:
         return late if name == record.input else 0.0

@@ -1,4 +1,4 @@
-"""Result of an identification: model, task, fit, errors, residual tests; physical parameters of the flexible arm."""
+"""Result of an identification: model, fit, residual tests, verdict, and physical parameters of a flexible arm."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ GRADIENT_STEP = 1e-6
 
 @dataclass(frozen=True)
 class PhysicalParameter:
-    """Physical parameter with its uncertainty.
+    """Value of a physical parameter with its standard error and unit.
 
     Parameters
     ----------
     value, standard_error
-        In ``unit``; a known parameter has standard error 0.
+        Value and standard error in ``unit``. A parameter that the user gave has standard error 0.
     unit
-        For whole orders; a fractional order adds a power of a second.
+        Unit for integer orders. With fractional orders it is multiplied by a power of a second.
     """
 
     value: float
@@ -65,7 +65,7 @@ class PhysicalParameter:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval."""
+        """95 % confidence interval (low, high) in ``unit``."""
         return self.value - NORMAL_95 * self.standard_error, self.value + NORMAL_95 * self.standard_error
 
     def __str__(self) -> str:
@@ -74,28 +74,29 @@ class PhysicalParameter:
 
 @check_arguments
 def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> dict[str, PhysicalParameter]:
-    """Compute the physical parameters of a link from its coefficients, given one parameter per stage.
+    """Return the physical parameters of a flexible link from its coefficients and one known parameter per stage.
 
-    a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (paper (16)-(21)), or j = J_1/J_2, fix
-    five ratios of six parameters. Standard errors follow from the joint covariance to first order; the known value is
-    taken as exact.
+    The coefficients a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (equations (16)-(21)
+    of the paper), or j = J_1/J_2 in place of r, determine five ratios of six parameters. Standard errors follow from
+    the joint covariance to first order. The known value is treated as exact.
 
     Parameters
     ----------
     joint
         Joint output-error fit of a :func:`flexible_link` with its coefficient law.
     known_values
-        One parameter per stage by name: K_s1, J_11, J_12, B_11, B_12 or K_tau1 (2 for the second stage).
+        One parameter per stage by name: K_s1, J_11, J_12, B_11, B_12 or K_tau1 for stage 1; K_s2, J_21, … for stage 2.
 
     Returns
     -------
     dict
-        All parameters of every stage that a known one belongs to.
+        All parameters by name, for each stage with a known parameter.
 
     Raises
     ------
     ModelError
-        No or an unknown name, two of one stage, a value that is not positive, a fit without the coefficient law.
+        If no name is given, a name is unknown, two belong to one stage, a value is not positive, or the fit has no
+        coefficient law.
     """
     out: dict[str, PhysicalParameter] = {}
     names = {name.format(j=j): (j, unit) for j in (1, 2) for name, unit in PHYSICAL_UNITS.items()}
@@ -141,7 +142,7 @@ def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> d
 
 
 def _physical(coefficients: NDArray[np.float64], name: str, value: float, stage: int) -> NDArray[np.float64]:
-    """Return K_s, J_1, J_2, B_1, B_2 and K_tau from a, b, d, g, r and one of them."""
+    """Return K_s, J_1, J_2, B_1, B_2 and K_tau of a stage from a, b, d, g, r and one known parameter."""
     a, b, d, g, r = coefficients
     # Every parameter in units of J_1.
     shares = np.array([a, 1.0, 1.0 / (r - 1.0), -b, d, g])
@@ -161,7 +162,7 @@ class Task:
     structure
         Structure to identify, with free orders and coefficients.
     order_grid
-        Grid of the order search; None for the default.
+        Grid of the order search; None for the default grid.
     """
 
     runs: tuple[Run, ...]
@@ -169,7 +170,7 @@ class Task:
     order_grid: OrderGrid | None = None
 
     def part_order_grid(self, part: Structure) -> OrderGrid:
-        """Return the order grid of one independently searched part of the structure."""
+        """Return the order grid of one independent group of equations of the structure."""
         return restrict_order_grid(self.order_grid, part) or OrderGrid()
 
 
@@ -182,24 +183,24 @@ class Identification:
     model
         Identified model.
     method
-        Estimator of the coefficients.
+        Name of the estimation method.
     comparison
         Simulation error and equation error on the estimation runs.
     searches
-        Order searches that gave the orders: by output, or under ``"stage"`` for a search under the order law; empty if
-        all orders were given.
+        Order searches from which the orders come, by output, or by ``"stage"`` for a search under the order law. Empty
+        if there was no order search.
     settings
-        Settings of the estimator.
+        Options and decisions of the estimator by name.
     findings
         Findings about data, fit and model.
     joint
         Optimum of the joint output error with its covariance; None for the equation-error methods.
     residuals
-        Residual tests on the estimation runs; None if these are too short.
+        Residual tests on the estimation runs; None if the runs are too short.
     information
         Information criteria, with orders counted as parameters; None without residuals.
     task
-        Runs and structure as given.
+        Estimation runs and structure.
     coefficient_errors
         Standard errors of coefficients, and of searched orders, for methods without a joint covariance.
     """
@@ -218,20 +219,20 @@ class Identification:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
+        """Findings as sentences."""
         return texts(self.findings)
 
     @property
     def orders(self) -> dict[str, float]:
-        """Free orders by name."""
+        """Values of the free orders by name."""
         return dict(self.model.orders)
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Standard errors by name.
+        """Standard errors of the parameters by name; {} for methods that give none.
 
-        Available for output error and instrumental variables, robust to colored residuals; with all orders given, of
-        the coefficients. Empty for the other equation-error methods.
+        Output error and instrumental variables give standard errors that are robust to colored residuals. If no order
+        is free, instrumental variables give those of the coefficients.
         """
         if self.joint is None:
             return dict(self.coefficient_errors)
@@ -239,10 +240,10 @@ class Identification:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals by name.
+        """95 % confidence intervals (low, high) of the parameters by name.
 
-        Value ± 1.96 standard errors. Parameters of a joint fit with a nonquadratic cost have profile-likelihood
-        intervals, which may be asymmetric or unbounded.
+        They are estimate ± 1.96 standard errors. Parameters of a joint fit with a nonquadratic cost have
+        profile-likelihood intervals instead, which may be asymmetric or unbounded.
         """
         values, errors = self._values, self.standard_errors
         quadratic = {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
@@ -250,23 +251,23 @@ class Identification:
 
     @property
     def profiles(self) -> dict[str, ProfileInterval]:
-        """95 % profile-likelihood intervals in use; see :meth:`ftlm.Identification.profile`."""
+        """95 % profile-likelihood intervals by name, for the parameters that have one; see :meth:`profile`."""
         return {} if self.joint is None else dict(self.joint.profiles)
 
     @property
     def delays(self) -> dict[str, float]:
-        """Delays of inputs [s] by input, estimated or fixed."""
+        """Delays of inputs [s] by input name, estimated or fixed."""
         return dict(self.model.structure.delay)
 
     @property
     def limits(self) -> dict[str, float]:
-        """Saturations (``sat_u``) and dead zones (``dead_u``) of inputs in their units, estimated or fixed."""
+        """Saturations (``sat_u``) and dead zones (``dead_u``) by name in the unit of the input, estimated or fixed."""
         limits = [(limit.name, limit.value) for limit in self.model.structure.limits]
         return {n: float(v) for n, v in limits if not isinstance(v, tuple)}
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Parameters by name: orders, coefficients, delays and limits, with standard errors, intervals and units."""
+        """Orders, coefficients, delays and limits by name, with standard errors, intervals and units."""
         model = self.model
         coefficients = model.coefficients if self.task is None else self.task.structure.coefficient_names
         free = {*model.orders, *coefficients, *self.standard_errors}
@@ -276,7 +277,7 @@ class Identification:
 
     @property
     def _values(self) -> dict[str, float]:
-        """Orders, coefficients and estimated delays and limits by name."""
+        """Values of orders, coefficients, and estimated delays, saturations and dead zones by name."""
         fit = {} if self.joint is None else self.joint.values_by_name
         return {**self.orders, **fit, **self.coefficients}
 
@@ -287,30 +288,32 @@ class Identification:
 
     @property
     def covariance(self) -> Floats:
-        """Covariance matrix of the estimated parameters, robust to colored residuals; 0 by 0 for other methods.
+        """Covariance matrix of the parameters in ``names``, robust to colored residuals.
 
-        Variances are infinite for parameters that the data do not determine, and their covariances NaN.
+        It has shape (0, 0) for methods other than output error.
+
+        Parameters that are not identifiable have infinite variances, and NaN covariances.
         """
         return np.zeros((0, 0)) if self.joint is None else self.joint.covariance
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Coefficients by name."""
+        """Values of the coefficients by name."""
         return self.model.coefficients
 
     @property
     def equation_error(self) -> dict[str, Metrics]:
-        """Metrics of the equation error by output."""
+        """Metrics (fit, RMSE, …) of the equation error by output."""
         return self.comparison.equation_error
 
     @property
     def output_error(self) -> dict[str, Metrics]:
-        """Metrics of the simulation error by output."""
+        """Metrics (fit, RMSE, …) of the simulation error by output."""
         return self.comparison.output_error
 
     @property
     def fit(self) -> dict[str, float]:
-        """Fit of the simulation in percent, by output."""
+        """Fit of the simulation to the measured output in percent, by output."""
         return self.comparison.fit
 
     #: The same, by the name that has the unit.
@@ -332,7 +335,7 @@ class Identification:
         Raises
         ------
         ModelError
-            A model without coefficient law or intervals, or a name that is not a parameter of it.
+            If the model has no coefficient law or no intervals, or a name is not one of its physical parameters.
         """
         if self.joint is None:
             raise ModelError(
@@ -348,41 +351,44 @@ class Identification:
         threads: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> dict[str, ProfileInterval]:
-        """Compute profile-likelihood intervals: at each value of a parameter all others are refitted.
+        """Compute profile-likelihood intervals of parameters.
 
-        If the cost is a parabola, they equal estimate ± standard errors. In a curved valley they may be asymmetric or
-        unbounded, and standard errors mean little. The cost may rise by the square of the normal quantile times the
-        noise variance, widened for colored residuals; a robust loss keeps the weights of the fit. Each bound is
-        followed continuously from the optimum, so another optimum beyond a ridge is not found.
+        A profile refits all other parameters at each value of one parameter.
 
-        A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley: ten to two
-        hundred simulations per parameter, each as long as one evaluation on the fit's finest grid. The result does not
-        depend on the number of threads. Ctrl-C ends the search within a refit.
+        The interval of a parameter contains the values at which the sum of squares rises by at most the squared normal
+        quantile times the noise variance, which is enlarged for colored residuals. For a quadratic cost it equals the
+        Wald interval. In a curved valley it may be asymmetric or unbounded, and standard errors are misleading. A
+        robust loss keeps the weights of the fit. Each bound is followed continuously from the optimum, so another
+        optimum behind a ridge is not found.
+
+        A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley. These are 10
+        to 200 simulations per parameter on the finest grid of the fit. The result does not depend on the number of
+        threads. Ctrl-C stops the search after at most one refit.
 
         Parameters
         ----------
         *names
-            Free orders, free coefficients, delays (``"delay_u"``); all of them where none is named. Not those that
-            follow from a coefficient law.
+            Names of free orders, free coefficients and delays (``"delay_u"``); by default all of them. Coefficients
+            that follow from a coefficient law have no profile.
         level
-            Probability, between 0 and 1.
+            Confidence level, between 0 and 1.
         threads
-            By default all cores.
+            Number of threads, by default all cores.
         progress
-            Called with (ends found, ends in all).
+            Callback with (bounds found, total bounds).
 
         Returns
         -------
         dict of ProfileInterval
-            By name.
+            Intervals by parameter name.
 
         Raises
         ------
         ModelError
-            A method without a likelihood, a fit with a reference, a name that is no free number, a level that is no
-            probability.
+            If the method has no likelihood, the fit has a reference, a name is not a free parameter, or the level is
+            not between 0 and 1.
         ConvergenceError
-            The profile leads to an optimum below the fit's.
+            If the profile leads to an optimum with a lower cost than the fit.
         """
         from ftlm.estimation.confidence_intervals import result_profiles
 
@@ -390,12 +396,12 @@ class Identification:
 
     @check_arguments
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
-        """Run residual tests on other runs; see :func:`ftlm.resid`."""
+        """Return residual tests of the model on other runs; see :func:`ftlm.resid`."""
         return resid(self.model, runs, lags=lags)
 
     @check_arguments
     def validate(self, runs: Run | Sequence[Run]) -> Validation:
-        """Compute both errors on runs that the model was not identified from, with a verdict.
+        """Compare the model with runs that it was not identified from, and return errors and verdict.
 
         Parameters
         ----------
@@ -405,13 +411,13 @@ class Identification:
         Returns
         -------
         Validation
-            A :class:`ftlm.Comparison` with a ``.verdict``. Its findings name a fit that falls, and runs from which the
-            model was identified.
+            :class:`ftlm.Comparison` with simulation error, equation error and a ``.verdict``. Findings report a fit
+            that is lower than on the estimation runs, and runs that are estimation runs.
 
         Raises
         ------
         DataError
-            Runs that do not fit the model.
+            If a run lacks a signal of the model or has other units.
         """
         from ftlm.estimation.model_checks import validate
         from ftlm.estimation.verdict import validation_with_verdict
@@ -422,7 +428,7 @@ class Identification:
     def report(
         self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
     ) -> Path:
-        """Write everything about this result to one HTML file that opens offline.
+        """Write all results, with charts, to one HTML file that opens offline.
 
         Parameters
         ----------
@@ -441,15 +447,15 @@ class Identification:
         Raises
         ------
         DataError
-            A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be
-            written.
+            If a validation run lacks a signal of the model, the file exists and ``force`` is False, or the file cannot
+            be written.
         """
         from ftlm.report.html_report import identification_page
 
         return identification_page(self, path, validation=validation, force=force)
 
     def to_frame(self) -> Any:
-        """Return the parameters as a pandas frame: value, standard error, 95 % interval, unit, nominal value."""
+        """Return a pandas DataFrame of the parameters: value, standard error, 95 % interval, unit, nominal value."""
         return parameter_frame(self.parameters.values(), self.model.structure.reference)
 
     def to_dict(self) -> dict[str, Any]:
@@ -468,29 +474,30 @@ class Identification:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
+        """Verdict ``"trust"``, ``"with care"`` or ``"do not use"``, with its reason.
 
-        It prints as one sentence; ``.reasons`` has all that speaks against the model, most serious first. Without a
-        validation no model is trusted, because it is not known how well it predicts other data: ``validate(runs)``
-        returns the verdict that includes other runs.
+        It prints as one sentence; ``.reasons`` has all findings against the model, most serious first. Without a
+        validation the verdict is at best "with care", because it is unknown how well the model predicts other data.
+        ``validate(runs).verdict`` takes other runs into account.
 
         Notes
         -----
-        The first of these rules that applies gives the reason.
+        The first of these rules that applies gives the reason. NR is the normalized residual, the RMS of the simulation
+        error relative to the standard deviation of the output.
 
         *Do not use*: the simulation overflows or has an unstable pole; a parameter is not identifiable (infinite
         standard error); NR exceeds 0.5 for an output, on estimation or validation runs, together or on one of them; the
-        own orders of an equation make it an identity.
+        orders of an equation make it nearly an identity.
 
         *With care*: on validation the fit falls by 20 points, or the residual (100 - fit) exceeds 10 % and three times
-        that of estimation, or 5 % and five times; stability is undecided, or the damping of an oscillation is not
-        significantly positive (an integrator is no fault); residuals are correlated with an input, are not white, or
-        are colored in a closed loop (each only above a thousandth of the output); the fit did not converge; a
+        that of estimation, or 5 % and five times; stability is not decided, or the damping of an oscillatory mode is
+        not significantly positive (an integrator is permitted); residuals are correlated with an input, are not white,
+        or are colored in a closed loop (each only above a thousandth of the output); the fit did not converge; a
         parameter has no effect, a coefficient has a relative standard error above 0.5, an order one above 0.25, a delay
-        or a limit an unbounded interval; an offset is hidden by the initial conditions; another finding of this level;
-        no standard errors; no validation.
+        or a limit an unbounded interval; initial conditions may hide an offset; another finding has this level; the
+        method gives no standard errors; there is no validation.
 
-        A saved model keeps the findings against it, and has the same verdict.
+        A saved model stores its findings, so its verdict is the same.
         """
         from ftlm.estimation.verdict import verdict
 
@@ -498,7 +505,7 @@ class Identification:
 
     @check_arguments
     def summary(self, validation: Comparison | None = None) -> str:
-        """Return the printed summary: verdict, equations, parameters, gain, modes, fit and three warnings.
+        """Return the summary as text: verdict, equations, parameters, gain, modes, fit and up to three warnings.
 
         Parameters
         ----------
@@ -508,7 +515,7 @@ class Identification:
         Raises
         ------
         ModelError
-            The validation does not come from :meth:`validate`.
+            If `validation` is not a result of :meth:`validate`.
         """
         from ftlm.report.text_summary import summary
 
@@ -563,7 +570,7 @@ class Identification:
 
 
 def _initial_in_words(comparison: Comparison) -> list[str]:
-    """Return one line for each output with initial terms, by run."""
+    """Return text lines that describe the initial terms of each output, by run."""
     lines = []
     for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
         for output, terms in initial.items():

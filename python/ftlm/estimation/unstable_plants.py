@@ -1,4 +1,4 @@
-"""Evidence for an unstable plant that a controller stabilizes: simulations of short pieces of the runs."""
+"""Test for an unstable plant that a controller stabilizes, by simulations of short pieces of the runs."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ SPLIT_CODES = ("plant_needs_pieces", "plant_unstable_in_pieces")
 
 @dataclass(frozen=True)
 class PieceTest:
-    """Simulation of short pieces, each from its own start.
+    """Result of the simulation of a model on short pieces of runs, each with its own initial values.
 
     Parameters
     ----------
     seconds
         Length of a piece [s].
     residual
-        Largest over the outputs of the RMS of the residuals, relative to that of the deviations from the mean of each
-        piece.
+        RMS of the residuals relative to that of the output, whose mean is subtracted in each piece; the largest over
+        all outputs.
     """
 
     seconds: float
@@ -52,22 +52,22 @@ class PieceTest:
 
     @property
     def passed(self) -> bool:
-        """Whether the model explains the pieces."""
+        """Whether the residual is so small that the model explains the pieces."""
         return self.residual <= MAX_PIECE_RESIDUAL
 
     @property
     def fit(self) -> float:
-        """Fit to the pieces in percent."""
+        """Fit of the simulation to the pieces in percent."""
         return 100.0 * (1.0 - self.residual)
 
 
 def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
-    """Return the test of an unstable model on pieces of the runs.
+    """Return the result of simulating an unstable model on short pieces of the runs; None if not possible.
 
-    A model of a stable plant that is unstable by the sign of an estimate fails it: from no start does it follow the
-    output over five time constants. Whole runs of an unstable plant are bounded only because a controller answers the
-    output. None if the model is stable or its modes are not known, if the rows are irregular, too few or too far apart
-    for the growth, or if a simulation fails.
+    Runs of an unstable plant are bounded only because a controller feeds back the output. A correct unstable model
+    follows the output within a piece. A wrongly unstable model of a stable plant does not, over five time constants,
+    from any initial values. The result is None if the model is stable, its modes are unknown, samples are nonuniform,
+    too few or too far apart for the growth, or a simulation fails.
     """
     try:
         growing = [m.pole.real for m in modes(model, coupling=model.structure.coupling) if m.unstable]
@@ -105,7 +105,10 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
 
 
 def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], comparison: Comparison) -> list[Finding]:
-    """Return a finding if pieces of the runs show an unstable plant, by the model or by a linear fit at its orders."""
+    """Return a finding if short pieces of the runs are evidence of an unstable plant.
+
+    The pieces are simulated with the model, and with a least-squares fit at its orders.
+    """
     if not model.structure.is_linear:
         return []
     explained = all(f.nr <= MAX_NORMALIZED_RESIDUAL for f in comparison.output_error.values())
@@ -122,7 +125,7 @@ def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], compari
 
 
 def least_squares_piece_test(runs: Sequence[Run], structure: Structure, units: Mapping[str, str]) -> PieceTest | None:
-    """Fit a structure by least squares, and return the piece test of an unstable model that passes it, else None."""
+    """Fit a structure by least squares; return its piece test if the model is unstable and passes, else None."""
     try:
         linear = estimate_coefficients(runs, structure, SearchSettings(coefficients="least-squares"), None)
         model = Model(structure.with_coefficients(linear.values), units=units, m=linear.m)

@@ -1,4 +1,4 @@
-"""Verdict on an identified model, by explicit rules, with one reason."""
+"""Verdict on an identified model: a level with its reason, by explicit rules."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_nee
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a model.
+    """Verdict on a model: a level with its reasons.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Verdict:
     reason
         Most serious reason, as a sentence.
     remedy
-        Suggested remedy.
+        Suggested remedy, as a sentence.
     reasons
         All reasons, most serious first; the first is ``reason``.
     """
@@ -70,14 +70,16 @@ class Verdict:
         return self.level == TRUST_LEVEL
 
     def __call__(self, validation: Any = None) -> Verdict:
-        """Return ``validation.verdict``, or this verdict without a validation: ``result.verdict(v)`` is ``v.verdict``.
+        """Return ``validation.verdict``, or this verdict without a validation.
 
-        The validation is taken to be one of the same result.
+        So ``result.verdict(v)`` is the same as ``v.verdict``.
+
+        The validation must be one of the same result, which is not checked.
 
         Raises
         ------
         ModelError
-            The validation is not what ``validate(run)`` returns.
+            If `validation` is not a result of ``validate(runs)``.
         """
         included = self if validation is None else getattr(validation, "verdict", None)
         if not isinstance(included, Verdict):
@@ -90,7 +92,7 @@ class Verdict:
 
     @property
     def sentence(self) -> str:
-        """Reason and remedy."""
+        """Reason and remedy as text."""
         return self.reason + (f"; {self.remedy}" if self.remedy else "")
 
     def __str__(self) -> str:
@@ -99,7 +101,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Validation(Comparison):
-    """Comparison with runs that the model was not identified from, and the resulting verdict.
+    """Comparison of a model with runs that it was not identified from, and the resulting verdict.
 
     Parameters
     ----------
@@ -126,15 +128,15 @@ def verdict_html(judgement: Verdict) -> Markup:
 
 
 def validation_with_verdict(result: Identification, comparison: Comparison) -> Validation:
-    """Return a comparison on other runs with the verdict of estimation and validation."""
+    """Return a comparison with other runs as a validation, with the verdict from estimation and validation."""
     own = {f.name: getattr(comparison, f.name) for f in fields(Comparison)}
     return Validation(**own, verdict=verdict(result, comparison))
 
 
 def verdict(result: Identification, validation: Comparison | None = None) -> Verdict:
-    """Return the verdict on a result, by the rules of :attr:`ftlm.Identification.verdict`.
+    """Return the verdict on a result by the rules of :attr:`ftlm.Identification.verdict`.
 
-    Findings of weight that no rule covers count in the order of the topics in ``findings.toml``.
+    Serious findings that no rule covers follow in the order of the topics in ``findings.toml``.
     """
     whole = not any(f.code == "runs_split" for f in result.findings)
     unstable = whole and any(f.code in UNSTABLE_PLANT_CODES for f in result.findings)
@@ -152,7 +154,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
 
 
 def _describe_residuals(result: Identification) -> str:
-    """Say what the residuals of a model to trust are: noise, noise with a color, or too small to matter."""
+    """Return text on the residuals of a trusted model: noise, colored noise, or negligibly small."""
     outputs = () if result.residuals is None else result.residuals.outputs.values()
     if any(not r.is_noise for r in outputs):
         return f"residuals are below {100 * NEGLIGIBLE_RESIDUAL_RATIO:g} % of the output where they are not noise"
@@ -163,7 +165,7 @@ def _describe_residuals(result: Identification) -> str:
 def _combined_verdict(
     own: Sequence[Finding], estimation_fits: Mapping[str, float], runs: Sequence[Comparison], has_validation: bool
 ) -> Verdict | None:
-    """Return the verdict from all findings, by itself and on other runs; None without findings."""
+    """Return the verdict from the findings of a fit and from its comparisons with other runs; None without findings."""
     buried = [f.output for f in own if f.code in POOR_FIT_CODES]
     findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
     findings += [f for comparison in runs for f in _validation_losses(estimation_fits, comparison)]
@@ -172,7 +174,7 @@ def _combined_verdict(
 
 
 def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
-    """Return the verdict by the most serious of these findings; None if none speaks against the model."""
+    """Return the verdict with the most serious of some findings as its reason; None if none is a warning."""
     listed = list(findings)
     bad = [f for level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) for f in listed if f.level == level]
     if not bad:
@@ -181,7 +183,7 @@ def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
 
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
-    """Return the verdict on a saved model, from its file and from comparisons with runs."""
+    """Return the verdict on a model read from a file, from its stored findings and comparisons with runs."""
     estimate = model.estimate
     plant = estimate is not None and any(f.code in UNSTABLE_PLANT_CODES for f in estimate.findings or ())
     unstable = plant and estimate is not None and estimate.piece_duration is UNSET
@@ -202,7 +204,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 
 
 def saved_findings(estimate: Estimate) -> list[Finding]:
-    """Return all findings that speak against using a saved model, those recorded at the fit first."""
+    """Return the findings against a model from its file, those recorded at the fit first."""
     findings = [] if estimate.against is UNSET else list(estimate.against)
     unidentifiable = [n for n, e in estimate.standard_errors.items() if e is None]
     if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in findings):
@@ -215,7 +217,7 @@ def saved_findings(estimate: Estimate) -> list[Finding]:
 
 
 def result_findings(result: Identification) -> Iterator[Finding]:
-    """Yield the findings about a result by itself, most serious first within a level."""
+    """Yield the findings about a result without validation, most serious first within each level."""
     for item in _against_result(result):
         yield replace(item, method=result.method)
 
@@ -255,7 +257,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
 
 
 def _free_runs(result: Identification) -> Iterator[Finding]:
-    """Yield findings about simulations: overflow, instability, poor fit, an unstable plant."""
+    """Yield findings about the simulation: overflow, instability, a poor fit, an unstable plant."""
     plant = [f for f in result.findings if f.code in UNSTABLE_PLANT_CODES]
     yield from plant
     if plant and plant[0].code != "plant_needs_pieces":
@@ -270,9 +272,9 @@ def _free_runs(result: Identification) -> Iterator[Finding]:
 
 
 def _unstable_poles(model: Model) -> Iterator[Finding]:
-    """Yield findings about unstable poles and undamped modes; none if the model is not linear.
+    """Yield findings about unstable poles and undamped modes; none for a nonlinear model.
 
-    A pole at the origin is an integrator, which is common in machines and no fault.
+    A pole at the origin is an integrator, which is common in machines and gives no finding.
     """
     if not model.structure.is_linear:
         return
@@ -295,12 +297,12 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
 
 
 def is_degenerate(result: Identification) -> bool:
-    """Whether the verdict on a fit without validation is "do not use", so that comparisons with it are meaningless."""
+    """Whether the verdict on a fit is "do not use" without validation, so that comparisons with it are meaningless."""
     return result.verdict.level == LEVEL_DO_NOT_USE
 
 
 def have_common_value(intervals: Any) -> bool:
-    """Whether all intervals have a value in common."""
+    """Whether all intervals (low, high) have a value in common."""
     each = list(intervals)
     return not each or max(low for low, _ in each) <= min(high for _, high in each)
 
@@ -308,11 +310,14 @@ def have_common_value(intervals: Any) -> bool:
 def improves_prediction(
     gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
 ) -> bool | None:
-    """Whether fractional orders improve the prediction, from their gains on validation runs and their intervals.
+    """Whether fractional orders improve the prediction of other runs; None if this is not decided.
 
-    True if every estimation run excludes an integer order, the runs are consistent, no validation run loses, and the
-    median gain is significant. False if no gain is significant, or if no run excludes an integer order and the median
-    gain is not significant. Otherwise None.
+    `gains` are the gains of fit on validation runs, `intervals` the confidence intervals of orders by run and name, and
+    `whole` the integer orders by name.
+
+    True if every estimation run excludes an integer order, the intervals of the runs overlap, no gain is negative, and
+    the median gain is significant. False if no gain is significant, or if no run excludes an integer order and the
+    median gain is not significant. Otherwise None.
     """
     runs = list(next(iter(intervals.values()), {}))
     is_outside = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
@@ -330,9 +335,9 @@ def improves_prediction(
 
 
 def is_buried(residuals: OutputResiduals) -> bool:
-    """Whether the residuals of an output are noise that is uncorrelated with the inputs.
+    """Whether the residuals of an output are white and uncorrelated with the inputs, so that only noise remains.
 
-    The model must also explain a part of the output: a zero model of an output without response passes the tests.
+    The model must also explain a part of the output, because a zero model of pure noise passes both tests.
     """
     moving = [t for t in residuals.informative_tests.values() if t.conclusive]
     explained = residuals.nr < MAX_BURIED_RESIDUAL
@@ -340,9 +345,9 @@ def is_buried(residuals: OutputResiduals) -> bool:
 
 
 def _poor_fits(where: str, comparison: Comparison, buried: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield outputs that the simulation explains by less than half, over all runs or on one.
+    """Yield a finding on each output of which the simulation explains less than half, over all runs or in one.
 
-    Each run is tested too, because a large run hides a small one.
+    Each run is also tested by itself, because the total is dominated by runs with large signals.
     """
     for run, errors in _each(comparison):
         useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in buried]
@@ -365,7 +370,7 @@ def _on(run: str) -> str:
 
 
 def _validation_losses(estimation_fits: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
-    """Yield outputs whose validation fit is far below the estimation fit."""
+    """Yield a finding on each output whose validation fit is far below its estimation fit."""
     for run, errors in _each(validation):
         for output, figures in errors.items():
             if output not in estimation_fits:
@@ -381,7 +386,7 @@ def _validation_losses(estimation_fits: Mapping[str, float], validation: Compari
 
 
 def _residuals(result: Identification) -> Iterator[Finding]:
-    """Yield findings of residual tests: feedback, dependence on an input, color."""
+    """Yield findings of failed residual tests: feedback, correlation with an input, color."""
     if result.residuals is None:
         if not any(f.code == "plant_unstable_in_pieces" for f in result.findings):
             yield make_finding("too_short_for_tests")
@@ -408,12 +413,12 @@ def _residuals(result: Identification) -> Iterator[Finding]:
 
 
 def has_loop_noise_model(settings: Mapping[str, Any]) -> bool:
-    """Whether a fit is consistent in a closed loop: by a reference signal, or by a noise model."""
+    """Whether a fit is consistent in a closed loop, because it used a reference signal or a noise model."""
     return "reference" in settings or "noise_model" in settings
 
 
 def _is_uncertain(result: Identification, name: str) -> bool:
-    """Whether a parameter is poorly determined, by its profile if available."""
+    """Whether an order or a coefficient is poorly determined, by its profile-likelihood interval if available."""
     error = result.standard_errors[name]
     numbers = {**result.coefficients, **({} if result.joint is None else result.joint.coefficients)}
     if name in result.orders:
@@ -428,7 +433,7 @@ def _is_uncertain(result: Identification, name: str) -> bool:
 
 
 def _is_of_input(result: Identification, name: str) -> bool:
-    """Whether a parameter is a delay, a saturation or a dead zone, which may be 0 but must be bounded."""
+    """Whether a parameter is a delay, a saturation or a dead zone of an input."""
     structure = result.model.structure
     return name in {f"delay_{s}" for s in structure.delay} | {limit.name for limit in structure.limits}
 

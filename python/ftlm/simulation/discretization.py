@@ -1,4 +1,4 @@
-"""Discretization of a run for a structure: block-pulse records of the core, and sample times on their grid."""
+"""Discretization of a run for a structure: block-pulse means of the signals, and the times of compared samples."""
 
 from __future__ import annotations
 
@@ -44,26 +44,28 @@ InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], in
 
 @dataclass(frozen=True)
 class Record:
-    """Pulse means of the signals of a structure on one run.
+    """Block-pulse record: the mean of each signal of a structure over each block pulse of a run.
 
     Parameters
     ----------
     signals
-        Names, in the order of the rows.
+        Signal names, in the order of the rows.
     step
-        Pulse width [s].
+        Width of a block pulse [s].
     means
-        Rows of pulse means.
+        Means over the block pulses, of shape (signals, pulses).
     inputs
-        Which signals are inputs of the run.
+        Whether each signal is an input of the run.
     sensor
-        Series of the sensor filter, applied to every signal not measured through it, or None.
+        Power series of the sensor filter, which is applied to every signal that was not measured through it; None
+        without a filter.
     initial
-        Resolved initial conditions.
+        Initial conditions after ``"auto"`` is resolved.
     offset
-        Unknown constant of each equation on this run.
+        Kind of the unknown constant of each equation on this run.
     states
-        Number of initial states of the sensor filter, estimated with the initial terms of every filtered output.
+        Number of initial states of the sensor filter, which are estimated with the initial terms of every filtered
+        output.
     """
 
     signals: tuple[str, ...]
@@ -77,33 +79,36 @@ class Record:
 
     @property
     def start(self) -> InitialTuple:
-        """Initial conditions as an argument of the core."""
+        """Initial conditions in the form that the core takes."""
         return initial_tuple(self.initial, self.offset, self.states)
 
     @property
     def m(self) -> int:
-        """Number of pulses."""
+        """Number of block pulses."""
         return int(self.means.shape[1])
 
     def core(self) -> tuple[float, Floats, Floats | None]:
-        """Return the record as an argument of the core."""
+        """Return (pulse width, means, filter series), the form that the core takes."""
         return self.step, self.means, self.sensor
 
     def of(self, name: str) -> Floats:
-        """Return the pulse means of a signal."""
+        """Return the block-pulse means of a signal."""
         row: Floats = self.means[self.signals.index(name)]
         return row
 
 
 def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """Return the paper's 2 048 pulses, or as many as the shortest run supports (a power of two for Haar rows)."""
+    """Return the default number of block pulses: 2048, or fewer if the shortest run has fewer samples.
+
+    It is a power of two if `power_of_two` is True, as Haar rows require.
+    """
     carried = min(run.length for run in runs) - 1
     m = min(DEFAULT_PULSES, carried)
     return 1 << (m.bit_length() - 1) if power_of_two and m > 0 else m
 
 
 def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """Raise ModelError for an invalid number of pulses, or one that a run or Haar rows do not support."""
+    """Return `m`; raise ModelError if a run or Haar rows do not allow this number of block pulses."""
     m = check_pulses(m, math.inf)
     for run in runs:
         carried = run.length - 1
@@ -122,14 +127,15 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
 
 
 def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True) -> Record:
-    """Return pulse means of every signal and non-linear term of a structure, with delays and sensor filter applied.
+    """Return the block-pulse record of a run for a structure, with delays and sensor filter applied.
 
-    Outputs are interpolated linearly between samples; inputs by the intersample behavior of the run. m may exceed the
-    grid of the run only if nothing is compared with measurements. ``filtered`` passes signals that were not measured
-    through the sensor filter through it (equation error); a simulation without filtered inputs does not need that.
-    ``smooth`` smooths the signals whose derivatives are in non-linear terms.
-    Raises for missing signals, signals whose squares underflow, delays of outputs, and missing samples of inputs. Other
-    missing samples are interpolated and must not be fitted.
+    It has a row for each signal and each nonlinear term. Outputs are interpolated linearly between samples, inputs by
+    the intersample behavior of the run. More pulses than sampling intervals are allowed only if nothing is compared
+    with measurements. With ``filtered``, the sensor filter is applied to signals that were not measured through it, as
+    the equation error requires. With ``smooth``, signals whose derivatives are in nonlinear terms are smoothed.
+
+    A missing signal, a signal whose squares underflow, a delay of an output or a missing sample of an input raises an
+    FtlmError. Missing samples of outputs are interpolated, and must not be fitted.
     """
     initial = resolve_initial_conditions(run, structure)
     run, structure = without_level(run, structure)
@@ -149,17 +155,19 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smo
 
 
 def without_level(run: Run, structure: Structure) -> tuple[Run, Structure]:
-    """Return a run minus the output level of a structure, and the structure without it."""
+    """Return a run from which the output level of a structure is subtracted, and the structure without this level."""
     if structure.offset != "level":
         return run, structure
     return deviations(run, structure)[0], replace(structure, offset="none")
 
 
 def recording(run: Run, structure: Structure, initial: Initial | None = None) -> _core.Recording:
-    """Return a run as the core samples it for a structure, with ``initial`` or the structure's initial conditions.
+    """Return a run as an object of the core, from which the core computes block-pulse means for a structure.
 
-    Free delays and limits are the core's to apply. Raises for missing signals, delays of outputs, and missing samples
-    of inputs.
+    ``initial`` replaces the initial conditions of the structure.
+
+    The core applies free delays, saturations and dead zones. A missing signal, a delay of an output or a missing sample
+    of an input raises an FtlmError.
     """
     initial = resolve_initial_conditions(run, structure) if initial is None else initial
     run, structure = without_level(run, structure)
@@ -184,7 +192,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
 
 
 def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
-    """Return a signal of a run as the core samples it."""
+    """Return a signal of a run as a channel object of the core."""
     channel: _core._Channel = {
         "name": name,
         "samples": np.zeros(0),
@@ -222,7 +230,7 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
 
 
 def check_early_input(run: Run, name: str, delay: float) -> None:
-    """Raise ModelError for an input that acts more than one sampling interval before it is logged."""
+    """Raise ModelError if an input has a negative delay (lead) of more than one sampling interval."""
     if delay < -run.step * (1.0 + MAX_EARLY_ROUNDING):
         raise ModelError(
             f"delay of {name} = {delay:g} s is more than one sampling interval ({run.step:g} s) of run {run.name!r} "
@@ -231,7 +239,7 @@ def check_early_input(run: Run, name: str, delay: float) -> None:
 
 
 def _check_known_inputs(structure: Structure) -> None:
-    """Raise ModelError for a free delay, saturation or dead zone."""
+    """Raise ModelError if a delay, saturation or dead zone of the structure is free."""
     for item in structure.free_inputs:
         what, value = ("delays", "value in seconds") if item.law == "delay" else ("limits", "value")
         raise ModelError(
@@ -240,17 +248,21 @@ def _check_known_inputs(structure: Structure) -> None:
 
 
 def apply_input_nonlinearity(run: Run, structure: Structure, name: str | None = None) -> Run:
-    """Return the run with known saturations and dead zones applied to its inputs, or to one of them."""
+    """Return the run with the structure's known saturations and dead zones applied to its inputs.
+
+    `name` restricts this to one input.
+    """
     _check_known_inputs(structure)
     limits = [limit for limit in structure.limits if limit.signal in run and name in (None, limit.signal)]
     return run.with_input_nonlinearities(limits) if limits else run
 
 
 def check_derivative_orders(run: Run, structure: Structure, order_values: Mapping[str, float] | None = None) -> None:
-    """Raise ModelError for derivatives of a run's signals that its samples do not determine.
+    """Raise ModelError for terms whose order is too high for the samples of their signal.
 
-    The order of another signal is below that of the equation plus 1, and for a zero-order-hold input at most that of
-    the equation, because its jumps have no derivative. ``order_values`` maps free orders with a single value to it.
+    The order of a signal other than the equation's output must be below the order of the equation plus 1. For a
+    zero-order-hold input it must be at most the order of the equation, because jumps have no derivative.
+    ``order_values`` are the values of free orders that have only one.
     """
     for item in structure.equations:
         alpha = item.order.substitute(order_values or {})
@@ -268,7 +280,10 @@ def check_derivative_orders(run: Run, structure: Structure, order_values: Mappin
 
 
 def _check_excess_order(signal: str, order: float, output: str, alpha: float) -> None:
-    """Raise ModelError for a signal that is differentiated once more than the output, or more often."""
+    """Raise ModelError if the order of a signal is at least alpha + 1, where alpha is the order of the equation.
+
+    The equation's own output is exempt.
+    """
     if signal != output and order > alpha + MAX_IMPROPER_ORDER - ORDER_RESOLUTION:
         raise ModelError(
             f"order {order:g} of {signal} is {order - alpha:g} above alpha = {alpha:g} of {output}; in the time domain "
@@ -279,9 +294,10 @@ def _check_excess_order(signal: str, order: float, output: str, alpha: float) ->
 def records(
     runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True
 ) -> list[Record]:
-    """Return records of several runs (see :func:`record`), cached if `runs` is a :class:`Runs`.
+    """Return the block-pulse records of several runs; see :func:`record`.
 
-    Records with a finer grid than the runs are large and used once, so they are not cached.
+    They are cached in `runs` if it is a :class:`Runs`. Records with more pulses than the runs have sampling intervals
+    are large and used once, so they are not cached.
     """
 
     def build() -> list[Record]:
@@ -302,7 +318,7 @@ def records(
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
-    """Return the structure's sensor filter as a series, or None."""
+    """Return the sensor filter of a structure as a power series on m block pulses; None without a filter."""
     sensor = structure.sensor_filter
     if sensor is None:
         return None
@@ -312,7 +328,10 @@ def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
 def _filter_series(
     numerator: tuple[tuple[float, float], ...], denominator: tuple[tuple[float, float], ...], m: int, step: float
 ) -> Floats:
-    """Return the series of a filter on m pulses."""
+    """Return the power series of a transfer function on m block pulses of width `step` [s].
+
+    Numerator and denominator are (exponent of s, coefficient) pairs.
+    """
     return make_read_only(_core.filter_series(list(numerator), list(denominator), m, step))
 
 
@@ -323,7 +342,7 @@ _long_series, _short_series = (
 
 
 def _check_missing(run: Run, structure: Structure) -> None:
-    """Raise DataError for missing samples of inputs, and of outputs that are filtered before comparison."""
+    """Raise DataError if samples are missing in inputs, or in outputs that are filtered before comparison."""
     missing = run.missing_samples
     if not missing:
         return
@@ -351,7 +370,7 @@ def _check_missing(run: Run, structure: Structure) -> None:
 
 
 def check_no_missing(runs: Sequence[Run], what: str) -> None:
-    """Raise DataError for missing samples if an analysis cannot exclude them."""
+    """Raise DataError if runs have missing samples; `what` names the analysis that does not allow them."""
     for run in runs:
         for name, is_missing in run.missing_samples.items():
             raise DataError(
@@ -362,19 +381,21 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
 
 
 def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
-    """Output, alpha and (signal, order) pairs of an equation whose orders are numbers.
+    """Return an equation as (output index, alpha, [(signal index, order), …]), the form that the core takes.
+
+    All orders must be numbers.
 
     Raises
     ------
     ModelError
-        An equation with friction, which nothing linear follows.
+        If the equation has friction or another nonlinear term.
     """
     check_frictionless([item], "what is linear in its coefficients")
     return linear_tuple(item, signals)
 
 
 def check_linear(equations: Sequence[Equation], what: str) -> None:
-    """Raise ModelError for friction or a non-linear term in a linear analysis."""
+    """Raise ModelError if an equation has friction or a nonlinear term; `what` names the analysis."""
     check_frictionless(equations, what)
     for item in equations:
         for term in item.nonlinear_terms:
@@ -387,7 +408,10 @@ def check_linear(equations: Sequence[Equation], what: str) -> None:
 
 
 def check_frictionless(equations: Sequence[Equation], what: str) -> None:
-    """Raise ModelError for friction, which is not linear in its coefficients."""
+    """Raise ModelError if an equation has friction, which is not linear in its parameters.
+
+    `what` names the analysis in the message.
+    """
     for item in equations:
         if item.friction is not None:
             raise ModelError(
@@ -397,7 +421,10 @@ def check_frictionless(equations: Sequence[Equation], what: str) -> None:
 
 
 def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
-    """Return an equation without friction as an argument of the core; non-linear terms are columns of a record."""
+    """Return an equation without friction in the form that the core takes.
+
+    Nonlinear terms are further rows of the record.
+    """
     index = {name: i for i, name in enumerate(signals)}
     if any(t.column not in index for t in item.nonlinear_terms):
         check_linear([item], "a computation on the signals alone")
@@ -406,7 +433,10 @@ def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, li
 
 
 def derived_signals(structure: Structure) -> list[_core._Derived]:
-    """Return the expressions of non-linear terms as the core takes them; they follow the signals of the structure."""
+    """Return the expressions of nonlinear terms in the form that the core takes.
+
+    The core appends their values to the signals of the structure.
+    """
     return [
         (
             item.program({channel: i for i, channel in enumerate(item.channels)}),
@@ -419,7 +449,11 @@ def derived_signals(structure: Structure) -> list[_core._Derived]:
 def order_grid_tuple(
     item: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
 ) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
-    """Output, values of alpha, and (signal, values of the order, whether both are free) of each term."""
+    """Return an equation with grids of orders in the form that the core takes.
+
+    It is (output index, values of alpha, [(signal index, values of the order, whether alpha and the order are free),
+    …]).
+    """
     check_linear([item], "a genetic algorithm")
 
     def axis(order: Order) -> list[float]:
@@ -430,7 +464,7 @@ def order_grid_tuple(
 
 
 def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
-    """Return the constant of an order and its weights of the free orders."""
+    """Return the constant of an order and its weight on each of the named free orders."""
     weights = dict(order.weights)
     return order.constant, [weights.get(n, 0.0) for n in names]
 
@@ -438,14 +472,14 @@ def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
 def equation_tuple(
     item: Equation, signals: Sequence[str]
 ) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
-    """Return an equation with its coefficients as arguments of the core."""
+    """Return an equation and its coefficients in the form that the core takes."""
     for term in item.terms:
         _check_excess_order(term.signal, term.order.constant, item.output, item.order.constant)
     return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
 
 
 def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) -> InitialTuple:
-    """Return resolved initial conditions for the core: Caputo or exponents, offset terms, filter states."""
+    """Return initial conditions, offset and number of filter states in the form that the core takes."""
     powers = [] if isinstance(initial, str) else list(initial)
     decided = (initial == "caputo", powers)
     if states:
@@ -454,7 +488,7 @@ def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) ->
 
 
 def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
-    """Return the error with names instead of signal numbers."""
+    """Return an error of the core with signal names in place of signal indices in its message."""
     return ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error)))
 
 
@@ -467,9 +501,11 @@ def prepare(
     gaps: bool = False,
     smooth: bool = True,
 ) -> list[Record]:
-    """Return the records of runs for an equation-error estimator, or raise for unsuitable data.
+    """Return the block-pulse records of runs for an equation-error estimator.
 
-    Missing samples raise DataError unless ``gaps`` is True, for an estimator that excludes them.
+    Raise DataError or ModelError for unsuitable data.
+
+    Missing samples raise DataError unless ``gaps`` is True, which an estimator sets that excludes them.
     """
     check_offset_resolved(structure.offset)
     if not gaps:
@@ -503,34 +539,34 @@ def prepare(
 
 
 def _is_offset(term: Term, item: Equation, prepared: Sequence[Record]) -> bool:
-    """Whether a free term of order 0 is equivalent to an offset on every run."""
+    """Whether a free term of order 0 has a constant signal in every run, so that it is equivalent to an offset."""
     if term.fixed is not None or term.column == item.output or term.order.names or term.order.constant != 0:
         return False
     return all(float(np.ptp(r.of(term.column))) == 0.0 for r in prepared)
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
-    """Return free coefficients by name. ``raw`` has the product of factor and coefficient of each term."""
+    """Return free coefficients by name from the core's estimates, which include the fixed factor of each term."""
     return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
 
 
 def has_nonuniform_samples(run: Run, structure: Structure) -> bool:
-    """Whether the outputs of a run are compared at nonuniform sample times.
+    """Whether simulation and measurement are compared at nonuniform sample times.
 
-    False if an input parameter is free, or if all signals are filtered.
+    False if a delay, saturation or dead zone is free, or if all signals are filtered: the uniform grid is used then.
     """
     return run.sample_times is not None and not structure.free_inputs and not structure.all_filtered
 
 
 def compared_times(run: Run, structure: Structure) -> Floats:
-    """Return the times of the compared samples of a run [s since its first sample]."""
+    """Return the times [s since the first sample] at which a run is compared with a simulation."""
     if run.sample_times is None or not has_nonuniform_samples(run, structure):
         return run.time
     return run.sample_times.times[run.sample_times.indices_within(run.duration)]
 
 
 def compared_values(run: Run, structure: Structure, name: str) -> Floats:
-    """Return the recorded values of a signal at these times; NaN for missing samples of an output."""
+    """Return the recorded values of a signal at the compared times; NaN for missing samples of an output."""
     if run.sample_times is None or not has_nonuniform_samples(run, structure):
         return run[name]
     return run.sample_times.data[name][run.sample_times.indices_within(run.duration)]

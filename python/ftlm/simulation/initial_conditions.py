@@ -1,4 +1,7 @@
-"""Initial conditions of a run: rest, or initial terms for its past inputs, and initial state of the sensor filter."""
+"""Choice of the initial conditions of a run: rest, or initial terms that represent its past inputs.
+
+An initial term is a power of t in the integrated equation.
+"""
 
 from __future__ import annotations
 
@@ -52,35 +55,36 @@ SQUARES_WEIGHT = 0.25
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Thresholds of the choice of a run's start. They were set on simulated records and checked on others.
+    """Thresholds for the choice of initial conditions, set on simulated records and verified on other records.
 
     Parameters
     ----------
     quiet_rows
-        Least number of rows before the inputs move that can show rest.
+        Minimum number of samples before an input changes that can show rest ("quiet" samples).
     sigmas
-        Standard errors within which slope, scatter and level of quiet rows are those of noise.
+        Number of standard errors within which slope, scatter and level of quiet samples are consistent with noise.
     noise_error
-        Relative standard error of the noise, times the root of the number of samples.
+        Relative standard error of the noise estimate, multiplied by the square root of the number of samples.
     least_noise
-        Noise of a signal without noise, as a share of its standard deviation.
+        Noise assumed for a noise-free signal, as a fraction of its standard deviation.
     drift_share
-        Standard error of a drift in quiet rows, over the whole run and as a share of the output's standard deviation,
-        up to which they show rest under a command that is held at a value other than 0 and changes often.
+        Limit on the uncertainty of a drift in quiet samples. It is the standard error of the drift, extrapolated to the
+        whole run, as a fraction of the output's standard deviation. It applies if an input starts at a nonzero value
+        and changes often.
     outlier_share
-        Largest share of quiet rows that may be outliers; one may always be.
+        Maximum fraction of quiet samples that may be outliers; one outlier is always allowed.
     rounding
-        Change of a constant input, relative to its largest value, that is rounding.
+        Change of an input, relative to its largest value, below which it counts as constant.
     slow_share
-        Change of an output from row to row, as a share of its median change, below which it hardly moves. Noise must be
-        smaller as well.
+        Change of an output between samples, as a fraction of its median change, below which it counts as slow. The
+        noise must be smaller as well.
     moving_share
-        Least share of the rows in which an output moves by more than that, so that one that does not at first was at
-        rest.
+        Minimum fraction of samples in which an output is not slow. A slow start of such an output shows rest.
     white_inflation
-        Inflation of the variance of a mean above which residuals are those of a structure that leaves something out.
+        Variance inflation of the mean of the residuals (1 for white noise) above which the structure is regarded as
+        incomplete.
     history_margin
-        Difference of :func:`start_score` from which on a history is believed where residuals have a color.
+        Difference of :func:`start_score` from which a history is preferred although residuals are colored.
     """
 
     quiet_rows: int = 5
@@ -101,13 +105,13 @@ START_SETTINGS = StartSettings()
 
 @dataclass(frozen=True)
 class RestEvidence:
-    """Evidence of the first rows that the plant rested before the run.
+    """Evidence in the first samples of a run that the plant rested before it.
 
     Parameters
     ----------
     rows
-        Number of rows in which inputs and outputs are constant before an input changes; 1 if only the outputs are, at
-        zero; 0 if the inputs are constant from the first or second row on, so that rest is an assumption.
+        Number of samples in which inputs and outputs are constant before an input changes. 1 if only the outputs rest,
+        at zero. 0 if the inputs never change after the first or second sample, so that rest is an assumption.
     levels
         Level of each output before the run.
     inputs
@@ -128,7 +132,7 @@ _EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, 
 
 
 def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
-    """Return the evidence that the plant rested before the run, or None if it may have been in motion."""
+    """Return the evidence that the plant rested before the run; None if it may have been in motion."""
     run = run.unmasked_run or run
     evidence = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
@@ -138,7 +142,7 @@ def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
 
 
 def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
-    """Return the evidence of quiet rows, or of inputs that are constant from the first or second row on."""
+    """Return evidence from quiet first samples, or from inputs that are constant from the first or second sample on."""
     inputs = [n for n in structure.signals if n in run.inputs]
     outputs = [n for n in structure.signals if n in run.outputs]
     if not inputs or not outputs or any(n not in run for n in structure.signals):
@@ -176,7 +180,7 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
 
 
 def _slow_start_evidence(run: Run, structure: Structure) -> RestEvidence | None:
-    """Return the evidence of outputs that start at zero and move slowly at first; an input may act from row 0 on."""
+    """Return evidence from outputs that start at zero and move slowly at first, whatever the inputs do."""
     inputs = [n for n in structure.signals if n in run.inputs]
     outputs = [n for n in structure.signals if n in run.outputs]
     if not inputs or not outputs or any(n not in run for n in structure.signals) or run.sample_times is not None:
@@ -187,7 +191,7 @@ def _slow_start_evidence(run: Run, structure: Structure) -> RestEvidence | None:
 
 
 def _starts_slowly(outputs: Sequence[Floats]) -> bool:
-    """Whether no output moves noticeably at first, and one of them does so at most other times."""
+    """Whether no output moves noticeably at first, although one of them does so at most later times."""
     conclusive = False
     for samples in outputs:
         noise = START_SETTINGS.sigmas * math.sqrt(2.0) * noise_at_start(samples)
@@ -201,19 +205,19 @@ def _starts_slowly(outputs: Sequence[Floats]) -> bool:
 
 
 def noise_at_start(samples: Floats) -> float:
-    """Return the largest likely standard deviation of the noise: two standard errors above its estimate."""
+    """Return an upper bound of the noise standard deviation: its estimate plus two standard errors."""
     count = min(samples.size, NOISE_SAMPLES)
     noise = white_noise(samples) * (1.0 + 2.0 * START_SETTINGS.noise_error / math.sqrt(count))
     return max(noise, START_SETTINGS.least_noise * float(np.nanstd(samples)))
 
 
 def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
-    """Return the rows in which a signal differs from its first value."""
+    """Return the indices of samples that differ from the first one."""
     return np.flatnonzero(np.abs(samples - samples[0]) > START_SETTINGS.rounding * float(np.max(np.abs(samples))))
 
 
 def _is_at_rest(rows: Floats, noise: float) -> bool:
-    """Whether slope and standard deviation of the samples of some rows are those of noise."""
+    """Whether slope and standard deviation of some samples are consistent with noise."""
     t = np.arange(rows.size) - 0.5 * (rows.size - 1)
     slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
     limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
@@ -221,22 +225,22 @@ def _is_at_rest(rows: Floats, noise: float) -> bool:
 
 
 def _without_outliers(rows: Floats, noise: float) -> Floats:
-    """Return rows without values far from their median, if these are single ones."""
+    """Return samples without isolated values far from their median."""
     near = np.abs(rows - np.median(rows)) <= REST_SIGMAS * noise if rows.size else np.ones(0, dtype=bool)
     few = max(1.0, START_SETTINGS.outlier_share * rows.size)
     return rows[near] if np.count_nonzero(~near) <= few else rows
 
 
 def _slope_weight(rows: int) -> float:
-    """Return the ratio of the noise of rows to the standard error of their slope per row."""
+    """Return the noise standard deviation divided by the standard error of the slope of `rows` samples."""
     return math.sqrt(rows * (rows**2 - 1) / 12.0)
 
 
 def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
-    """Return the structure with the start of runs that rested before their first row: from rest, with its level.
+    """Return the structure with initial conditions and level set for runs that rested before their first sample.
 
-    Initial terms and offset that are given stay, and ``"auto"`` stays if a run may have been in motion. A constant in
-    the equations is a level where the plant rested under it.
+    Initial terms and offsets that the user gave are kept. ``"auto"`` is kept if a run may have been in motion. An
+    offset ``"constant"`` becomes ``"level"`` if the plant rested under the constant.
     """
     automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
     if not structure.is_linear or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
@@ -250,9 +254,10 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
 
 
 def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
-    """Return a run as deviations from its level before the first row, and the levels of its outputs.
+    """Return a run minus its levels before the first sample, and the levels of its outputs by name.
 
-    Inputs deviate from their values in quiet rows, unless they have a saturation or a dead zone.
+    The level of an input is its value in the quiet samples. It is not subtracted from an input with a saturation or a
+    dead zone.
     """
     evidence = rest_evidence(run, structure)
     limited = {limit.signal for limit in structure.limits}
@@ -272,18 +277,18 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
-    """Whether all outputs of a structure start at zero within their noise."""
+    """Whether the first samples of all outputs are zero within their noise."""
     return all(is_rest(run[name]) for name in structure.signals if name in run.outputs)
 
 
 def has_memory(structure: Structure) -> bool:
-    """Whether an order is free or fractional, so that initial conditions are no finite sum."""
+    """Whether an order is free or fractional, so that the past has no finite-dimensional state."""
     orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
     return any(o.names or o.constant != round(o.constant) for o in orders)
 
 
 def history(run: Run, structure: Structure) -> History:
-    """Return powers of time for the past inputs of a run, as many as the noise of its outputs requires."""
+    """Return powers of t that represent the past inputs of a run, as many as the noise of its outputs requires."""
     visible = 1.0
     for name in structure.outputs:
         if name in run:
@@ -302,7 +307,7 @@ def history(run: Run, structure: Structure) -> History:
 
 
 def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
-    """Return the initial conditions of a structure on a run, resolving ``"auto"``."""
+    """Return the initial conditions of a structure for a run, with a decision for ``"auto"``."""
     structure = resolve_start([run], structure)
     initial = structure.initial
     if initial == "auto":
@@ -314,28 +319,28 @@ def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
 
 
 def common_initial_conditions(decisions: list[Initial]) -> Initial | None:
-    """Return common initial conditions for runs of one fit, the longest ones, or None if they are equal."""
+    """Return the initial conditions with the most terms among those of several runs; None if all are equal."""
     if len(set(decisions)) < 2:
         return None
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
 
 
 def resolve_common_initial_conditions(runs: Sequence[Run], structure: Structure) -> Initial:
-    """Return common initial conditions of a fit of all runs."""
+    """Return initial conditions that are common to all runs of a fit, with a decision for ``"auto"``."""
     starts = [resolve_initial_conditions(run, structure) for run in runs]
     return common_initial_conditions(starts) or starts[0]
 
 
 def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Excess of residuals with few initial terms over those with many, in units of noise.
+    """Return the excess of residuals with few initial terms over those with many, in units of the noise variance.
 
-    If the few terms suffice, it has a chi-squared distribution with the number of additional terms as degrees of
-    freedom.
+    If the few terms are sufficient, it has a chi-squared distribution. Its degrees of freedom are the number of
+    additional terms.
 
     Parameters
     ----------
     few, many
-        Residuals of each output; infinite where a simulation is not finite, NaN at missing samples.
+        Residuals of each output; infinite if the simulation is not finite, NaN at missing samples.
     sizes
         Standard deviation of each measured output.
     """
@@ -348,7 +353,7 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
 
 
 def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Misfit between two fits, or a fraction of the excess in the sum of squares if that is larger."""
+    """Return the misfit between two fits, or a fraction of the excess in the sum of squares if that is larger."""
     squares = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
         is_finite = ~np.isnan(one)
@@ -359,7 +364,7 @@ def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequenc
 
 
 def output_residuals(measurement: Floats, simulated: Floats) -> Floats:
-    """Difference of measured and simulated samples; infinite if the simulation is, NaN at missing samples."""
+    """Return measured minus simulated samples; infinite if the simulation is not finite, NaN at missing samples."""
     with np.errstate(invalid="ignore"):
         rows: Floats = measurement - simulated
     rows[~np.isnan(measurement) & ~np.isfinite(rows)] = np.inf
@@ -367,10 +372,10 @@ def output_residuals(measurement: Floats, simulated: Floats) -> Floats:
 
 
 def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Floats]) -> float:
-    """Return the Bayesian information criterion of a fit with this number of initial terms, from its residuals.
+    """Return the Bayesian information criterion of a fit with `terms` initial terms; lower is better.
 
-    The residuals count as white ones by the color of `reference`: all starts are allowed the same smooth misfit, so
-    that the choice does not depend on missing terms.
+    The numbers of samples are divided by the variance inflation of the `reference` residuals, the same for all compared
+    fits. A smooth misfit that a missing term causes then has the same weight in all of them.
     """
     score, total = 0.0, 0
     for own, other in zip(residuals, reference, strict=True):
@@ -389,10 +394,12 @@ def needs_history(
     sizes: Sequence[float],
     terms: tuple[int, int],
 ) -> bool:
-    """Whether residuals with Caputo's terms require a history instead, by the number of terms of both.
+    """Whether residuals with Caputo's initial terms are so large that a history is required.
 
-    Powers of t follow what a structure leaves out in any run, so colored residuals do not require them at the same
-    level as white ones.
+    `few` and `many` are the residuals with Caputo's terms and with a history, `terms` their numbers of terms.
+
+    The powers of t of a history can also fit an effect that the structure lacks. The threshold is therefore higher for
+    colored residuals.
     """
     more = terms[1] - terms[0]
     finite = all(np.all(np.isfinite(drop_missing(r))) for r in (*few, *many))

@@ -1,4 +1,4 @@
-"""Columns of non-linear terms: pulse means of expressions of measured signals and of their derivatives."""
+"""Rows of nonlinear terms in a block-pulse record: expressions of measured signals and their derivatives."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ SMOOTHING_POINTS, SMOOTHING_DEGREE = 31, 3
 
 
 def nonlinear_columns(structure: Structure) -> dict[str, Expression]:
-    """Return the expressions of the non-linear terms by their names in records, in order of appearance."""
+    """Return the expressions of the nonlinear terms, by the name of their row in a record, in order of appearance."""
     return {t.column: t.nonlinear for e in structure.equations for t in e.terms if t.nonlinear is not None}
 
 
 def record_signals(structure: Structure) -> tuple[str, ...]:
-    """Return the names of the rows of a record: the signals of a structure, then the columns of non-linear terms."""
+    """Return the names of the rows of a record: the signals of a structure, then its nonlinear terms."""
     return (*structure.signals, *nonlinear_columns(structure))
 
 
 def has_derivative_channels(structure: Structure) -> bool:
-    """Whether a non-linear term has the derivative of a signal, which the data do not contain."""
+    """Whether a nonlinear term contains the derivative of a signal, which the data do not contain."""
     return any(order > 0 for item in nonlinear_columns(structure).values() for _, order in item.channels)
 
 
 def append_columns(run: Run, structure: Structure, means: Floats, step: float, *, smooth: bool) -> Floats:
-    """Return pulse means of the signals and, below them, of the expressions of the non-linear terms.
+    """Return block-pulse means of the signals, with a further row for each nonlinear term.
 
-    An expression of pulse means is that of the signals to second order in the step. Derivatives are those of the raw
-    means, or with ``smooth`` of local polynomials. A column is NaN where it has no value, and everywhere behind a
-    sensor filter or with the derivative of an input that is held between its samples; see :func:`check_columns`.
+    An expression is evaluated at the means of its signals, which is accurate to second order in the step. Derivatives
+    are those of the raw means, or with ``smooth`` those of local polynomials. A row is NaN where the expression has no
+    value. It is all NaN with a sensor filter, or if it contains the derivative of a zero-order-hold input; see
+    :func:`check_columns`.
     """
     columns = nonlinear_columns(structure)
     if not columns:
@@ -57,19 +58,19 @@ def append_columns(run: Run, structure: Structure, means: Floats, step: float, *
 
 
 def _is_held(run: Run, signal: str, order: float) -> bool:
-    """Whether a signal has no derivative, because a run holds it between its samples."""
+    """Whether a signal is a zero-order-hold input, which has no derivative, and the order is positive."""
     return order > 0 and run.intersample.get(signal) == "zoh"
 
 
 def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], step: float) -> None:
-    """Raise for a column of a non-linear term without a value, for an estimator that needs all of them.
+    """Raise an error if a nonlinear term has no value somewhere, for estimators that need all values.
 
     Raises
     ------
     DataError
-        An expression that is not finite, with the time and the values of its signals.
+        If an expression is not finite; the message has the time and the values of its signals.
     ModelError
-        The derivative of an input that is held between its samples, or a sensor filter.
+        If a term contains the derivative of a zero-order-hold input, or the structure has a sensor filter.
     """
     for name, item in nonlinear_columns(structure).items():
         bad = np.flatnonzero(np.isnan(rows[name]))
@@ -96,10 +97,12 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
 
 
 def differentiate(means: Floats, order: float, step: float, *, smooth: bool) -> Floats:
-    """Return the derivative of a signal at rest before its record from its pulse means, to second order in the step.
+    """Return the fractional derivative of a signal from its block-pulse means, to second order in the step.
 
-    Grünwald and Letnikov's weights (1 - q)^order are multiplied by 1 + order/2 (1 - q), so that the derivative is not
-    late by order/2 steps. O(m log m).
+    The signal is zero before its record, and `step` is in seconds.
+
+    The Grünwald-Letnikov weights (1 - q)^order are multiplied by 1 + order/2 (1 - q), which removes their delay of
+    order/2 steps. With ``smooth``, values are smoothed first. The cost is O(m log m).
     """
     values = smooth_locally(means) if smooth else means
     m = values.size
@@ -109,7 +112,7 @@ def differentiate(means: Floats, order: float, step: float, *, smooth: bool) -> 
 
 
 def smooth_locally(values: Floats) -> Floats:
-    """Return values smoothed by local polynomials (Savitzky and Golay 1964); few values are returned as they are."""
+    """Return values smoothed by local polynomials (Savitzky and Golay 1964); short series are returned unchanged."""
     points, half = SMOOTHING_POINTS, SMOOTHING_POINTS // 2
     if values.size < points:
         return values

@@ -1,4 +1,4 @@
-"""Samples of the outputs of a simulation by the core, and the initial conditions that a run requires."""
+"""Samples of simulated outputs, and the choice of initial conditions that a run requires."""
 
 from __future__ import annotations
 
@@ -60,19 +60,20 @@ LEVEL_EXPONENT = math.inf
 
 @dataclass(frozen=True)
 class OutputSamples:
-    """Output samples of a simulation.
+    """Samples of the simulated outputs of a model on one run.
 
     Parameters
     ----------
     outputs
-        Shape (outputs, N), filtered for outputs measured through the sensor filter; not finite if the model diverges.
-        At the samples of the run, or at its nonuniform sample times.
+        Samples of shape (outputs, N) at the sample times of the run. They are filtered if the output was measured
+        through the sensor filter, and not finite if the model diverges.
     initial
         Coefficients of the initial terms, by output and exponent.
     refinement
-        Pulses per sampling interval on the finest grid; 1 for an exact simulation.
+        Number of block pulses per sampling interval on the finest grid; 1 for an exact simulation.
     change
-        Change on halving the step, relative to the largest value of each output; infinite before there are three grids.
+        Change of the samples when the step is halved, relative to the largest value of each output; infinite with fewer
+        than three grids.
     """
 
     outputs: Floats
@@ -82,9 +83,9 @@ class OutputSamples:
 
 
 def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
-    """Exponents of initial terms and offset of an equation with fixed orders, distinct and ascending.
+    """Return the exponents of t of the initial terms and the offset of an equation, distinct and ascending.
 
-    Those of the states of a sensor filter are -1, -2 and so on.
+    All orders must be numbers. The initial states of a sensor filter have the exponents -1, -2 and so on.
     """
     alpha = item.order.constant
     exponents = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}
@@ -99,7 +100,7 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: 
 
 
 def nonuniform_sample_times(model: Model, run: Run) -> Floats | None:
-    """Return the times of the compared samples of a run [s] if they are nonuniform, else None."""
+    """Return the times of the compared samples of a run [s] if they are nonuniform, otherwise None."""
     return compared_times(run, model.structure) if has_nonuniform_samples(run, model.structure) else None
 
 
@@ -110,9 +111,12 @@ InitialTermsTuple: TypeAlias = tuple[bool, list[list[tuple[float, float]]], bool
 def output_simulation(
     model: Model, run: Run, initial: Terms | None, times: Floats | None, state_refinement: int
 ) -> tuple[_core.OutputSimulation, InitialTermsTuple]:
-    """Return a simulation by the core, at uniform samples or at given times [s], and its initial terms.
+    """Return the simulation object of the core for a model and a run, and its initial terms.
 
-    Initial terms of a model that is not linear in them are fitted on a grid of its own.
+    Samples are uniform, or at given `times` [s].
+
+    `initial` are given initial terms; with None they are fitted to the run. For a nonlinear model they are fitted on a
+    grid of `state_refinement` block pulses per sampling interval.
     """
     structure, signals = model.structure, record_signals(model.structure)
     start = resolve_initial_conditions(run, structure)
@@ -134,9 +138,11 @@ def output_simulation(
 def simulate_samples(
     model: Model, run: Run, every: int, initial: Terms | None, times: Floats | None = None
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Return samples (outputs, N) on ``every`` pulses per sampling interval, and initial terms; may be not finite.
+    """Return simulated samples (outputs, N) and the initial terms by output and exponent.
 
-    At the sample times of the grid, or at given times [s].
+    The step is 1/`every` of the sampling interval. The samples are not finite if the simulation diverges.
+
+    Samples are at the uniform sample times of the run, or at given `times` [s].
     """
     core, terms = output_simulation(model, run, initial, times, every)
     samples, initial_terms = core.samples(every, terms, stop_flag())
@@ -148,18 +154,21 @@ def simulate_samples(
 def add_levels(
     model: Model, levels: Mapping[str, float], outputs: Floats, initial: Terms
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Return samples and initial terms of deviations, with the levels of the outputs before the run added."""
+    """Return samples and initial terms to which the levels of the outputs before the run are added.
+
+    The arguments are deviations from these levels.
+    """
     terms = {o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in own.items()} for o, own in initial.items()}
     return outputs + np.array([levels[o] for o in model.outputs])[:, None], terms
 
 
 def named_terms(model: Model, terms: Sequence[Sequence[tuple[float, float]]]) -> dict[str, dict[float, float]]:
-    """Return initial terms by output and exponent."""
+    """Return the core's initial terms as coefficients by output and exponent."""
     return {o: dict(own) for o, own in zip(model.outputs, terms, strict=True)}
 
 
 def check_uniform_samples(run: Run, model: Model) -> None:
-    """Raise ModelError for nonuniform samples."""
+    """Raise ModelError if the samples of a run are nonuniform."""
     if has_nonuniform_samples(run, model.structure):
         structure = model.structure
         what = "friction" if structure.has_friction else "a non-linear term"
@@ -171,7 +180,7 @@ def check_uniform_samples(run: Run, model: Model) -> None:
 
 
 def with_initial_conditions(model: Model, run: Run) -> Model:
-    """Return the model with initial conditions resolved on a run: Caputo's unless the samples require a history."""
+    """Return the model with initial conditions chosen for a run: Caputo's unless the samples require a history."""
     model = replace(model, structure=resolve_start([run], model.structure))
     start = resolve_initial_conditions(run, model.structure)
     long = replace(model, structure=replace(model.structure, initial=start))
@@ -194,7 +203,7 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
 
 
 def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
-    """Return output and power of every initial term and offset for given initial conditions."""
+    """Return the (output, exponent) pairs of all initial terms and offsets under given initial conditions."""
     structure = model.structure
     states = structure.filter_states(initial)
     return [
@@ -207,9 +216,9 @@ def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
 
 
 def measured_samples(model: Model, run: Run, every: int) -> Floats:
-    """Return the samples to compare with, shape (outputs, N): as measured, or filtered if the equation is.
+    """Return the measured samples to compare with a simulation, of shape (outputs, N).
 
-    NaN at missing samples of an output.
+    They are filtered if the equation is. Missing samples of an output are NaN.
     """
     through = model.structure.is_filtered
     if not model.structure.all_filtered or all(map(through, model.outputs)):
@@ -236,7 +245,7 @@ MAX_RESIDUAL_RATIO, MIN_RESIDUAL_DROP, MAX_HISTORY_RESIDUAL, MAX_REST_RESIDUAL =
 
 @dataclass(frozen=True)
 class StartResiduals:
-    """Residuals of a run from rest and with a history, one row per output.
+    """Residuals of a run simulated from rest and with a history, each of shape (outputs, N).
 
     ``terms`` is the number of terms of the history, ``sizes`` are the standard deviations of the outputs.
     """
@@ -248,7 +257,7 @@ class StartResiduals:
 
 
 def is_in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
-    """Whether the residuals of a model from rest, on all runs together, require a history."""
+    """Whether residuals of a model that starts from rest require a history, over all runs together."""
     residuals = []
     for run in runs:
         if (one := _start_residuals(structure, run)) is None:
@@ -258,7 +267,7 @@ def is_in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
 
 
 def _requires_history(residuals: Sequence[StartResiduals]) -> bool:
-    """Whether all runs together require a history."""
+    """Whether the residuals of all runs together require a history."""
     terms = sum(one.terms for one in residuals)
     excess = sum(misfit([*one.rest], [*one.history], one.sizes.tolist()) for one in residuals)
     # Noise that is coloured is followed by slow terms in any run.
@@ -267,7 +276,7 @@ def _requires_history(residuals: Sequence[StartResiduals]) -> bool:
 
 
 def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
-    """Residuals of the first samples from rest and with a history; None if they are not finite."""
+    """Return residuals of the first samples of a run from rest and with a history; None if they are not finite."""
     if run.length > MAX_START_SAMPLES:
         run = run.window(None, MAX_START_SAMPLES * run.step)
     ends, terms = [], 0
@@ -287,7 +296,7 @@ def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
 
 
 def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
-    """Return names of the runs that start near zero but had nonzero initial conditions."""
+    """Return the names of runs that start near zero although they had nonzero initial conditions."""
     structure = model.structure
     if structure.initial != "auto" or not structure.is_linear or not has_memory(structure):
         return []
@@ -304,7 +313,7 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
 
 
 def _is_reportable(residuals: StartResiduals) -> bool:
-    """Whether a model explains a run with a history, and not from rest, by enough for a report."""
+    """Whether a history explains a run and rest does not, by enough that a finding is worthwhile."""
     # An overflow is infinite, and nothing is reported where both are.
     with np.errstate(over="ignore", invalid="ignore"):
         ends = [end / residuals.sizes[:, None] for end in (residuals.rest, residuals.history)]

@@ -1,9 +1,9 @@
-"""Initial terms of a compared run under a Gaussian prior on its inputs before the first row.
+"""Initial terms of a run that represent its past inputs, under a Gaussian prior on these inputs.
 
-With free coefficients, the initial terms of a run with a history would absorb the errors of a model. Here each equation
-is driven before the first row by an unknown zero-mean Gaussian input, which is piecewise constant on octaves of time,
-over four lengths of the run. Its variance, in units of the model's response to the inputs of the run, is chosen by
-marginal likelihood (empirical Bayes). Initial values by Caputo's definition have no prior.
+When a model is compared with a run, initial terms with free coefficients would absorb errors of the model. The prior
+prevents this. Before the first sample, each equation has an unknown zero-mean Gaussian input. It is piecewise constant
+on octaves of time, over four lengths of the run. Its variance, relative to the model's response to the inputs of the
+run, maximizes the marginal likelihood (empirical Bayes). Initial values by Caputo's definition have no prior.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ RESPONSE_TOLERANCE = 1e-10
 def fit_history(
     core: _core.OutputSimulation, model: Model, run: Run, terms: InitialTermsTuple, times: Floats, max_m: int
 ) -> InitialTermsTuple | None:
-    """Return the posterior mean of the initial terms of a run with a history; None if a response is not finite.
+    """Return the posterior mean of the initial terms that represent past inputs; None if a response is not finite.
 
     Parameters
     ----------
@@ -131,10 +131,10 @@ def fit_history(
 
 
 def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
-    """Return posterior means of the coefficients of some shapes in a signal, under a normal prior.
+    """Return the posterior mean of the coefficients of some signals (shapes) in a target, under a normal prior.
 
-    The standard deviation of the prior has the largest likelihood. The rest of the signal is
-    noise, with the variance of its sums.
+    The standard deviation of the prior maximizes the likelihood. The remainder of the target is noise, whose variance
+    is increased for autocorrelation.
     """
     u, spread, right = thin_svd(shapes)
     along = projections(u, target)
@@ -152,9 +152,10 @@ def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
 
 
 def _past_responses(model: Model, run: Run, times: Floats, max_m: int) -> list[Floats] | None:
-    """Return the responses of all outputs to a unit forcing of each equation on each octave of the past.
+    """Return the responses of all outputs to a unit input of each equation during each octave of the past.
 
-    One array (octaves, outputs, N) per equation, at the given times [s]; None if a response is not finite.
+    There is one array (octaves, outputs, N) for each equation, at the given times [s]. None if a response is not
+    finite.
     """
     outputs = model.outputs
     followed = outputs if model.structure.coupling == "simulated" else ()

@@ -1,4 +1,4 @@
-"""Simulation of a model on the inputs of a run; explicit Euler baseline."""
+"""Simulation of a model on the inputs of a run, and explicit Euler as a baseline."""
 
 from __future__ import annotations
 
@@ -32,18 +32,20 @@ from ftlm.utils.validation import Floats, real_number
 
 
 def comparison_records(runs: Sequence[Run], model: Model, m: int) -> list[Record]:
-    """Return the records with which simulations are compared: measured outputs, filtered like the simulated ones.
+    """Return block-pulse records of runs with which simulations are compared.
 
-    Simulated outputs pass the sensor filter if they were measured through it. If a filtered signal is an input of a
-    simulation, all signals are filtered.
+    The sensor filter is applied to an output if it was measured through the filter. If a filtered signal is an input of
+    a simulation, the filter is applied to all signals.
     """
     return records(runs, model.structure, m, filtered=model.structure.all_filtered)
 
 
 def respond(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
-    """Return pulse means of the outputs on one of the :func:`comparison_records`, and initial terms by exponent.
+    """Return simulated block-pulse means by output, and initial terms by output and exponent.
 
-    The initial terms minimize the distance to the measured outputs.
+    `rec` is one of the :func:`comparison_records`.
+
+    The initial terms are fitted to the measured outputs by least squares.
     """
     structure = model.structure
     coupled = structure.coupling == "simulated"
@@ -83,48 +85,50 @@ def simulate(
     initial: Mapping[str, Mapping[float, float]] | None = None,
     max_m: int = 1 << 22,
 ) -> Run:
-    """Simulate the outputs of a model on the inputs of a run, at its sample times.
+    """Simulate the outputs of a model on the inputs of a run, at the sample times of the run.
 
-    Integer orders are simulated exactly, by the matrix exponential of one sampling interval, if the samples are uniform
-    and the model has no sensor filter, friction or non-linear term. For all other models the step of the record is
-    refined under the intersample behavior of the inputs (a zero-order hold stays exact), with Richardson extrapolation
-    (powers 2, 3 and 4), until halving the step changes no output by more than ``tolerance`` of its largest value.
+    Models of integer orders are simulated exactly, by the matrix exponential of one sampling interval, if the samples
+    are uniform and the model has no sensor filter, friction or nonlinear term. For all other models, the step is halved
+    until this changes no output by more than ``tolerance`` times its largest value. Inputs follow their intersample
+    behavior (a zero-order hold stays exact), and Richardson extrapolation removes the error terms of powers 2, 3 and 4.
 
-    A sample is the value just after the input of its row has changed. A term of the equation's own order (direct
-    feedthrough) acts without delay; everything else is continuous there.
+    A simulated sample is the value just after the zero-order-hold inputs of its row have changed. It differs from the
+    value just before only if the model has direct feedthrough.
 
     Parameters
     ----------
     model
-        The model. With measured coupling the run must contain the other outputs.
+        Model to simulate. With ``coupling="measured"``, the run must contain the outputs that are inputs of other
+        equations.
     run
-        The run; measured values of the modeled outputs are not used.
+        Run with the inputs. Measured values of the simulated outputs are not used.
     tolerance
-        Relative change at which refinement terminates.
+        Change of the outputs, relative to their largest value, at which the refinement of the step terminates.
     initial
-        Coefficients of initial terms, by output and exponent; default at rest. They are valid for this record only.
-        After a sensor filter, -1 and -2 are an impulse and its derivative, which represent the filter's initial state.
-        An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); the level of an
-        output is the exponent infinity, and inputs then count from their values in quiet rows; default none. Initial
-        values y(0), y'(0) by Caputo's definition bring further powers of t where a term of the output has a fractional
-        order; a call without these powers raises an error that lists them.
+        Coefficients of the initial terms (powers of t), by output and exponent; by default the run starts at rest. They
+        are valid for this run only. With a sensor filter, the exponents -1 and -2 are an impulse and its derivative,
+        which represent the initial state of the filter. An offset c of the equation is the exponent alpha with the
+        coefficient c / Gamma(alpha + 1). The level of an output is the exponent infinity; inputs are then measured from
+        their values before they change. Initial values y(0), y'(0) by Caputo's definition imply further powers of t if
+        a term of the output has a fractional order. If these powers are missing, an error lists them.
     max_m
-        Maximum number of pulses; a larger remaining change raises ConvergenceError.
+        Maximum number of block pulses. If the simulation has not converged with it, ConvergenceError is raised.
 
     Returns
     -------
     Run
-        The inputs and the simulated outputs, with the step and length of the run. Outputs measured through the sensor
-        filter are filtered, and all of them if a filtered signal is an input.
+        Run with the inputs and the simulated outputs, at the sample times of `run`. The sensor filter is applied to
+        outputs that are measured through it, and to all outputs if a filtered signal is an input.
 
     Raises
     ------
     DataError
-        A signal that the run does not have.
+        If the run lacks a signal of the model.
     ModelError
-        An equation that cannot be solved for its output, or a tolerance that is not positive.
+        If an equation cannot be solved for its output, or the tolerance is not positive.
     ConvergenceError
-        Overflow of an unstable model (with the time), or a response that has not converged at ``max_m`` pulses.
+        If the output of an unstable model overflows (the message has the time), or the simulation has not converged
+        with ``max_m`` pulses.
     """
     check_model(model)
     if not isinstance(run, Run):
@@ -184,9 +188,10 @@ def simulate(
 
 
 def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
-    """Raise ModelError for initial values that lack the fractional powers of t that own terms imply.
+    """Raise ModelError if initial values lack the fractional powers of t that they imply.
 
-    D^nu y of y = y_i t^i / i! + ... is integrated by alpha to I^(alpha - nu) (y - y_i t^i / i! ...).
+    A term D^nu y of Caputo's derivative, integrated alpha times, is I^(alpha - nu) (y - y_i t^i / i! - ...), which
+    contains them.
     """
     alpha = item.order.constant
     values = {round(e): v for e, v in terms.items() if v and e == round(e) and 0.0 <= e < alpha}
@@ -209,13 +214,13 @@ def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
 
 
 def _units(model: Model, run: Run) -> dict[str, str]:
-    """Units of inputs and simulated outputs, from the run or the model."""
+    """Return the units of inputs and simulated outputs by name, from the run or else from the model."""
     inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
     return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
 def _with_missing_outputs(run: Run, model: Model) -> Run:
-    """Return the run with zeros for missing outputs; simulated outputs are never read."""
+    """Return the run with zeros for outputs that it lacks; the simulation does not use them."""
     missing = [o for o in model.outputs if o not in run]
     if not missing:
         return run
@@ -231,27 +236,27 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
 
 @check_arguments
 def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
-    """Simulate an integer-order model by explicit Euler at the step of the run, as in the paper's baseline.
+    """Simulate a model of integer orders by explicit Euler with the step of the run, the baseline of the paper.
 
     Parameters
     ----------
     model
-        Integer orders only; see :func:`ftlm.link_model` for the manual's.
+        Model with integer orders only, such as :func:`ftlm.link_model` with the values of the manual.
     run
-        Run with the inputs; the step of the paper is 0.002 s.
+        Run with the inputs. The paper uses a step of 0.002 s.
     step
-        Only the record's own.
+        Only ``"record"``, the step of the run.
 
     Returns
     -------
     dict
-        Samples by output. Not finite if the step is unstable; for the hub pole of the second joint (-500 1/s) a step
-        of 2 ms is near the limit.
+        Samples by output. They are not finite if the method is unstable at this step. For the hub pole of the second
+        joint (-500 1/s), a step of 2 ms is near the stability limit.
 
     Raises
     ------
     ModelError
-        A fractional order.
+        If an order is fractional.
     """
     if step != "record":
         raise ModelError(

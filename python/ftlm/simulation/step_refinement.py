@@ -1,4 +1,4 @@
-"""Step refinement of a simulation: samples in the limit for zero step."""
+"""Simulation with a step that is refined until the samples converge."""
 
 from __future__ import annotations
 
@@ -41,20 +41,21 @@ def simulate_refined(
     max_m: int = MAX_M,
     on_grid: bool = False,
 ) -> OutputSamples:
-    """Simulate samples on refined grids, with Richardson extrapolation, until converged or out of pulses.
+    """Simulate samples with successively halved steps and Richardson extrapolation, until they converge.
 
-    Integer orders on uniform samples need no grid (:func:`exact_samples`). A long
-    record is refined only as far as that moves it by superposition of responses.
+    The refinement also stops at `max_m` block pulses.
+
+    Models of integer orders with uniform samples are simulated exactly; see :func:`exact_samples`.
 
     Parameters
     ----------
     initial
-        Coefficients of initial terms by output and exponent. None: fit them to the measured outputs, each weighted by
-        its standard deviation.
+        Coefficients of initial terms by output and exponent. With None they are fitted to the measured outputs, each
+        divided by its standard deviation.
     tolerance
-        Change, relative to the largest value of each output, at which refinement terminates.
+        Change, relative to the largest value of each output, at which the refinement terminates.
     on_grid
-        Whether to use the uniform grid of a run with nonuniform samples.
+        Whether a run with nonuniform samples is simulated at the times of its uniform grid.
     """
     if initial is not None:
         return _simulate_refined(model, run, initial, tolerance, max_m, on_grid)
@@ -80,13 +81,13 @@ def _residuals(model: Model, run: Run, simulated: OutputSamples) -> list[Floats]
 
 
 def _has_white_residuals(model: Model, run: Run, simulated: OutputSamples) -> bool:
-    """Whether a simulation leaves nothing that initial terms could explain."""
+    """Whether the residuals of a simulation are white, so that further initial terms explain nothing."""
     residuals = [drop_missing(e) for e in _residuals(model, run, simulated)]
     return all(bool(np.all(np.isfinite(e))) and is_white(e) for e in residuals)
 
 
 def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSamples) -> bool:
-    """Whether a simulation with few initial terms is preferred to one with more by :func:`start_score`."""
+    """Whether :func:`start_score` prefers a simulation with few initial terms to one with more."""
     if not (np.all(np.isfinite(few.outputs)) and np.all(np.isfinite(many.outputs))):
         return False
     residuals = [_residuals(model, run, s) for s in (few, many)]
@@ -100,7 +101,10 @@ def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSa
 def _simulate_refined(
     model: Model, run: Run, initial: Terms | None, tolerance: float, max_m: int, on_grid: bool
 ) -> OutputSamples:
-    """Simulate as :func:`simulate_refined`, with a start that is resolved, and deviations for a level."""
+    """Simulate as :func:`simulate_refined`, for a model whose initial conditions are chosen.
+
+    A level of the outputs is subtracted before the simulation and added to the result.
+    """
     if initial is None and model.structure.is_linear:
         model = with_initial_conditions(model, run)
     times = (
@@ -127,5 +131,5 @@ def _simulate_refined(
 def exact_samples(
     core: _core.OutputSimulation, terms: InitialTermsTuple
 ) -> tuple[Floats, list[list[tuple[float, float]]]] | None:
-    """Return samples and initial terms of a model with integer orders; None if it needs a grid."""
+    """Return exact samples and initial terms of a model with integer orders; None if it must be discretized."""
     return core.exact_samples(terms, stop_flag())

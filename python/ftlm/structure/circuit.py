@@ -1,4 +1,4 @@
-"""Equivalent circuits of impedances, such as ``R0-p(R1,CPE1)-W1``: notation, impedance, derivatives, polynomials."""
+"""Equivalent circuits of impedances, such as ``R0-p(R1,CPE1)-W1``: parsing, impedance and its derivatives."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TOKEN_PATTERN = re.compile(r"p\(|[(),-]|[A-Za-z]+_?\d*")
 
 
 def _diffusion(s: Complex, p: Sequence[float], *, blocked: bool) -> Response:
-    """Return the impedance of a finite diffusion layer, with derivatives by the logarithms of R and tau."""
+    """Return the impedance of a finite diffusion layer at s, and its derivatives by ln R and ln tau."""
     x = np.sqrt(s * p[1])
     x = np.where(x.real > MAX_DIFFUSION_ARGUMENT, MAX_DIFFUSION_ARGUMENT * (1 + 1j), x)
     tanh, root = np.tanh(x), np.sqrt(s * p[1])
@@ -39,18 +39,20 @@ def _diffusion(s: Complex, p: Sequence[float], *, blocked: bool) -> Response:
 
 @dataclass(frozen=True)
 class Element:
-    """Element of circuits.
+    """Kind of circuit element, such as a resistor.
 
     Parameters
     ----------
     meaning
-        Name of the element in words.
+        Name of the kind, such as "resistor".
     parameters
-        Suffix and unit of each parameter; the suffix is empty if the name of the element is that of the parameter.
+        Name suffix and unit of each parameter. The suffix is empty if the parameter has the name of the element.
     impedance
-        Impedance at s, and its derivatives: by logarithms of parameters, by an exponent itself.
+        Function that returns the impedance at s and its derivatives, by the logarithm of each positive parameter and by
+        an exponent itself.
     ratio
-        Numerator and denominator of the impedance as polynomials; None if the impedance is not a ratio of powers of s.
+        Function that returns numerator and denominator of the impedance as sums of powers of s; None if the impedance
+        is not such a ratio.
     """
 
     meaning: str
@@ -60,7 +62,7 @@ class Element:
 
 
 def _power(sign: float, order: float) -> Callable[[Complex, Sequence[float]], Response]:
-    """Return a function of (s, p): the impedance (p s^order)^sign and its derivative with respect to ln p."""
+    """Return a function of (s, p) that gives the impedance (p s^order)^sign and its derivative by ln p."""
     return lambda s, p: (z := (p[0] * s**order) ** sign, [sign * z])
 
 
@@ -118,16 +120,17 @@ class Circuit:
     Parameters
     ----------
     text
-        Elements in series joined by ``-``, in parallel in ``p(…, …)``: ``R0-p(R1,CPE1)-W1``. Elements are R, C, L, CPE
-        (Q, alpha), W (sigma: half-infinite diffusion), Wo and Ws (R, tau: open and short Warburg) and G
-        (R, tau: Gerischer), each with a number of its own.
+        Circuit as text, such as ``R0-p(R1,CPE1)-W1``: ``-`` joins elements in series, and ``p(…, …)`` joins them in
+        parallel. Elements are R, C, L, CPE (parameters Q, alpha), W (sigma: half-infinite diffusion), Wo and Ws (R,
+        tau: open and short Warburg) and G (R, tau: Gerischer), each followed by a different number.
     values
-        Known values by name: ``R0``, ``CPE1_Q``, ``CPE1_alpha``, ``W1_sigma``, in Ω, F, H, s.
+        Known parameter values by name (``R0``, ``CPE1_Q``, ``CPE1_alpha``, ``W1_sigma``) in Ω, F, H and s.
 
     Raises
     ------
     ModelError
-        An unknown element, two of one name, a parenthesis that is not closed, or an unknown name of a value.
+        If an element is unknown, two elements have one name, a parenthesis is not closed, or a value has an unknown
+        name.
     """
 
     text: str
@@ -138,7 +141,7 @@ class Circuit:
 
     @cached_property
     def tree(self) -> Node:
-        """Circuit as nested groups."""
+        """Circuit as a tree of nested series and parallel groups."""
         text = "".join(c for c in self.text if not c.isspace())
         tokens = _TOKEN_PATTERN.findall(text)
         if "".join(tokens) != text:
@@ -185,7 +188,7 @@ class Circuit:
 
     @cached_property
     def elements(self) -> list[tuple[str, str]]:
-        """Letters and name of every element, from left to right."""
+        """(letters, name) of every element, such as ("CPE", "CPE1"), from left to right."""
 
         def walk(node: Node) -> list[tuple[str, str]]:
             kind, rest = node
@@ -209,26 +212,26 @@ class Circuit:
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Names of the parameters without a value."""
+        """Names of the parameters without a known value."""
         return tuple(n for n in self.names if n not in self.values)
 
     @check_arguments
     def with_values(self, values: Mapping[str, float]) -> Circuit:
-        """Return the circuit with more values."""
+        """Return the circuit with further known parameter values."""
         return replace(self, values={**self.values, **values})
 
     @check_arguments
     def impedance(self, w: ArrayLike) -> Complex:
-        """Return the impedance [Ω] at angular frequencies [rad/s], finite, above 0."""
+        """Return the complex impedance [Ω] at positive angular frequencies [rad/s]; all parameters must have values."""
         return impedance_and_derivatives(self, as_floats("w", w), {})[0]
 
     def polynomials(self) -> tuple[Polynomial, Polynomial]:
-        """Return numerator and denominator of the impedance as coefficients by power of s.
+        """Return numerator and denominator of the impedance, each as coefficients by power of s.
 
         Raises
         ------
         ModelError
-            An element whose impedance is not a ratio of powers of s.
+            If the impedance of an element is not a ratio of powers of s.
         """
 
         def product(one: Polynomial, other: Polynomial) -> Polynomial:
@@ -269,9 +272,9 @@ class Circuit:
 def impedance_and_derivatives(
     circuit: Circuit, w: Floats, more: Mapping[str, float], node: Node | None = None
 ) -> tuple[Complex, dict[str, Complex]]:
-    """Return the impedance of a circuit part and its derivatives.
+    """Return the complex impedance [Ω] of a circuit part, and its derivatives by parameter name.
 
-    Derivatives are with respect to ln(parameter), and with respect to alpha itself for exponents.
+    Derivatives are with respect to the logarithm of a parameter, but with respect to an exponent alpha itself.
 
     Parameters
     ----------
@@ -280,9 +283,9 @@ def impedance_and_derivatives(
     w
         Angular frequencies [rad/s].
     more
-        Values by name besides those of the circuit.
+        Parameter values by name, in addition to those of the circuit.
     node
-        Part of the circuit's tree; None for all of it.
+        Part of the circuit's tree; None for the whole circuit.
     """
     kind, rest = node or circuit.tree
     if kind not in ("series", "parallel"):

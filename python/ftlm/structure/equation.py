@@ -1,4 +1,4 @@
-"""Fractional-order equations: terms, friction, validation and formatting."""
+"""Fractional-order equations of a structure: terms and friction, their validation and their text."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ftlm.utils.validation import real_number
 class Term:
     """Term ``factor * coefficient * D^order signal`` on the right-hand side of an equation.
 
-    A non-linear term has an expression of signals in place of the signal, such as ``y^3`` or ``abs(D y)*D y``.
+    A nonlinear term has an expression in place of the signal, such as ``y^3`` or ``abs(D y)*D y``.
 
     Parameters
     ----------
     signal
-        Name of the signal; the first one of an expression.
+        Name of the signal; in an expression, that of its first signal.
     order
-        Order of the derivative, also that of an expression as a whole.
+        Order of the derivative of the signal or of the expression as a whole.
     coefficient
         Name of a free coefficient, or its value.
     factor
@@ -49,12 +49,12 @@ class Term:
 
     @property
     def nonlinear(self) -> Expression | None:
-        """Expression of a non-linear term; None if the term is linear."""
+        """Expression of a nonlinear term; None if the term is linear."""
         return self.expression if isinstance(self.expression, Expression) else None
 
     @property
     def column(self) -> str:
-        """Name of the term's row in a record: its signal, or the text of its expression."""
+        """Name of the term's signal in a block-pulse record: the signal, or the text of the expression."""
         return self.signal if self.nonlinear is None else str(self.nonlinear)
 
     @property
@@ -71,12 +71,12 @@ class Term:
 
     @check_arguments
     def as_text(self, signal: str) -> str:
-        """Format the term with a given text for its signal."""
+        """Return the term as text, with the given text in place of its signal."""
         return self.format({self.signal: signal})
 
     @check_arguments
     def format(self, inputs: Mapping[str, str]) -> str:
-        """Format the term; ``inputs`` maps an input to its text after delay and nonlinearity."""
+        """Return the term as text; ``inputs`` maps an input to its text with delay and nonlinearity."""
         if isinstance(self.coefficient, str):
             factor = "" if self.factor == 1 else "-" if self.factor == -1 else f"{self.factor!r} "
             text = f"{factor}{self.coefficient} "
@@ -86,7 +86,7 @@ class Term:
 
     @check_arguments
     def format_operand(self, inputs: Mapping[str, str]) -> str:
-        """Format the derivative of the signal or expression, without the coefficient."""
+        """Return the derivative of the signal or expression as text, without the coefficient."""
         shape = self.nonlinear
         if shape is None:
             return derivative(self.order, inputs.get(self.signal, self.signal))
@@ -109,7 +109,7 @@ class Term:
 
 
 def derivative(order: Order, signal: str) -> str:
-    """Format the derivative of a signal, such as ``D^0.5 y``."""
+    """Return the derivative of a signal as text, such as ``D^0.5 y``."""
     if not order.names and order.constant == 0:
         return signal
     text = str(order)
@@ -120,18 +120,19 @@ def derivative(order: Order, signal: str) -> str:
 @check_arguments
 @dataclass(frozen=True)
 class Stribeck:
-    """Stribeck friction near rest: ``factor * coefficient * exp(-(D output / speed)^2) * sign(D output)``.
+    """Stribeck term of friction: ``factor * coefficient * exp(-(D output / speed)^2) * sign(D output)``.
 
     Parameters
     ----------
     coefficient
-        Name of the free coefficient fs, or its value [unit of D^alpha y]; not negative times a factor that is negative.
+        Name of the free coefficient fs, or its nonnegative value [unit of D^alpha y].
     speed
-        Stribeck speed vs at which the term has decayed to 1/e: name if free, else value [unit of y per s], positive.
+        Stribeck speed vs, at which the term has decayed to 1/e: its name if free, otherwise its positive value [unit of
+        y per s].
     factor
-        Known factor of the coefficient, negative, because friction dissipates energy.
+        Known factor of the coefficient. It is negative, because friction dissipates energy.
     name, speed_name
-        Names of coefficient and speed before they were fixed.
+        Names of coefficient and speed before their values were fixed.
     """
 
     coefficient: str | float
@@ -142,12 +143,12 @@ class Stribeck:
 
     @property
     def strength(self) -> float | None:
-        """Stiction in excess of Coulomb friction [unit of D^alpha y]; None if the coefficient is free."""
+        """Stiction minus Coulomb friction [unit of D^alpha y]; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
 
     @check_arguments
     def as_text(self, output: str) -> str:
-        """Format the Stribeck term for an output."""
+        """Return the Stribeck term of an output as text."""
         speed = self.speed if isinstance(self.speed, str) else f"{self.speed!r}"
         return f"- {_format_coefficient(self.coefficient, self.factor)} exp(-(D {output}/{speed})^2) sign(D {output})"
 
@@ -155,17 +156,17 @@ class Stribeck:
 @check_arguments
 @dataclass(frozen=True)
 class Friction:
-    """Coulomb friction ``factor * coefficient * sign(D output)`` of an equation's own output, set-valued at rest.
+    """Coulomb friction ``factor * coefficient * sign(D output)`` on the output of an equation, set-valued at rest.
 
-    The sign is that of the simulated velocity, not of a measured one. At rest it takes the value in [-1, 1] that keeps
-    the output at rest; if there is none, the output slides.
+    The sign is that of the simulated velocity, not of a measured one. At rest, the sign is replaced by the value in
+    [-1, 1] that keeps the output at rest. If there is no such value, the output slides.
 
     Parameters
     ----------
     coefficient
-        Name of the free coefficient, or its value [unit of D^alpha y]; not negative times a factor that is negative.
+        Name of the free coefficient, or its nonnegative value [unit of D^alpha y].
     factor
-        Known factor, negative, because friction dissipates energy.
+        Known factor of the coefficient. It is negative, because friction dissipates energy.
     name
         Name that the coefficient had before it got its value.
     more
@@ -190,14 +191,14 @@ class Friction:
 
     @property
     def law(self) -> tuple[float, float, float]:
-        """Parameters (fc, fs, vs) of fixed friction; fs = 0 and vs = 1 without a Stribeck term."""
+        """Values (fc, fs, vs) of friction without free parameters; fs = 0 and vs = 1 without a Stribeck term."""
         more = self.stribeck
         near = (0.0, 1.0) if more is None else (more.strength or 0.0, float(more.speed))
         return (self.strength or 0.0, *near)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free coefficients."""
+        """Names of the free friction parameters."""
         numbers = [self.coefficient] + (
             [] if self.stribeck is None else [self.stribeck.coefficient, self.stribeck.speed]
         )
@@ -205,7 +206,7 @@ class Friction:
 
     @property
     def identified_coefficients(self) -> dict[str, float]:
-        """Values of the fixed coefficients by their former names."""
+        """Values of fixed friction parameters, by their names before they were fixed."""
         more = self.stribeck
         pairs = [(self.name, self.coefficient)]
         if more is not None:
@@ -214,7 +215,7 @@ class Friction:
 
     @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
-        """Return the friction with some free coefficients fixed; the others stay free."""
+        """Return the friction with some free parameters fixed to values; the others stay free."""
         out, more = self, self.stribeck
         if isinstance(self.coefficient, str) and self.coefficient in values:
             out = replace(
@@ -232,13 +233,13 @@ class Friction:
 
     @check_arguments
     def as_text(self, output: str) -> str:
-        """Format the friction terms for an output."""
+        """Return the friction terms of an output as text."""
         near = "" if self.stribeck is None else f" {self.stribeck.as_text(output)}"
         return f"- {_format_coefficient(self.coefficient, self.factor)} sign(D {output}){near}"
 
 
 def _format_coefficient(coefficient: str | float, factor: float) -> str:
-    """Format a friction coefficient with the magnitude of its factor."""
+    """Return a friction coefficient as text, multiplied by the magnitude of its factor."""
     if isinstance(coefficient, str):
         return coefficient if factor == -1 else f"{-factor!r} {coefficient}"
     return f"{-factor * coefficient!r}"
@@ -256,17 +257,17 @@ class Equation:
     order
         Highest order alpha, in (0, 10].
     terms
-        Right-hand side. Orders of the output itself lie in [0, alpha), orders of other signals in [-3, 10].
-        Orders above alpha occur, for example, when the hub of an arm drives its link. In the time domain they are below
-        alpha + 1, and for zero-order-hold inputs at most alpha, because jumps have no derivative.
+        Terms of the right-hand side. Orders of the output lie in [0, alpha), orders of other signals in [-3, 10].
+        Orders above alpha occur, for example, if the measured hub angle of an arm is an input of the link. For
+        simulation they must be below alpha + 1, and for zero-order-hold inputs at most alpha, because jumps have no
+        derivative.
     coulomb
-        Optional Coulomb and Stribeck friction of the output's velocity. Alpha then lies in (1, 2], and all orders are
-        below alpha.
+        Optional Coulomb and Stribeck friction. Alpha must then lie in (1, 2], and all other orders below alpha.
 
     Raises
     ------
     ModelError
-        No term, a repeated coefficient, or an order or number out of range.
+        If there is no term, a coefficient is repeated, or an order or value is out of range.
     """
 
     output: str
@@ -319,7 +320,7 @@ class Equation:
             self._check_friction(self.friction)
 
     def _check_expression(self, term: Term, shape: Expression) -> None:
-        """Raise for a non-linear term that the highest derivative of the output does not determine."""
+        """Raise ModelError if a nonlinear term contains too high a derivative of the output to be simulated."""
         words = f"{term} in the equation of {self.output}"
         if term.order.names or self.order.names:
             return
@@ -337,7 +338,7 @@ class Equation:
                 )
 
     def _check_friction(self, friction: Friction) -> None:
-        """Raise for friction that adds energy, or for an order alpha without a velocity."""
+        """Raise ModelError if friction adds energy, or if alpha is so low that the output has no velocity."""
         words = f"friction in the equation of {self.output}"
         terms: list[Friction | Stribeck] = [friction] if friction.stribeck is None else [friction, friction.stribeck]
         for term in terms:
@@ -369,14 +370,17 @@ class Equation:
 
     @check_arguments
     def check_input_orders(self, outputs: Sequence[str]) -> None:
-        """Raise if an input makes an output that is not linear in it jump; simulated outputs are exempt.
+        """Raise ModelError if the order of an input is not below alpha, so that the output jumps with the input.
 
-        Friction follows the velocity of the output, and a non-linear term its values within a pulse.
+        Only equations with friction or nonlinear terms are checked; simulated outputs are exempt.
+
+        Friction depends on the velocity of the output, and a nonlinear term on its values within a block pulse, so both
+        require a continuous output.
 
         Raises
         ------
         ModelError
-            A fixed input order that is not below a fixed alpha.
+            If a fixed order of an input is not below a fixed alpha.
         """
         for item in self.terms:
             is_fixed = not (self.order.names or item.order.names or set(item.signals) <= set(outputs))
@@ -395,12 +399,12 @@ class Equation:
 
     @property
     def nonlinear_terms(self) -> tuple[Term, ...]:
-        """Non-linear terms, in order of appearance."""
+        """Nonlinear terms, in order of appearance."""
         return tuple(t for t in self.terms if t.nonlinear is not None)
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Signal names: the output, then the others in order of appearance."""
+        """Names of the signals: the output, then the others in order of appearance."""
         return tuple(dict.fromkeys([self.output, *(s for t in self.terms for s in t.signals)]))
 
     @property
@@ -416,24 +420,24 @@ class Equation:
 
     @check_arguments
     def with_orders(self, values: Mapping[str, float]) -> Equation:
-        """Return the equation with some free orders fixed; the others stay free.
+        """Return the equation with some free orders fixed to values; the others stay free.
 
         Raises
         ------
         ModelError
-            Orders that are out of range.
+            If an order is out of range.
         """
         terms = tuple(replace(t, order=t.order.substitute(values)) for t in self.terms)
         return Equation(self.output, self.order.substitute(values), terms, self.coulomb)
 
     @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
-        """Return the equation with some free coefficients fixed; the others stay free.
+        """Return the equation with some free coefficients fixed to values; the others stay free.
 
         Raises
         ------
         ModelError
-            A value that is not a finite number.
+            If a value is not a finite number.
         """
         terms = tuple(
             replace(t, coefficient=real_number(t.coefficient, values[t.coefficient]), name=t.coefficient)
@@ -451,7 +455,7 @@ class Equation:
 
     @check_arguments
     def as_text(self, inputs: Mapping[str, str]) -> str:
-        """Format the equation; ``inputs`` maps an input to its text after delay and nonlinearity."""
+        """Return the equation as text; ``inputs`` maps an input to its text with delay and nonlinearity."""
         right = " + ".join(t.format(inputs) for t in self.terms).replace("+ -", "- ")
         friction = "" if self.friction is None else f" {self.friction.as_text(self.output)}"
         return f"{derivative(self.order, self.output)} = {right}{friction}"
@@ -461,7 +465,10 @@ class Equation:
 
 
 def format_equation(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
-    """Format an identified equation with six significant digits; ``inputs`` holds texts such as ``u(t - 0.035 s)``."""
+    """Return an identified equation as text with six significant digits.
+
+    ``inputs`` maps an input to its text, such as ``u(t - 0.035 s)``.
+    """
     texts = inputs or {}
     parts = [f"{t.fixed or 0.0:+.6g} {t.format_operand(texts)}" for t in item.terms]
     right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])

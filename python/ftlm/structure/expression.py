@@ -1,4 +1,4 @@
-"""Expressions of signals in non-linear terms: normal form, text, values, derivatives and instructions of the core."""
+"""Expressions of signals in nonlinear terms: construction, text, evaluation and derivatives."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ MAX_INSTRUCTIONS = 1000
 class Expression:
     """Expression of signals and their derivatives without free parameters, such as ``abs(D y)*D y``.
 
-    Made by :func:`constant`, :func:`channel`, :func:`add`, :func:`multiply`, :func:`power` and :func:`apply`, which
-    keep it in normal form: the grammar reads ``str`` of an expression as an equal one.
+    The functions :func:`constant`, :func:`channel`, :func:`add`, :func:`multiply`, :func:`power` and :func:`apply`
+    construct expressions in normal form. Parsing the text of an expression gives an equal expression.
 
     Parameters
     ----------
     operation
-        Kind of the expression, or the name of a function.
+        Kind of the expression, such as ``"add"``, or the name of a function.
     arguments
-        Expressions that the operation combines.
+        Operands of the operation.
     value
-        Value of a constant, order of the derivative of a channel, or exponent of a power.
+        Value of a constant, exponent of a power, or order of the derivative in a channel (a signal or its derivative).
     signal
-        Signal of a channel.
+        Name of the signal in a channel.
     """
 
     operation: Operation
@@ -60,14 +60,14 @@ class Expression:
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """Signals with the orders of their derivatives, in order of first use."""
+        """(signal, order of its derivative) pairs in the expression, in order of first use."""
         if self.operation == "channel":
             return ((self.signal, self.value),)
         return tuple(dict.fromkeys(c for argument in self.arguments for c in argument.channels))
 
     @property
     def is_linear(self) -> bool:
-        """Whether the expression is a sum of channels and constants with constant factors."""
+        """Whether the expression is a sum of constants and of channels with constant factors."""
         if self.operation == "multiply":
             return len(self.arguments) == 2 and not self.arguments[0].channels and self.arguments[1].is_linear
         return self.operation in ("constant", "channel") or (
@@ -76,7 +76,7 @@ class Expression:
 
     @check_arguments
     def program(self, channel_index: Mapping[Channel, int]) -> list[tuple[str, float]]:
-        """Return postfix instructions of the core; ``channel_index`` numbers the channels.
+        """Return the expression as postfix instructions for the core; ``channel_index`` numbers the channels.
 
         Instructions are ("constant", value), ("channel", index), ("add", 0), ("multiply", 0), ("negate", 0),
         ("power", exponent), and (name of a function, 0).
@@ -97,7 +97,10 @@ class Expression:
 
     @check_arguments
     def evaluate(self, values: Mapping[Channel, Floats | float]) -> Any:
-        """Return the values for numbers or arrays of the channels; not finite where it is undefined or overflows."""
+        """Return the values of the expression from numbers or arrays of its channels.
+
+        They are not finite where the expression is undefined or overflows.
+        """
         with np.errstate(all="ignore"):
             return self._evaluate({c: np.asarray(v, dtype=np.float64) for c, v in values.items()})
 
@@ -123,7 +126,7 @@ class Expression:
 
     @check_arguments
     def gradient(self, values: Mapping[Channel, Floats | float]) -> dict[Channel, Any]:
-        """Return the partial derivatives with respect to the channels, by channel; that of abs at 0 is 0."""
+        """Return the partial derivatives with respect to the channels, by channel; the derivative of abs at 0 is 0."""
         samples = {c: np.asarray(v, dtype=np.float64) for c, v in values.items()}
         with np.errstate(all="ignore"):
             return {c: self._derivative(c, samples) for c in self.channels}
@@ -150,7 +153,7 @@ class Expression:
         return total
 
     def split_factor(self) -> tuple[float, Expression]:
-        """Return the constant factor of the expression, 1 if it has none, and the expression without it."""
+        """Return the constant factor of the expression (1 if it has none) and the expression without the factor."""
         if self.operation == "constant":
             return self.value, constant(1.0)
         if self.operation == "multiply" and self.arguments[0].operation == "constant":
@@ -159,7 +162,7 @@ class Expression:
 
     @check_arguments
     def as_text(self, signals: Mapping[str, str] | None = None) -> str:
-        """Format the expression; ``signals`` maps an input to its text after delay and nonlinearity."""
+        """Return the expression as text; ``signals`` maps an input to its text with delay and nonlinearity."""
         texts = signals or {}
         match self.operation:
             case "constant":
@@ -182,7 +185,7 @@ class Expression:
         return f"{self.operation}({self.arguments[0].as_text(texts)})"
 
     def _as_factor(self, texts: Mapping[str, str]) -> str:
-        """Format the expression as a factor of a product."""
+        """Return the expression as text, in parentheses if it is a sum, for use in a product."""
         text = self.as_text(texts)
         return f"({text})" if self.operation == "add" else text
 
@@ -191,17 +194,17 @@ class Expression:
 
 
 def _derivative_text(order: float, text: str) -> str:
-    """Format the derivative of a channel, such as ``D^0.5 y``."""
+    """Return the derivative of a signal as text, such as ``D^0.5 y``."""
     return text if order == 0 else f"D {text}" if order == 1 else f"D^{format_shortest(order)} {text}"
 
 
 def constant(value: float) -> Expression:
-    """Return a constant.
+    """Return a constant as an expression.
 
     Raises
     ------
     ModelError
-        A value that is not finite.
+        If the value is not finite.
     """
     if not math.isfinite(value):
         raise ModelError(f"a constant of an expression is {value}, which is not finite; give a number")
@@ -209,12 +212,12 @@ def constant(value: float) -> Expression:
 
 
 def channel(signal: str, order: float = 0.0) -> Expression:
-    """Return a signal or its derivative of a given order.
+    """Return a signal, or its derivative of the given order, as an expression.
 
     Raises
     ------
     ModelError
-        A negative order.
+        If the order is negative.
     """
     if not 0 <= order < math.inf:
         raise ModelError(f"order {order:g} of {signal} inside a non-linear term is negative; use derivatives, from 0")
@@ -222,7 +225,7 @@ def channel(signal: str, order: float = 0.0) -> Expression:
 
 
 def add(*terms: Expression) -> Expression:
-    """Return a sum in normal form: flat, with one constant at the end."""
+    """Return a sum in normal form: without nested sums, and with at most one constant, at the end."""
     parts = [part for term in terms for part in (term.arguments if term.operation == "add" else (term,))]
     total = sum(part.value for part in parts if part.operation == "constant")
     parts = [part for part in parts if part.operation != "constant"]
@@ -232,7 +235,7 @@ def add(*terms: Expression) -> Expression:
 
 
 def multiply(*factors: Expression) -> Expression:
-    """Return a product in normal form: flat, with one constant factor at the head."""
+    """Return a product in normal form: without nested products, and with at most one constant, at the start."""
     parts = [part for factor in factors for part in (factor.arguments if factor.operation == "multiply" else (factor,))]
     product = math.prod(part.value for part in parts if part.operation == "constant")
     parts = [part for part in parts if part.operation != "constant"]
@@ -244,12 +247,14 @@ def multiply(*factors: Expression) -> Expression:
 
 
 def power(base: Expression, exponent: float) -> Expression:
-    """Return a power: a whole one from 1 to 100, or any positive one of an absolute value.
+    """Return a power of an expression.
+
+    The exponent is an integer from 1 to 100. For an absolute value it is any positive number.
 
     Raises
     ------
     ModelError
-        Another exponent.
+        If the exponent is not allowed.
     """
     if base.operation == "abs":
         if not 0 < exponent <= MAX_POWER:
@@ -269,12 +274,12 @@ def power(base: Expression, exponent: float) -> Expression:
 
 
 def apply(function: str, argument: Expression) -> Expression:
-    """Return a function of an expression.
+    """Return a function, such as ``sin``, of an expression.
 
     Raises
     ------
     ModelError
-        An unknown function.
+        If the function is unknown.
     """
     if function not in EXPRESSION_FUNCTIONS:
         raise ModelError(f"{function}(…) is not computed; use {', '.join(EXPRESSION_FUNCTIONS)}")

@@ -68,9 +68,11 @@ MAX_POLYNOMIAL_POWER = 10
 
 @dataclass(frozen=True)
 class ParsedTerm:
-    """Term ``factor * name * D^order signal`` of one side; ``name`` is None if the coefficient is known.
+    """Term ``factor * name * D^order signal`` on one side of an equation text.
 
-    A non-linear term has an expression, and the first of its signals.
+    ``name`` is None if the coefficient is a number.
+
+    A nonlinear term has an expression; ``signal`` is then its first signal.
     """
 
     factor: float
@@ -81,7 +83,7 @@ class ParsedTerm:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Signals of the term."""
+        """Names of the signals in the term."""
         return (self.signal,) if self.expression is None else tuple(signal for signal, _ in self.expression.channels)
 
 
@@ -91,19 +93,19 @@ UNIT_POLYNOMIAL: SymbolicPolynomial = [(1.0, None, Order())]
 
 
 class EquationParser:
-    """Parser of one equation: terms on both sides, friction, offset, delays and limits of inputs.
+    """Parser of the text of one equation: terms of both sides, friction, offset, delays and limits of inputs.
 
     Parameters
     ----------
     text
         Text of the equation.
     signals
-        Names that are signals, where they would else be read as coefficients.
+        Names that denote signals where they could also denote coefficients.
 
     Attributes
     ----------
     left, right
-        Terms of both sides.
+        Terms of the left-hand and the right-hand side.
     friction, stribeck
         Friction of the output on the right-hand side, with its signal.
     offset
@@ -111,9 +113,9 @@ class EquationParser:
     limits
         Saturations and dead zones, by signal and kind.
     plain
-        Signals that occur without a limit.
+        Names of signals that occur without saturation and dead zone.
     delays
-        Delays [s] by signal: a number if known, (lower, upper) if estimated in that interval.
+        Delays [s] by signal: a number if known, (lower, upper) if it is to be estimated in this interval.
     """
 
     def __init__(self, text: str, signals: Collection[str] = ()) -> None:
@@ -155,11 +157,11 @@ class EquationParser:
         return token
 
     def _sees(self, *values: str) -> bool:
-        """Whether the next tokens have these values."""
+        """Whether the next tokens have the given values."""
         return all(self._peek(k)[1] == value for k, value in enumerate(values))
 
     def _accept(self, symbol: str) -> bool:
-        """Take the next token if it is this symbol."""
+        """Consume the next token if it is the given symbol, and return whether it was."""
         is_match = self._peek()[:2] == ("symbol", symbol)
         self._position += is_match
         return is_match
@@ -189,7 +191,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------------------ equation
 
     def parse(self) -> EquationParser:
-        """Parse the whole text as an equation; the result is in the attributes."""
+        """Parse the whole text as an equation, set the attributes, and return the parser."""
         if self._is_transfer():
             self._transfer()
             return self
@@ -204,14 +206,14 @@ class EquationParser:
         return self
 
     def parse_expression(self) -> Expression:
-        """Parse the whole text as the expression of a non-linear term."""
+        """Parse the whole text as the expression of a nonlinear term, and return it."""
         terms = self._expression()
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-', '*' or the end")
         return terms
 
     def _sum(self, *, is_lhs: bool = False, closed: bool = False) -> list[ParsedTerm]:
-        """Parse a sum up to a token that does not continue it."""
+        """Parse a sum up to the first token that cannot continue it, and return its terms."""
         terms: list[ParsedTerm] = []
         while True:
             sign = self._signs()
@@ -229,7 +231,7 @@ class EquationParser:
         return sign
 
     def _item(self, sign: float) -> list[ParsedTerm]:
-        """Parse a product, or a number times a sum in parentheses."""
+        """Parse a product, or a number times a sum in parentheses, and return its terms."""
         factor = self._numbers(sign)
         name: str | None = None
         if self._sees("(") and not self._is_expression_group():
@@ -273,7 +275,7 @@ class EquationParser:
         )
 
     def _numbers(self, factor: float) -> float:
-        """Parse the numbers at the head of a product."""
+        """Parse numbers at the start of a product, and return `factor` times these numbers."""
         while self._peek()[0] == "number":
             factor *= float(self._take()[1])
             while self._sees("/") and self._peek(1)[0] == "number":
@@ -282,7 +284,7 @@ class EquationParser:
         return factor
 
     def _divisors(self, factor: float) -> float:
-        """Divide by the numbers behind a product."""
+        """Parse divisions by numbers at the end of a product, and return `factor` divided by them."""
         while self._accept("/"):
             kind, value, at = self._peek()
             if kind != "number" or float(value) == 0.0:
@@ -294,7 +296,7 @@ class EquationParser:
         return factor
 
     def _continues_after_name(self) -> bool:
-        """Whether the name at hand is a coefficient: a signal, a derivative or a sum follows."""
+        """Whether the next name is a coefficient, because a signal, a derivative or a sum follows it."""
         kind, value, _ = self._peek(1)
         if self._peek()[1] in self._signals:
             return False
@@ -307,7 +309,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------------------- offset
 
     def _is_offset(self) -> bool:
-        """Whether the next term is an unknown constant; raise for a known one."""
+        """Whether the next term is an unknown constant (offset); raise ModelError for a known constant."""
         (kind, value, at), (kind_after, symbol, _) = self._peek(), self._peek(1)
         if not (kind_after == "end" or (kind_after == "symbol" and symbol in "+-=")):
             return False
@@ -330,7 +332,7 @@ class EquationParser:
         self._take()
 
     def _take_printed_offset(self) -> bool:
-        """Take an offset in parentheses, as structures with one are printed; False for any other term."""
+        """Parse an offset in parentheses, the form in which a structure prints it; return False for any other term."""
         for kind, phrase in OFFSET_PHRASES.items():
             if self._sees("(") and self._peek(1)[0] == "name":
                 values = [self._peek(k)[1] for k in range(2, 3 + len(phrase))]
@@ -345,7 +347,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------------ non-linear terms
 
     def _closing_distance(self, offset: int = 0) -> int:
-        """Return the distance to the token behind the parenthesis that closes the next one."""
+        """Return the number of tokens up to and including the parenthesis that closes the next one."""
         depth = 0
         while True:
             kind, value, _ = self._peek(offset)
@@ -355,7 +357,7 @@ class EquationParser:
                 return offset
 
     def _is_curved(self, end: int) -> bool:
-        """Whether a power or a function is among the tokens up to a distance."""
+        """Whether a power or a function is among the next `end` tokens."""
         return any(self._peek(k)[1] == "^" or self._peek(k)[1] in EXPRESSION_FUNCTIONS for k in range(end))
 
     def _is_plain_sum(self) -> bool:
@@ -368,9 +370,10 @@ class EquationParser:
         return signs > 0 and not self._is_curved(end) and self._peek(end)[1] not in ("^", "*")
 
     def _is_expression_group(self) -> bool:
-        """Whether parentheses after a number are a factor of a non-linear term, not a sum that is multiplied out.
+        """Whether the next parentheses, after a number, are a factor of a nonlinear term and not a sum to expand.
 
-        They are raised or multiplied, or hold a constant beside a power or a function, or are double.
+        They are if a power or a product follows, if they contain a constant and a power or function, or if they are
+        doubled.
         """
         end = self._closing_distance()
         if self._peek(end)[1] in ("^", "*"):
@@ -393,7 +396,7 @@ class EquationParser:
         return False
 
     def _operand(self) -> tuple[Order, str | Expression]:
-        """Parse what a coefficient multiplies: order and signal, or order and expression of a non-linear term."""
+        """Parse the operand of a coefficient: return (order, signal), or (order, expression) of a nonlinear term."""
         begin = self._position
         operator = self._operator()
         if operator is not None and self._sees("("):
@@ -416,7 +419,7 @@ class EquationParser:
         return Order(), self._product(divide=False)
 
     def _operator(self) -> Order | None:
-        """Parse ``D``, ``D^order`` or ``d/dt`` before a signal or parentheses; None for other text."""
+        """Parse ``D``, ``D^order`` or ``d/dt`` before an operand, and return its order; None for other text."""
         operator = self._leibniz()
         if operator is not None and not operator[1]:
             self._position += operator[2]
@@ -427,7 +430,7 @@ class EquationParser:
         return self._order() if self._accept("^") else Order(1.0)
 
     def _group(self) -> Expression:
-        """Parse an expression in parentheses."""
+        """Parse an expression in parentheses, and return it."""
         self._expect("(")
         self._depth += 1
         if self._depth > MAX_DEPTH:
@@ -444,7 +447,7 @@ class EquationParser:
         return terms
 
     def _expression(self) -> Expression:
-        """Parse a sum of products of numbers, signals and functions, without free parameters."""
+        """Parse a sum of products of numbers, signals and functions without free parameters, and return it."""
         terms = []
         while True:
             sign = self._signs()
@@ -453,7 +456,7 @@ class EquationParser:
                 return add(*terms)
 
     def _product(self, *, divide: bool = True) -> Expression:
-        """Parse a product of numbers, signals, their derivatives, powers and functions."""
+        """Parse a product of numbers, signals, derivatives, powers and functions, and return it."""
         factors = [self._power()]
         while True:
             kind, value, _ = self._peek()
@@ -471,7 +474,7 @@ class EquationParser:
                 return multiply(*factors)
 
     def _power(self) -> Expression:
-        """Parse one factor of a product, with its power."""
+        """Parse one factor of a product with its exponent, and return it."""
         kind, value, at = self._peek()
         derived = value == "D" or self._leibniz() is not None
         if kind == "number":
@@ -504,7 +507,7 @@ class EquationParser:
             raise self._error(f"at character {at + 1}: {error}") from error
 
     def _function(self) -> Expression:
-        """Parse a function of an expression."""
+        """Parse a function of an expression, and return it."""
         _, name, at = self._take()
         if name not in EXPRESSION_FUNCTIONS:
             reason = f"of the functions of signals only {', '.join(EXPRESSION_FUNCTIONS)}, sat and dead are computed"
@@ -520,7 +523,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------ derivatives and signals
 
     def _derivative(self) -> tuple[Order | None, str]:
-        """Parse a signal or its derivative; the order is None without one."""
+        """Parse a signal or its derivative, and return (order, signal); the order is None without a derivative."""
         operator = self._leibniz()
         if operator is not None:
             order, signal, tokens = operator
@@ -536,7 +539,7 @@ class EquationParser:
         return (Order(float(primes)) if primes else None), signal
 
     def _leibniz(self) -> tuple[Order, str, int] | None:
-        """Return order, signal and number of tokens of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
+        """Return (order, signal, number of tokens) of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
         distance, order = 0, 1
         kind, value, _ = self._peek()
         if kind != "name" or not value.startswith("d"):
@@ -563,7 +566,7 @@ class EquationParser:
         return Order(float(order)), signal, distance
 
     def _signal(self) -> str:
-        """Parse a signal, at time t or delayed, or an input behind a saturation or a dead zone."""
+        """Parse a signal with its time argument, saturation or dead zone, and return its name."""
         kind, value, _ = self._peek()
         if kind != "name" or value == "D":
             raise self._syntax_error("the name of a signal")
@@ -590,7 +593,7 @@ class EquationParser:
         return signal
 
     def _time_argument(self, signal: str) -> None:
-        """Parse ``(t)`` or ``(t - 0.06 s)`` after a signal, and store its delay."""
+        """Parse ``(t)`` or ``(t - 0.06 s)`` after a signal, and store the delay of the signal."""
         if not (self._sees("(", "t") and self._peek(2)[1] in ")-+"):
             self._check_delay(signal, 0.0)
             return
@@ -623,7 +626,7 @@ class EquationParser:
         return self._value("a delay [s], or LEAST:LARGEST where it is estimated")
 
     def _value(self, expectation: str) -> Value:
-        """Parse a number, or an interval in which one is estimated."""
+        """Parse a number, or an interval ``low:high`` for an estimate, and return it."""
         ends = []
         while True:
             if self._peek()[0] != "number":
@@ -633,7 +636,7 @@ class EquationParser:
                 return ends[0] if len(ends) == 1 else (ends[0], ends[1])
 
     def _order(self) -> Order:
-        """Parse an order: a number, a name, or an expression in parentheses."""
+        """Parse an order (a number, a name, or an expression in parentheses), and return it."""
         kind, value, start = self._peek()
         if value in "({" and kind == "symbol":
             close = ")" if value == "(" else "}"
@@ -663,7 +666,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------------------ friction
 
     def _take_friction(self, sign: float) -> bool:
-        """Parse ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; False for any other term."""
+        """Parse ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; return False for any other term."""
         distance, number, name = 0, 1.0, None
         if self._peek(distance)[0] == "number":
             number = float(self._peek(distance)[1])
@@ -712,7 +715,7 @@ class EquationParser:
         return True
 
     def _stribeck_factor(self) -> tuple[str, str | float]:
-        """Parse ``exp(-(D y/vs)^2)``: the signal, and name or value of the Stribeck speed."""
+        """Parse ``exp(-(D y/vs)^2)``, and return the signal and the name or value of the Stribeck speed."""
         self._take()
         for symbol in "(-(":
             self._expect(symbol, "-(D y/vs)^2, as in exp(-(D y/vs)^2)")
@@ -727,7 +730,7 @@ class EquationParser:
         return signal, float(value) if kind == "number" else value
 
     def _velocity(self, expectation: str) -> str:
-        """Parse ``D y``."""
+        """Parse ``D y``, and return the signal."""
         if not self._sees("D") or self._peek(1)[0] != "name":
             raise self._syntax_error(expectation)
         self._take()
@@ -736,7 +739,10 @@ class EquationParser:
     # --------------------------------------------------------------------------------------- transfer functions
 
     def _is_transfer(self) -> bool:
-        """Whether the text is ``y = G(s) u`` or ``y/u = G(s)``: a bare signal, and s on the other side."""
+        """Whether the text has the form ``y = G(s) u`` or ``y/u = G(s)``.
+
+        A single signal is then on one side, and s on the other.
+        """
         values = [value for _, value, _ in self._tokens]
         if values.count("=") != 1:
             return False
@@ -752,7 +758,7 @@ class EquationParser:
         ) or any(values[k : k + 2] == ["(", "s"] and values[k + 2 : k + 3] != [")"] for k in range(at, len(values)))
 
     def _transfer(self) -> None:
-        """Parse transfer functions, and multiply by the common denominator."""
+        """Parse transfer functions, and store the terms of the equation multiplied by their common denominator."""
         output = self._transform()
         common = self._transform() if self._accept("/") else None
         self._expect("=")
@@ -784,7 +790,7 @@ class EquationParser:
             self.right += [ParsedTerm(c, n, o, signal) for c, n, o in scaled]
 
     def _transform(self) -> str:
-        """Parse a signal, with or without ``(s)`` behind it."""
+        """Parse a signal with or without ``(s)`` after it, and return its name."""
         kind, value, _ = self._peek()
         if kind != "name":
             raise self._syntax_error("the name of a signal")
@@ -795,7 +801,7 @@ class EquationParser:
         return value
 
     def _ratio(self, common: str | None) -> tuple[SymbolicPolynomial, SymbolicPolynomial, Value]:
-        """Parse numerator, denominator and delay of a transfer function up to its signal."""
+        """Parse a transfer function up to its signal, and return numerator, denominator and delay."""
         top, bottom, divides, delay = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, 0.0
         while True:
             kind, value, _ = self._peek()
@@ -814,14 +820,17 @@ class EquationParser:
 
     @staticmethod
     def _ends_ratio(kind: str, value: str, symbols: list[str], *, is_named: bool) -> bool:
-        """Whether a token ends a transfer function: the name of its signal, or the end of the term without one."""
+        """Whether a token ends a transfer function.
+
+        It is the name of its signal, or without such a name the end of the term.
+        """
         if not is_named:
             return kind == "end" or (kind == "symbol" and value in "+-")
         last = symbols[0] in ("the end", "+", "-") or symbols == ["(", "s", ")"]
         return kind == "name" and value not in ("s", "sqrt") and last
 
     def _exponential(self) -> float:
-        """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, a delay [s]."""
+        """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, and return the delay [s]."""
         _, value, at = self._take()
         if value == "e":
             self._take()
@@ -838,7 +847,7 @@ class EquationParser:
         return delay
 
     def _polynomial(self) -> SymbolicPolynomial:
-        """Parse a sum of products of numbers, names and powers of s."""
+        """Parse a sum of products of numbers, names and powers of s, and return it."""
         polynomial: SymbolicPolynomial = []
         while True:
             sign = self._signs()
@@ -858,7 +867,7 @@ class EquationParser:
                 return [item for item in polynomial if item[0] != 0.0] or UNIT_POLYNOMIAL
 
     def _factor(self) -> SymbolicPolynomial:
-        """Parse one factor of a transfer function."""
+        """Parse one factor of a transfer function, and return it as a polynomial in s."""
         kind, value, at = self._peek()
         if kind == "number":
             self._take()
@@ -889,7 +898,7 @@ class EquationParser:
         return product
 
     def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
-        """Multiply two polynomials; equal powers with known coefficients are added."""
+        """Return the product of two polynomials in s; terms of equal power with known coefficients are added."""
         products: dict[tuple[str | None, Order], float] = {}
         out: SymbolicPolynomial = []
         for c1, n1, o1 in first:
@@ -912,7 +921,7 @@ class EquationParser:
 
 
 def add_orders(first: Order, second: Order) -> Order:
-    """Return the sum of two orders."""
+    """Return the sum of two orders as an order."""
     weights = dict(first.weights)
     for name, weight in second.weights:
         weights[name] = weights.get(name, 0.0) + weight

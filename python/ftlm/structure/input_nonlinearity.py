@@ -1,4 +1,4 @@
-"""Input nonlinearities: saturation, dead zone and delay of an input."""
+"""Saturation, dead zone and delay of inputs."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ INPUT_EFFECT_ABBREVIATIONS: dict[InputEffect, str] = {"delay": "delay", "saturat
 
 
 def input_name(law: InputEffect, signal: str) -> str:
-    """Return the parameter name of an input effect, such as ``delay_u`` or ``sat_u``."""
+    """Return the parameter name of a delay, saturation or dead zone, such as ``delay_u`` or ``sat_u``."""
     return f"{INPUT_EFFECT_ABBREVIATIONS[law]}_{signal}"
 
 
 @dataclass(frozen=True)
 class FreeInputParameter:
-    """Parameter of an input to estimate: delay, saturation or dead zone.
+    """Delay, saturation or dead zone of an input whose value is to be estimated.
 
     Parameters
     ----------
     signal
-        The input.
+        Name of the input.
     law
-        Kind of the effect.
+        Kind: ``"delay"``, ``"saturation"`` or ``"dead_zone"``.
     bounds
-        Lower and upper bound: [s] for a delay, else in the unit of the input.
+        Lower and upper bound, in seconds for a delay, otherwise in the unit of the input.
     """
 
     signal: str
@@ -62,8 +62,8 @@ class FreeInputParameter:
 class InputNonlinearity:
     """Symmetric saturation or dead zone of an input.
 
-    Saturation: min(|u|, value) sign(u). Dead zone: max(|u| - value, 0) sign(u). An input with both passes the dead zone
-    first; a delay comes last.
+    A saturation gives min(|u|, value) sign(u), a dead zone max(|u| - value, 0) sign(u). If an input has both, the dead
+    zone acts first. A delay acts last.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class InputNonlinearity:
     Raises
     ------
     ModelError
-        A value that is neither a valid number nor a valid interval.
+        If the value is neither a valid number nor a valid interval.
     """
 
     signal: str
@@ -105,7 +105,7 @@ class InputNonlinearity:
 
     @property
     def free(self) -> FreeInputParameter | None:
-        """Parameter to estimate; None if the value is fixed."""
+        """Parameter to estimate, or None if the value is fixed."""
         return FreeInputParameter(self.signal, self.law, self.value) if isinstance(self.value, tuple) else None
 
     @property
@@ -114,12 +114,12 @@ class InputNonlinearity:
         return input_name(self.law, self.signal)
 
     def apply(self, values: Floats) -> Floats:
-        """Apply the nonlinearity to input values.
+        """Return input values after the nonlinearity.
 
         Raises
         ------
         ModelError
-            The value of the nonlinearity is still free.
+            If the value of the nonlinearity is free.
         """
         if isinstance(self.value, tuple):
             raise ModelError(f"the {INPUT_EFFECT_LABELS[self.law]} of {self.signal} is still free; give its value")
@@ -127,21 +127,21 @@ class InputNonlinearity:
         return np.asarray(clipped if self.law == "saturation" else values - clipped)
 
     def as_text(self, inner: str, digits: str = "r") -> str:
-        """Format the nonlinearity around the text of its input, such as ``sat(u, 0.94)``."""
+        """Return text such as ``sat(u, 0.94)``, where `inner` is the text of the input."""
         ends = self.value if isinstance(self.value, tuple) else (self.value,)
         texts = [repr(float(v)) if digits == "r" else format(v, digits) for v in ends]
         return f"{INPUT_EFFECT_ABBREVIATIONS[self.law]}({inner}, {':'.join(texts)})"
 
 
 def sort_nonlinearities(limits: Sequence[InputNonlinearity]) -> list[InputNonlinearity]:
-    """Sort nonlinearities in the order in which they act: dead zones first."""
+    """Return nonlinearities in the order in which they act: dead zones first."""
     return sorted(limits, key=lambda limit: limit.law == "saturation")
 
 
 def replace_nonlinearities(
     limits: Sequence[InputNonlinearity], law: NonlinearityKind, values: Mapping[str, Value]
 ) -> tuple[InputNonlinearity, ...]:
-    """Replace the nonlinearities of one kind, by input."""
+    """Return nonlinearities in which those of one kind are replaced by new values, by input."""
     others = [limit for limit in limits if limit.law != law or limit.signal not in values]
     new = [
         InputNonlinearity(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()
@@ -152,9 +152,9 @@ def replace_nonlinearities(
 def check_nonlinearities(
     limits: Sequence[InputNonlinearity], delays: Mapping[str, object], late: Mapping[str, object]
 ) -> None:
-    """Raise for repeated nonlinearities, or more than one free parameter per input.
+    """Raise ModelError if an input has two nonlinearities of one kind, or more than one free parameter.
 
-    ``delays`` are fixed delays by input, ``late`` free ones.
+    ``delays`` are the fixed delays and ``late`` the free delays, by input.
     """
     for k, limit in enumerate(limits):
         if any((o.signal, o.law) == (limit.signal, limit.law) for o in limits[:k]):

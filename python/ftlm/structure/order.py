@@ -1,4 +1,4 @@
-"""Orders of terms: numbers or affine functions of free orders, and the grid values of an order."""
+"""Orders of terms, which are numbers or affine functions of free orders, and grids of order values."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Order:
     constant
         Constant part.
     weights
-        Weight of each free order, by name, as sorted pairs without zeros.
+        (name, weight) of each free order, sorted by name, without zero weights.
     """
 
     constant: float = 0.0
@@ -46,19 +46,21 @@ class Order:
 
     @check_arguments
     def substitute(self, values: Mapping[str, float]) -> Order:
-        """Substitute values for some free orders; the others stay free."""
+        """Return the order with values in place of some free orders; the others stay free."""
         constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
         return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in self.weights if n not in values))
 
     @classmethod
     @check_arguments
     def parse(cls, text: str | float) -> Order:
-        """Parse ``0.5``, ``"alpha"`` or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
+        """Return the order that a number or text denotes.
+
+        Text is a number, a name, or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
 
         Raises
         ------
         ModelError
-            An expression that is not affine in its names.
+            If an expression is not affine in its names.
         """
         if isinstance(text, (int, float)) and not isinstance(text, bool):
             return cls(float(text))
@@ -80,22 +82,22 @@ class Order:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free orders in this expression."""
+        """Names of the free orders in the order."""
         return tuple(name for name, _ in self.weights)
 
     @property
     def is_single(self) -> bool:
-        """Whether the expression is a single free order."""
+        """Whether the order is a single free order."""
         return self.constant == 0 and len(self.weights) == 1 and self.weights[0][1] == 1
 
     @check_arguments
     def at(self, values: Mapping[str, float]) -> float:
-        """Evaluate the order at given free orders, rounded to 1e-9.
+        """Return the value of the order at given values of the free orders, rounded to 1e-9.
 
         Raises
         ------
         ModelError
-            A free order without a value.
+            If a free order has no value.
         """
         try:
             return round(self.constant + sum(w * values[n] for n, w in self.weights), 9) + 0.0
@@ -112,13 +114,13 @@ class Order:
 
 
 def format_shortest(value: float) -> str:
-    """Format a number with six significant digits if exact, else with its shortest exact representation."""
+    """Return a number as text: with six significant digits if these are exact, otherwise with all digits needed."""
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 
 
 def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
-    """Constant and weights of an affine expression; `ValueError` if it is not affine."""
+    """Return the constant and the weights of an affine expression; raise ValueError if it is not affine."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value), {}
@@ -146,9 +148,10 @@ def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
 
 
 def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
-    """Parse the values of one order: a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers.
+    """Return the value of a fixed order, or the ascending grid values of a free one.
 
-    Returns a number if the order is fixed, else its values in ascending order.
+    `spec` is a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers. Raise ModelError for other
+    input.
     """
     if isinstance(spec, str):
         parts = spec.split(":")
@@ -198,7 +201,7 @@ MAX_AXIS_VALUES = 1_000_000
 
 
 def order_axis(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
-    """Values of one order from ``low`` to ``high`` in increments of ``step``, both ends included."""
+    """Return the values of an order from ``low`` to ``high``, both included, in increments of ``step``."""
     low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
     if not (math.isfinite(step) and step > 0):
         raise ModelError(f"order {name}: increment {step:g} is not positive; the paper's is 0.05")

@@ -1,4 +1,4 @@
-"""Parser of equation texts: text to `Structure`."""
+"""Parser from the text of equations to a structure."""
 
 from __future__ import annotations
 
@@ -36,50 +36,53 @@ def equation(
     offset: str | None = None,
     coupling: Literal["measured", "simulated"] | None = None,
 ) -> Structure:
-    """Parse the text of one or several fractional-order equations into a structure.
+    """Return the structure that the text of one or several fractional-order equations describes.
 
     Parameters
     ----------
     text
-        Such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` is a free order, ``D^(alpha-mu)`` an order law,
-        ``D y``, ``y'`` or ``dy/dt`` the first derivative. A coefficient is a name, a number (fixed) or a number times a
-        name. Terms may stand on both sides, as in ``"y'' + 2 y' + y = u(t - 0.1)"`` with a delay [s] of the input, and
-        transfer functions may be written in s: ``"y = (2 s^0.5 + 1)/(s^1.5 + 3) e^(-0.1 s) u"``. The equation is solved
-        for the highest derivative of its output, the signal that is differentiated most on the left-hand side. Separate
-        equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an offset, an unknown constant;
-        write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is Coulomb friction of the
-        simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds Stribeck friction, with fs and
-        vs > 0 each a name or a number; the breakaway force is then fc + fs. Non-linear terms are linear in their
-        coefficients: ``k3 y^3``, ``e y*u``, ``- w abs(D y)*D y``, ``k sin(2 y)``, ``k D^mu (y^3)``, with the functions
-        sin, cos, exp, tanh, abs and sqrt. The first name of a product is its coefficient, unless it is that of a signal
-        elsewhere in the equations.
+        Equations such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` is a free order, ``D^(alpha-mu)`` an
+        order law, ``D y``, ``y'`` or ``dy/dt`` the first derivative. A coefficient is a name, a number (fixed) or a
+        number times a name. Terms may stand on both sides, as in ``"y'' + 2 y' + y = u(t - 0.1)"`` with a delay [s] of
+        the input, and transfer functions may be written in s: ``"y = (2 s^0.5 + 1)/(s^1.5 + 3) e^(-0.1 s) u"``. The
+        equation is solved for the highest derivative of its output, the signal that is differentiated most on the
+        left-hand side. Separate equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an
+        offset, an unknown constant; write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is
+        Coulomb friction of the simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds
+        Stribeck friction, with fs and vs > 0 each a name or a number; the breakaway force is then fc + fs. Nonlinear
+        terms must be linear in their coefficients: ``k3 y^3``, ``e y*u``, ``- w abs(D y)*D y``, ``k sin(2 y)``, ``k
+        D^mu (y^3)``, with the functions sin, cos, exp, tanh, abs and sqrt. The first name in a product is its
+        coefficient, unless it denotes a signal elsewhere in the equations.
     orders
-        Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its grid.
+        Values of the free orders by name: a number fixes the order, ``"0.5:1.5:0.05"`` or (low, high, step) is its
+        grid.
     fixed
-        Known coefficients, by name.
+        Values of known coefficients by name.
     delay
-        Delay of inputs [s], by name: a number fixes one, (lower, upper) is estimated by output error. It is negative
-        where an input is logged after it acts, by one sampling interval at most.
+        Delay of inputs [s] by name: a number fixes the delay, bounds (lower, upper) let output error estimate it. It
+        may be negative, down to minus one sampling interval, if an input is logged after it acts.
     saturation, dead_zone
-        Symmetric saturation level and half-width of the dead zone of inputs, in their units: a number fixes one,
-        (lower, upper) is estimated by output error. As text: ``sat(u, 0.94)``, ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.
+        Symmetric saturation level and half-width of the dead zone of inputs by name, in their units: a number fixes the
+        value, bounds (lower, upper) let output error estimate it. In the text they are written ``sat(u, 0.94)``,
+        ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.
     initial
-        Initial conditions as powers of t: ``"rest"`` (zero), ``"caputo"`` (constant before the start), ``"history"``
-        (unknown past: exponents in quarters, as many as are significant), or given exponents. ``"auto"``: rest if the
-        outputs start at zero, or stand still in five rows or more before an input moves, or if the inputs are constant
-        over the run (said in a finding); then the level of the outputs is estimated where it is not zero, and the
-        inputs count from their first value. Else Caputo for integer orders or if the data need no more, else history.
+        Initial conditions, as powers of t in the integrated equation: ``"rest"`` (none), ``"caputo"`` (Caputo's initial
+        values), ``"history"`` (unknown past inputs: multiples of 1/4 as exponents, as many as are significant), or
+        given exponents. ``"auto"`` chooses rest if the outputs start at zero, are constant in at least five samples
+        before an input changes, or if the inputs are constant over the run (with a finding). A nonzero level of the
+        outputs is then estimated, and inputs are measured from their first value. Otherwise ``"auto"`` chooses Caputo
+        for integer orders or if the data require no more, else history.
     sensor_filter
-        Known filter of some measured signals, inputs or outputs; see :class:`ftlm.SensorFilter`.
+        Known filter that some signals passed when they were measured; see :class:`ftlm.SensorFilter`.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, the same as ``+ c`` in the text;
-        ``"ramp"``: a constant and a constant times t; ``"level"``: a constant that is added to the output, the value at
-        which the plant rests, one number whatever the orders; ``"none"``. From rest a constant is a load that acts from
-        the first row on, or, if the outputs stand still elsewhere than at zero, the level at which it rests. Offsets
-        are estimated per run with the coefficients and never transferred to another run. Default: as in the text.
+        ``"ramp"``: a constant and a constant times t; ``"level"``: an unknown constant that is added to each output;
+        ``"none"``. If a run starts from rest, a constant is a load that acts from the first sample on. If the outputs
+        rest at nonzero values first, it is replaced by a level. Offsets are estimated for each run together with the
+        coefficients, and are not transferred to another run. Default: as in the text.
     coupling
-        Coupling of several equations. ``"measured"``: the measured other outputs are inputs (default).
-        ``"simulated"``: all outputs are simulated together (default if an equation has friction).
+        Coupling of several equations. ``"measured"`` (default): the measured other outputs are inputs of each equation.
+        ``"simulated"`` (default if an equation has friction): all outputs are simulated together.
 
     Returns
     -------
@@ -89,8 +92,8 @@ def equation(
     Raises
     ------
     ModelError
-        A syntax error (with its position), an unknown name, an order out of range, or an offset in only some of several
-        equations.
+        If the text has a syntax error (the message has its position), a name is unknown, an order is out of range, or
+        only some of several equations have an offset.
     """
     if not isinstance(text, str):
         raise ModelError(f"the equation is {type(text).__name__}, not text; write it as in 'D^1.5 y = a0 y + b0 u'")
@@ -124,7 +127,10 @@ def equation(
 
 
 def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
-    """Parse equation texts; the first name of a product is a coefficient unless it is that of a signal elsewhere."""
+    """Return one parser per equation text, after all texts are parsed.
+
+    The first name in a product is a coefficient unless it denotes a signal in another place.
+    """
     parsed = [EquationParser(line).parse() for line in lines]
     items = [item for words in parsed for item in (*words.left, *words.right)]
     signals = {signal for item in items for signal in item.signals}
@@ -134,7 +140,7 @@ def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
 
 
 def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None) -> Offset:
-    """Return the offset: the argument if given, else the one that all equation texts share."""
+    """Return the offset option: the argument if given, otherwise the one that all equation texts share."""
     pairs = [(item.output, has_offset) for item, has_offset in parsed if has_offset]
     if offset is not None:
         if pairs and check_offset(offset) == "none":
@@ -155,9 +161,9 @@ def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None
 
 
 def _equation_of(words: EquationParser) -> Equation:
-    """Return a parsed equation solved for its leading derivative.
+    """Return a parsed equation, solved for its leading derivative.
 
-    That is the highest one on the left-hand side, or the first one if an order there is a named parameter.
+    This is the highest derivative on the left-hand side, or the first one if an order there is a free parameter.
     """
     linear = [item for item in words.left if item.expression is None]
     derivatives = [item for item in linear if item.order.names or item.order.constant != 0]
@@ -199,7 +205,7 @@ def _equation_of(words: EquationParser) -> Equation:
 
 
 def _friction_of(words: EquationParser, output: str, leading: float) -> Friction | None:
-    """Return the friction of an equation's output, divided by the factor of its highest derivative."""
+    """Return the friction of an equation, divided by the factor of its leading derivative; None without friction."""
     for pair in (words.friction, words.stribeck):
         if pair is not None and pair[1] != output:
             raise ModelError(
@@ -220,7 +226,7 @@ def _friction_of(words: EquationParser, output: str, leading: float) -> Friction
 
 
 def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
-    """Merge the input nonlinearities of all equations; each input must have the same one in every term."""
+    """Return the saturations and dead zones of all equations; raise ModelError if an input has different ones."""
     limits: dict[tuple[str, str], Value] = {}
     for words in parsed:
         for key, limit in words.limits.items():
@@ -241,7 +247,7 @@ def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlin
 
 
 def _merge_delays(parsed: Sequence[EquationParser], explicit_delays: Mapping[str, Value]) -> dict[str, Value]:
-    """Merge the delays of all equation texts and those of the argument."""
+    """Return the delays of all equation texts and of the argument, by input; raise ModelError if they contradict."""
     delays: dict[str, Value] = {}
     for words in parsed:
         for signal, delay in words.delays.items():

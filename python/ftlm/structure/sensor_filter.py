@@ -1,4 +1,4 @@
-"""Sensor filter: known rational transfer function of measured signals."""
+"""Sensor filter: a known transfer function of measured signals."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from ftlm.utils.validation import real_number
 
 
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Sensor filter: known rational transfer function that some signals have passed.
+    """Known transfer function (sensor filter) that some signals passed when they were measured.
 
     The filter may apply to inputs and outputs, because it commutes with every linear equation. If a filtered signal is
-    an input of an equation, the equation is used for filtered signals only: signals without the filter, including the
-    output that is compared, are filtered by software. If all inputs are unfiltered, or an equation has friction, the
-    unfiltered motion is simulated and only the filtered outputs are filtered before the comparison. See
+    an input of an equation, all other signals, including the measured output, are filtered by software, and the
+    equation is applied to filtered signals. If all inputs are unfiltered, or an equation has friction, the unfiltered
+    motion is simulated; the filter is then applied to the simulated outputs that were measured through it. See
     :attr:`Structure.all_filtered`.
 
     Parameters
     ----------
     signals
-        Names of the filtered signals, at least one.
+        Names of the signals that were measured through the filter, at least one.
     numerator, denominator
-        (coefficient, order) pairs of sums of coefficient * D^order.
+        Numerator and denominator as (coefficient, order) pairs, each a sum of coefficient * D^order.
 
     Raises
     ------
     ModelError
-        No signal, a repeated signal, an invalid term, or a numerator of higher order than the denominator.
+        If there is no signal, a signal is repeated, a term is invalid, or the order of the numerator exceeds that of
+        the denominator.
     """
 
     signals: tuple[str, ...]
@@ -65,7 +66,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def relative_degree(self) -> int:
-        """Relative degree: integer part of the order of the denominator minus that of the numerator."""
+        """Integer part of the order of the denominator minus the order of the numerator."""
         bottom, top = (
             max((order for coefficient, order in part if coefficient), default=0.0)
             for part in (self.denominator, self.numerator)
@@ -74,14 +75,14 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def holds_answers(self) -> bool:
-        """Whether impulse responses span the filter's transient: no zeros and integer orders only."""
+        """Whether the filter's transient is a sum of impulse responses: no zeros and only integer orders."""
         whole = all(order == round(order) for coefficient, order in self.denominator if coefficient)
         return whole and not any(order for coefficient, order in self.numerator if coefficient)
 
     @classmethod
     @check_arguments
     def low_pass(cls, signals: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
-        """Second-order low-pass filter; the default is that of the arm's stock real-time model.
+        """Return a second-order low-pass filter; the default is that of the arm's original real-time model.
 
         Parameters
         ----------
@@ -95,7 +96,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Raises
         ------
         ModelError
-            No signals, or a frequency or damping that is not positive.
+            If there are no signals, or frequency or damping is not positive.
         """
         if isinstance(signals, str):
             raise ModelError(f"sensor filter: signals = {signals!r} is one text; give a list of names, [{signals!r}]")

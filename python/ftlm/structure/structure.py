@@ -1,4 +1,4 @@
-"""Model structures: coupled equations with order law, coefficient law, delays, offsets and initial terms."""
+"""Model structures: coupled equations with laws between parameters, delays, offsets and initial conditions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ from ftlm.utils.validation import check_known, real_number
 
 
 class History(tuple[float, ...]):
-    """Exponents of t of the initial terms, selected from the data for unknown initial conditions."""
+    """Exponents of t of the initial terms that represent unknown past inputs.
+
+    The exponents are selected from the data.
+    """
 
     __slots__ = ()
 
@@ -40,7 +43,7 @@ INITIAL_CHOICES = ("auto", "rest", "caputo", "history")
 
 
 def check_initial(initial: str | Iterable[float]) -> Initial:
-    """Validate initial terms: a known word, or exponents in (-1, 10]."""
+    """Return validated initial conditions: a known name, or exponents in (-1, 10]; raise ModelError for others."""
     if isinstance(initial, str) and initial in INITIAL_CHOICES:
         return initial  # type: ignore[return-value]
     try:
@@ -57,14 +60,14 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
 
 
 def check_offset(offset: str) -> Offset:
-    """Validate an offset: ``"none"``, ``"level"``, ``"constant"``, ``"ramp"`` or ``"auto"``."""
+    """Return a validated offset option; raise ModelError for an unknown one."""
     if offset in ("none", "level", "constant", "ramp", "auto"):
         return offset  # type: ignore[return-value]
     raise ModelError(f"{setting('offset')} {offset!r} is not known; use 'none', 'level', 'constant', 'ramp' or 'auto'")
 
 
 def check_offset_resolved(offset: str) -> None:
-    """Raise if the offset is still ``"auto"``."""
+    """Raise ModelError if the offset is still ``"auto"``."""
     if offset == "auto":
         raise ModelError(
             f"{parameter('offset', 'auto')} lets ftlm.identify decide from the runs whether an equation has one; "
@@ -74,24 +77,24 @@ def check_offset_resolved(offset: str) -> None:
 
 @dataclass(frozen=True)
 class Hints:
-    """Prior knowledge for initial guesses of a fit; it imposes no bounds.
+    """Prior knowledge for the initial guesses of a fit, without bounds on the result.
 
     Parameters
     ----------
     highest_order_range
-        Usual interval of the highest orders; None for no preference.
+        Usual interval of the orders of the equations; None for no preference.
     nominal_orders
-        Typical values of the free orders, by name; used as additional initial guesses if every free order has some.
+        Typical values of the free orders by name. They give additional initial guesses if every free order has some.
     order_names_by_coefficient
-        Name of the free order of a term when its equation is separated from an order law, by the term's coefficient.
+        Name of the free order of a term, by its coefficient, when an equation is used without the order law.
     min_ratios
-        Physical lower bounds of ratios in the coefficient law, by name; default 1, as for a sum of inertias over one
-        of them.
+        Physical lower bounds of the ratios in the coefficient law, by name. The default is 1, which holds for a sum of
+        inertias divided by one of them.
     positive_coefficients
-        Coefficients that the coefficient law ties to another equation and that are physically positive. Least squares
-        can confuse the two equations; an additional initial guess uses the law with these signs.
+        Names of physically positive coefficients that the coefficient law relates to another equation. Least squares
+        can give them wrong signs; an additional initial guess uses the law with positive signs.
     nominal_coefficients
-        Nominal values of coefficients from approximate physics, used as additional initial guesses.
+        Nominal values of coefficients by name, which give an additional initial guess.
     """
 
     highest_order_range: tuple[float, float] | None = None
@@ -105,46 +108,47 @@ class Hints:
 @check_arguments
 @dataclass(frozen=True)
 class Structure:
-    """Structure of coupled fractional-order equations; orders and coefficients may be free.
+    """Structure of a model: coupled fractional-order equations whose orders and coefficients may be free.
 
     Parameters
     ----------
     equations
         One equation per modeled output.
     order_values
-        Grid values of free orders, ascending, where given.
+        Ascending grid values of free orders by name, for those that have a grid.
     coupling
         ``"measured"``: the measured other outputs are inputs of each equation. ``"simulated"``: all outputs are
         simulated together from the inputs.
     delay
-        Fixed delay of inputs [s].
+        Fixed delays of inputs [s] by name.
     free_delays
-        Lower and upper bound of estimated input delays [s].
+        (lower, upper) bounds of estimated input delays [s] by name.
     input_nonlinearities
         Saturations and dead zones of inputs, fixed or estimated.
     initial
-        Initial terms, see :func:`equation`.
+        Initial conditions; see :func:`equation`.
     sensor_filter
-        Known filter of some measured signals, inputs or outputs.
+        Known filter that some signals passed when they were measured.
     coefficient_law
         Optional law between coefficients: (name, sign, factors) with coefficient = sign * product of factors.
     reference
-        Manufacturer's values of coefficients by name, shown next to the estimates.
+        Nominal values of coefficients by name, which are printed next to the estimates.
     name
         Name of the structure.
     hints
-        Prior knowledge for initial guesses; neither compared nor written.
+        Prior knowledge for initial guesses. It is ignored by comparisons of structures and not saved.
     offset
-        ``"constant"``: an unknown constant on the right-hand side of each equation. ``"ramp"``: a constant and a
-        constant times t. Offsets are estimated per run, like initial terms, and never transferred to another run.
-        ``"level"``: a constant that is added to each output, the value at which the plant rests. ``"auto"``:
-        identification decides between none and a constant. With ``"none"`` and ``"constant"`` a run that rests at its
-        own level before an input moves has a level (see `initial`).
+        ``"none"``; ``"constant"``: an unknown constant on the right-hand side of each equation; ``"ramp"``: a constant
+        and a constant times t; ``"level"``: an unknown constant that is added to each output; ``"auto"``: the
+        identification decides between none and a constant. Offsets are estimated for each run, like initial terms, and
+        are not transferred to another run. With ``"none"`` and ``"constant"``, a run that rests at a nonzero level
+        before an input changes gets a level (see `initial`).
 
     Raises
     ------
     ModelError
-        No equation, a repeated output or coefficient, or a delay, nonlinearity or filter of an unknown signal.
+        If there is no equation, an output or coefficient is repeated, or a delay, nonlinearity or filter has an unknown
+        signal.
     """
 
     equations: tuple[Equation, ...]
@@ -205,12 +209,12 @@ class Structure:
 
     @property
     def has_nonlinear_terms(self) -> bool:
-        """Whether an equation has a non-linear term."""
+        """Whether an equation has a nonlinear term."""
         return any(e.nonlinear_terms for e in self.equations)
 
     @property
     def is_linear(self) -> bool:
-        """Whether no equation has friction or a non-linear term."""
+        """Whether no equation has friction or a nonlinear term."""
         return not (self.has_friction or self.has_nonlinear_terms)
 
     @property
@@ -219,7 +223,7 @@ class Structure:
         return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)
 
     def _check_friction(self) -> None:
-        """Raise for properties that the simulation with friction does not support."""
+        """Raise ModelError if a structure with friction has properties that its simulation does not support."""
         rubbing = [self.equations[i].output for i in self.friction_equations]
         words = f"the equation of {rubbing[0]} has friction"
         if len(self.equations) > 1 and self.coupling == "measured":
@@ -246,7 +250,7 @@ class Structure:
             )
 
     def _check_offset(self) -> None:
-        """Raise for an unknown offset, or one that duplicates a given initial term."""
+        """Raise ModelError if the offset is unknown, or has the same power of t as a given initial term."""
         check_offset(self.offset)
         if isinstance(self.initial, (str, History)):
             # An exponent that equals that of the offset is merged with it.
@@ -267,16 +271,15 @@ class Structure:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of all signals: outputs in the order of their equations, then the others by name."""
+        """Names of all signals: outputs in the order of their equations, then the others alphabetically."""
         return (*self.outputs, *sorted({s for e in self.equations for s in e.signals} - set(self.outputs)))
 
     @property
     def all_filtered(self) -> bool:
-        """Whether the equations hold for filtered signals, so that all unfiltered signals must be filtered.
+        """Whether the sensor filter must be applied to all signals, because the equations hold for filtered signals.
 
         This is the case if a filtered signal is an input of an equation: an external signal, or another output with
-        measured coupling. All simulated and compared outputs are then filtered. With friction, outputs are simulated
-        before the filter.
+        measured coupling. It is False if an equation has friction; the outputs are then simulated before the filter.
         """
         followed = self.outputs if self.coupling == "simulated" or self.has_friction else ()
         return any(s not in followed and self.is_filtered(s) for s in self.signals)
@@ -285,14 +288,14 @@ class Structure:
     def filter_states(self, initial: Initial) -> int:
         """Return the number of unknown initial states of the sensor filter for given initial terms.
 
-        Signals that are filtered by software pass the filter from the start of the run, so its initial transient is
-        unknown. The transient is modeled by responses to an impulse and its derivatives. There is none from rest or
-        with given exponents.
+        The filter that software applies to a signal starts with the run, so its initial state is unknown. The transient
+        is modeled by responses to an impulse and its derivatives. The number is 0 for rest and for given exponents.
 
         Raises
         ------
         ModelError
-            A filter with zeros or fractional orders on simulated outputs, whose transient these responses do not span.
+            If the filter of simulated outputs has zeros or fractional orders, because these responses then do not
+            represent its transient.
         """
         sensor = self.sensor_filter
         if sensor is None or not (initial == "caputo" or isinstance(initial, History)):
@@ -309,17 +312,17 @@ class Structure:
 
     @check_arguments
     def has_filter_transient(self, output: str) -> bool:
-        """Whether an output may contain the initial transient of the sensor filter."""
+        """Whether an output may contain a transient from the initial state of the sensor filter."""
         return self.all_filtered or self.is_filtered(output)
 
     @check_arguments
     def is_filtered(self, signal: str) -> bool:
-        """Whether a signal passed the sensor filter."""
+        """Whether a signal was measured through the sensor filter."""
         return self.sensor_filter is not None and signal in self.sensor_filter.signals
 
     @property
     def order_names(self) -> tuple[str, ...]:
-        """Names of the free orders: single ones in order of appearance, then those that occur only in a law."""
+        """Names of the free orders: those that are the order of a term first, then those only in expressions."""
         orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms))]
         alone = [o.names[0] for o in orders if o.is_single]
         return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
@@ -331,17 +334,17 @@ class Structure:
 
     @property
     def has_order_law(self) -> bool:
-        """Whether an order law relates the orders: an order is an expression, or two orders share a name."""
+        """Whether an order law relates the orders: an order is an expression, or two terms share a free order."""
         orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms)) if o.names]
         names = [o.names[0] for o in orders]
         return any(not o.is_single for o in orders) or len(set(names)) < len(names)
 
     def independent_groups(self) -> dict[str, Structure]:
-        """Return the independent substructures of an order search: groups of equations that share free orders.
+        """Return, by name, groups of equations that share free orders, each as a structure for an order search.
 
-        Equations related by an order law form one group, named ``"stage"`` if it is the whole structure, else by its
-        outputs. Any other equation is a group of its own, with measured coupling. Equations without free orders are
-        omitted.
+        Equations related by an order law form one group. Its name is ``"stage"`` if it is the whole structure,
+        otherwise its outputs. Every other equation forms a group by itself, with measured coupling. Equations without
+        free orders are omitted.
         """
         groups: list[tuple[set[str], list[Equation]]] = []
         for item in self.equations:
@@ -365,7 +368,7 @@ class Structure:
         return out
 
     def _of(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:
-        """Return the substructure of some equations, without coefficient laws."""
+        """Return a structure that has only the given equations, without coefficient laws."""
         orders = {n for e in equations for n in e.order_names}
         signals = tuple(dict.fromkeys(s for e in equations for s in e.signals))
         return replace(
@@ -383,15 +386,15 @@ class Structure:
 
     @check_arguments
     def equation(self, output: str) -> Structure:
-        """Return one equation as a structure of its own, with measured coupling and without order laws.
+        """Return one equation as a separate structure, with measured coupling and without order laws.
 
-        An order given by a law becomes a free order named after its term. The order of an input becomes 0 unless it is
-        fixed.
+        An order that is an expression becomes a free order named after its term. The order of an input becomes 0 unless
+        it is a number.
 
         Raises
         ------
         ModelError
-            No such output.
+            If the structure has no such output.
         """
         check_known("output", [output], self.outputs)
         own = next(e for e in self.equations if e.output == output)
@@ -412,12 +415,12 @@ class Structure:
     @check_arguments
     @check_arguments
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
-        """Fix free orders (a number) or set their grid values (see :func:`parse_values`).
+        """Return the structure with orders fixed (a number) or with grid values; see :func:`parse_values`.
 
         Raises
         ------
         ModelError
-            A name that is not a free order, or values out of range.
+            If a name is not a free order, or a value is out of range.
         """
         check_known("order", orders, self.order_names)
         numbers: dict[str, float] = {}
@@ -433,26 +436,26 @@ class Structure:
 
     @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Structure:
-        """Fix free coefficients.
+        """Return the structure with some free coefficients fixed to values.
 
         Raises
         ------
         ModelError
-            A name that is not a free coefficient.
+            If a name is not a free coefficient.
         """
         check_known("coefficient", values, self.coefficient_names)
         return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
 
     @check_arguments
     def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
-        """Set input delays [s]: a number fixes one, (lower, upper) bounds an estimated one.
+        """Return the structure with delays of inputs [s]: a number fixes one, (lower, upper) are bounds of an estimate.
 
-        A delay is negative where an input is logged after it acts, by one sampling interval of a run at most.
+        A delay may be negative, down to minus one sampling interval, if an input is logged after it acts.
 
         Raises
         ------
         ModelError
-            A name that is not an input, a delay that is not finite, or no interval.
+            If a name is not an input, a delay is not finite, or bounds are not an interval.
         """
         fixed, free = dict(self.delay), dict(self.free_delays)
         for name, delay in delays.items():
@@ -470,17 +473,19 @@ class Structure:
     def with_limits(
         self, *, saturation: Mapping[str, Value] | None = None, dead_zone: Mapping[str, Value] | None = None
     ) -> Structure:
-        """Set saturations and dead zones of inputs: a number fixes one, (lower, upper) bounds an estimated one.
+        """Return the structure with saturations and dead zones of inputs.
+
+        A number fixes the limit, (lower, upper) are bounds of an estimate.
 
         Parameters
         ----------
         saturation, dead_zone
-            Limit by input, in its unit: the saturation level, and the half-width of the dead zone.
+            Saturation level and half-width of the dead zone by input, in the unit of the input.
 
         Raises
         ------
         ModelError
-            A name that is not an input, an invalid limit or interval, or more than one free parameter per input.
+            If a name is not an input, a limit or interval is invalid, or an input has more than one free parameter.
         """
         limits = replace_nonlinearities(self.limits, "dead_zone", dead_zone or {})
         return replace(
@@ -494,13 +499,13 @@ class Structure:
 
     @property
     def free_inputs(self) -> tuple[FreeInputParameter, ...]:
-        """Parameters of inputs to estimate: delays, then saturations and dead zones."""
+        """Delays, then saturations and dead zones of inputs that are to be estimated."""
         late = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
         return tuple([*late, *(limit.free for limit in self.limits if limit.free is not None)])
 
     @check_arguments
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
-        """Fix free input parameters by name, such as ``delay_u`` and ``sat_u``."""
+        """Return the structure with delays and limits fixed to values by name, such as ``delay_u`` and ``sat_u``."""
         names = {n: input_name("delay", n) for n in self.free_delays}
         delays = {n: values[name] for n, name in names.items() if name in values}
         limits = tuple(
@@ -516,7 +521,7 @@ class Structure:
 
     @check_arguments
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
-        """Texts of inputs with delay or nonlinearity, such as ``sat(u(t - 0.035 s), 0.94)``."""
+        """Return text of inputs with a delay or nonlinearity by name, such as ``sat(u(t - 0.035 s), 0.94)``."""
         ends: dict[str, tuple[float, ...]] = {n: (d,) for n, d in self.delay.items() if d > 0} | dict(self.free_delays)
         out = {n: f"{n}(t - {':'.join(_format(d, digits) for d in values)} s)" for n, values in ends.items()}
         for limit in self.limits:
@@ -529,12 +534,12 @@ class Structure:
 
     @check_arguments
     def equation_text(self, item: Equation) -> str:
-        """Format an identified equation with its delays, nonlinearities and offset."""
+        """Return an identified equation as text, with delays, nonlinearities and offset."""
         return format_equation(item, self.describe_inputs(".6g")) + self.offset_in_words
 
     @property
     def offset_in_words(self) -> str:
-        """Text of the offset at the end of an equation; empty if there is none."""
+        """Return the text of the offset at the end of an equation; empty without an offset."""
         names = {*self.coefficient_names, *self.order_names, *self.signals}
         name = next(n for n in ("c", *(f"c{k}" for k in range(len(names) + 1))) if n not in names)
         auto_text = f" + ({name} if the runs ask for it)"
@@ -547,12 +552,12 @@ class Structure:
 
 
 def _format(value: float, digits: str) -> str:
-    """Format a number with these digits, or exactly for ``"r"``."""
+    """Return a number as text with the given digits; ``"r"`` gives all digits."""
     return format_shortest(value) if digits == "r" else format(value, digits)
 
 
 def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, ...] | UnsetType:
-    """Return the nonlinearities as a tuple, or UNSET if there are none."""
+    """Return the nonlinearities as a tuple, or msgspec's UNSET if there are none, so that they are not written."""
     return tuple(limits) or UNSET
 
 
@@ -563,7 +568,7 @@ def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
 
 
 def restrict_filter(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
-    """Restrict a sensor filter to some signals; None if none of them is filtered."""
+    """Return a sensor filter restricted to some signals; None if none of them is filtered."""
     if sensor is None:
         return None
     filtered_signals = tuple(s for s in sensor.signals if s in signals)

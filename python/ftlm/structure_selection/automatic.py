@@ -1,4 +1,7 @@
-"""Automatic structure of one output: integer orders with zeros, delays, friction and a level, then fractional forms."""
+"""Automatic structure of one output: integer-order transfer functions and variants, then fractional orders.
+
+The variants have zeros, delays, friction or an offset.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ Delays: TypeAlias = Mapping[str, float | tuple[float, float]]
 
 @dataclass(frozen=True)
 class IntegerOrderForm:
-    """Integer-order transfer function of one output, with dry friction and an offset.
+    """Form of an integer-order transfer function from the inputs to one output, with dry friction and an offset.
 
     Parameters
     ----------
@@ -60,13 +63,13 @@ class IntegerOrderForm:
     delayed
         Whether every input has a free delay.
     integrator
-        Whether the equation has no term in the output itself: a pole at s = 0.
+        Whether there is a pole at s = 0, so that the equation has no term in the output itself.
     offset
-        Kind of offset of each run: ``"none"``; ``"level"``, the value at which the output rests; or ``"ramp"``, a
-        linear trend.
+        Kind of offset of each run: ``"none"``; ``"level"``, a constant added to the output; or ``"ramp"``, a linear
+        trend.
     friction
-        Coulomb friction: ``"none"``; ``"derivative"``, which opposes the derivative of the output, a position; or
-        ``"output"``, which opposes the output itself, a speed.
+        Coulomb friction: ``"none"``; ``"derivative"``, which opposes the derivative of the output (a position); or
+        ``"output"``, which opposes the output itself (a speed).
     """
 
     order: int
@@ -78,11 +81,11 @@ class IntegerOrderForm:
 
     @property
     def has_feedthrough(self) -> bool:
-        """Whether the form has direct feedthrough: the output jumps with its inputs."""
+        """Whether the form has direct feedthrough from an input."""
         return self.zeros >= self.order
 
     def structure(self, problem: OutputProblem) -> Structure:
-        """Return the structure of the form for one output; see :meth:`OutputProblem.input_delays` for its delays."""
+        """Return the structure that has this form, for one output."""
         output, end = problem.output, problem.suffix
         powers = range(self.order - 1, int(self.integrator) - 1, -1)
         own = [f"a{k}{end} {_derivative(k, output)}" for k in powers]
@@ -105,22 +108,22 @@ def _derivative(order: int, name: str) -> str:
 
 @dataclass(frozen=True)
 class OutputProblem:
-    """One output of some runs, whose structure is selected.
+    """Selection problem of one output: runs, the output, and the signals that enter its equation.
 
     Parameters
     ----------
     runs
         Estimation runs.
     output
-        The output.
+        Name of the output.
     drivers
-        Signals that drive it: inputs, and other outputs, which act as measured.
+        Names of the signals that enter its equation: inputs, and measured other outputs.
     delays
-        Given delays.
+        Delays [s] that the user gave, by input: a number, or (lower, upper).
     suffix
         Suffix of the names of coefficients and orders, which distinguishes several outputs.
     initial
-        Start of the runs.
+        Initial conditions of the runs.
     """
 
     runs: Sequence[Run]
@@ -132,24 +135,24 @@ class OutputProblem:
 
     @property
     def numbered_drivers(self) -> list[tuple[str, str]]:
-        """Pairs of the number in coefficient names and the driving signal; the number is empty for a single signal."""
+        """Pairs of a number for coefficient names and an input signal; the number is empty for a single signal."""
         return [(f"{k}_" if len(self.drivers) > 1 else "", name) for k, name in enumerate(self.drivers, 1)]
 
     @property
     def has_free_delays(self) -> bool:
-        """Whether the delay of an input is not given as a number."""
+        """Whether an input has no delay given as a number, so that its delay can be estimated."""
         return self.input_delays(delayed=False) != self.input_delays(delayed=True)
 
     @property
     def tanh_slope(self) -> float:
-        """Slope of the tanh that replaces the sign of the output; infinite if the output has one sign."""
+        """Slope s of tanh(s y), which replaces sign(y) in friction; infinite if the output never changes sign."""
         return sign_tanh_slope([run[self.output] for run in self.runs])
 
     def input_delays(self, *, delayed: bool) -> dict[str, float | tuple[float, float]]:
-        """Return the delays [s] of the driving inputs: a number, or an interval of one to estimate.
+        """Return the delays [s] by input: a number, or an interval (lower, upper) in which the delay is estimated.
 
-        A delayed form has the given delays, and a free delay of every other input. A form that is not delayed has only
-        those given delays that exclude 0.
+        With `delayed`, inputs without a given delay get a free one. Otherwise only given delays that exclude 0 are
+        returned.
         """
         inputs = [n for n in self.drivers if n in self.runs[0].inputs]
         delays = {n: d for n, d in self.delays.items() if n in inputs}
@@ -160,7 +163,7 @@ class OutputProblem:
 
 @dataclass(frozen=True)
 class FittedForm:
-    """Structure with its fit, number of parameters, variance inflation of the residuals, and BIC."""
+    """Form with its fit, number of parameters, variance inflation of the residuals, and BIC."""
 
     structure: Structure
     joint: JointFit
@@ -171,7 +174,7 @@ class FittedForm:
 
 
 def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
-    """Return fits sorted by BIC, best first, with the smallest variance inflation among them."""
+    """Return fits sorted by BIC, best first; BIC uses the smallest variance inflation among them."""
     inflation = min((f.variance_inflation for f in fits), default=1.0)
     return sorted(
         (replace(f, bic=schwarz_criterion(f.joint, f.parameters, inflation)) for f in fits), key=lambda f: f.bic
@@ -180,14 +183,14 @@ def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
 
 @dataclass
 class AutomaticSelection:
-    """Automatic selection for one output of some runs.
+    """Automatic selection of the structure of one output.
 
     Parameters
     ----------
     problem
-        The output and its driving signals.
+        Output, runs and input signals.
     evaluator
-        Evaluator of the candidates.
+        Object that fits and validates candidates.
     """
 
     problem: OutputProblem
@@ -196,7 +199,7 @@ class AutomaticSelection:
     feedback: tuple[str, ...] = field(default=(), init=False)
 
     def run(self) -> list[Trial]:
-        """Fit the candidates and validate the best; return all trials in order."""
+        """Fit the candidates, validate the best ones, and return all trials in this order."""
         fits = self._fit_integer_orders()
         if fits:
             # Under colored noise high orders overfit: the best form of each order is validated, whatever its BIC.
@@ -211,7 +214,7 @@ class AutomaticSelection:
         return self.evaluator.trials
 
     def _fit(self, forms: Sequence[IntegerOrderForm]) -> list[FittedForm]:
-        """Fit forms, best first; a form that cannot be fitted becomes a failed trial."""
+        """Return the fits of forms, sorted by BIC; a form whose fit fails becomes a failed trial."""
         return self._fit_structures([(f.structure(self.problem), f, []) for f in dict.fromkeys(forms)])
 
     def _fit_structures(
@@ -228,7 +231,7 @@ class AutomaticSelection:
         return _rank(fits_of_form)
 
     def _fit_integer_orders(self) -> list[FittedForm]:
-        """Fit integer orders, and variants of the best; best first."""
+        """Return the fits of integer-order forms and of variants of the best ones, sorted by BIC."""
         if not self.problem.drivers:
             # Free responses have neither zeros nor delays.
             return self._fit([IntegerOrderForm(n, 0, offset=o) for n in range(1, MAX_ORDER + 1) for o in FREE_OFFSETS])
@@ -252,10 +255,12 @@ class AutomaticSelection:
         return fits
 
     def _inputs_in_loop(self, fits: Sequence[FittedForm]) -> tuple[str, ...]:
-        """Return the inputs that depend on the output, from the residuals of the best form without feedthrough.
+        """Return the inputs that depend on the output through feedback, by the residuals of the best form.
 
-        Feedback and direct feedthrough both correlate an input with the output in the same row. For negative feedback
-        the sign of the correlation is opposite to that of the static gain.
+        The form must not have direct feedthrough.
+
+        Feedback and direct feedthrough both correlate an input with the output in the same sample. With negative
+        feedback the correlation and the static gain have opposite signs.
         """
         if not fits:
             return ()
@@ -275,10 +280,10 @@ class AutomaticSelection:
         return tuple(names)
 
     def _fit_neighbors(self, fits: list[FittedForm]) -> list[FittedForm]:
-        """Return the fits with the neighbors of the best forms added, best first.
+        """Return the fits extended by those of neighbors of the best forms, sorted by BIC.
 
-        A high order can approximate a property that is missing, such as a level or direct feedthrough. The search moves
-        to neighbors that have it at a lower order while BIC decreases.
+        A form of high order can approximate a missing property, such as a level or direct feedthrough. The search
+        therefore moves to neighbors that have the property at a lower order, while BIC decreases.
         """
         forms_before = {f.form for f in fits}
         new = [f.form for f in fits[:EXTENDED_CANDIDATES]]
@@ -293,12 +298,14 @@ class AutomaticSelection:
         return fits
 
     def _is_admissible(self, form: IntegerOrderForm) -> bool:
-        """Whether feedback and the given delays allow a form."""
+        """Whether a form is compatible with the detected feedback and the given delays."""
         free = not form.delayed or self.problem.has_free_delays
         return free and not (self.feedback and form.has_feedthrough)
 
     def _fit_zeros(self, forms: Sequence[IntegerOrderForm], fits: Sequence[FittedForm]) -> list[FittedForm]:
-        """Add fits of forms with all zeros, and of forms with fewer zeros that can have the lowest BIC; best first.
+        """Return the fits extended by forms with zeros, sorted by BIC.
+
+        First all zeros are added, then forms with fewer zeros that can still have the lowest BIC.
 
         Fewer zeros cannot reduce the residuals, so they lower BIC by at most the penalty of the removed zeros.
         """
@@ -315,11 +322,14 @@ class AutomaticSelection:
         return _rank([*full, *self._fit(fewer)])
 
     def _penalty(self, fit: FittedForm) -> float:
-        """Return the penalty in BIC of one zero of every driving signal."""
+        """Return the penalty in BIC for one more zero of every input signal."""
         return len(self.problem.drivers) * math.log(fit.joint.samples)
 
     def _fit_delayed(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
-        """Add fits of delayed forms; those above order 2 only if a delay lowers BIC of order 1 or 2."""
+        """Return the fits extended by forms with delays, sorted by BIC.
+
+        Forms above order 2 are tried only if a delay lowers BIC at order 1 or 2.
+        """
         if not self.problem.has_free_delays:
             return fits
         delayed = [IntegerOrderForm(n, n - 1, delayed=True, offset=offset) for n in range(1, MAX_ORDER)]
@@ -334,7 +344,10 @@ class AutomaticSelection:
         return self._fit_zeros(delayed, fits)
 
     def _fit_friction(self, fits: list[FittedForm], offset: str) -> list[FittedForm]:
-        """Add forms of order 1 and 2 with friction if residuals are colored and friction clearly lowers BIC."""
+        """Return the fits extended by forms of order 1 and 2 with friction, if residuals are colored.
+
+        The forms are added only if friction clearly lowers BIC.
+        """
         delayed = bool(fits and fits[0].form and fits[0].form.delayed)
         speed = IntegerOrderForm(1, 0, delayed=delayed, offset=offset, friction="output")
         changes_sign = math.isfinite(self.problem.tanh_slope)
@@ -348,7 +361,7 @@ class AutomaticSelection:
         return fits
 
     def _validate(self, candidates: Sequence[FittedForm]) -> FittedForm | None:
-        """Validate fits; return the one with the best prediction."""
+        """Validate fitted forms, and return the one with the best prediction; None if no validation succeeds."""
         validations = self.evaluator.map_candidates(
             lambda f: self.evaluator.validate(describe_structure(f.structure), f.structure, f.joint), candidates
         )
@@ -357,10 +370,10 @@ class AutomaticSelection:
         return ranked[0][1] if ranked else None
 
     def _fit_fractional_forms(self, fits: Sequence[FittedForm], best: FittedForm | None) -> list[FittedForm]:
-        """Fit fractional forms from the optima of integer orders, best first.
+        """Return the fits of fractional-order forms, sorted by BIC; they start from the integer-order optima.
 
-        They have the offset of the best form of integer orders. If that form has a delay, the best fractional form is
-        also fitted with one.
+        They have the offset of the best integer-order form. If that form has a delay, the best fractional form is also
+        fitted with a delay.
         """
         form = best.form if best is not None and best.form is not None else IntegerOrderForm(1, 0)
         y, end, frequency = self.problem.output, self.problem.suffix, _frequency(fits, form.offset, self.problem.suffix)
@@ -412,14 +425,17 @@ class AutomaticSelection:
 
 
 def _best_of_each_order(fits: Sequence[FittedForm]) -> list[IntegerOrderForm]:
-    """Return the form with the lowest BIC of each order; the noise color is that of the same order."""
+    """Return the form with the lowest BIC of each order; BIC uses the variance inflation of the same order."""
     forms = [f for f in fits if f.form is not None]
     orders = sorted({f.form.order for f in forms if f.form})
     return [g.form for n in orders if (g := _rank([f for f in forms if f.form and f.form.order == n])[0]).form]
 
 
 def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
-    """Return forms that differ in an integrator, direct feedthrough, an offset, or a canceled pole and zero."""
+    """Return forms that differ in one property.
+
+    The property is an integrator, direct feedthrough, an offset, or a canceled pole and zero.
+    """
     forms = [
         replace(form, integrator=not form.integrator),
         replace(form, zeros=form.order if form.zeros < form.order else form.order - 1),
@@ -437,14 +453,14 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
 
 
 def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
-    """Return the decrease of the lowest BIC by a property of forms; 0 if no form has it."""
+    """Return how much the forms with a property lower the minimum of BIC; 0 if no form has it."""
     with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
     without = [f.bic for f in fits if f.form is not None and not has(f.form)]
     return min(without, default=math.inf) - min(with_it) if with_it else 0.0
 
 
 def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
-    """Return the frequency [rad/s] of a resonance of order 2 if there is one, otherwise of a lag of order 1."""
+    """Return the frequency [rad/s] of the resonance of the form of order 2, or else of the pole of order 1."""
     for order in (2, 1):
         for item in fits:
             if item.form is not None and (item.form.order, item.form.offset, item.form.integrator) == (

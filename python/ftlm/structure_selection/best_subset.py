@@ -1,4 +1,7 @@
-"""Best-subset search over the input terms of one equation, with scores in closed form."""
+"""Best-subset search over the input terms of one equation, with scores in closed form.
+
+The coefficients of output terms are taken from a grid; those of input terms then follow by linear least squares.
+"""
 
 from __future__ import annotations
 
@@ -45,15 +48,18 @@ POINTS_PER_TASK = 16
 
 
 class TaskPool(Protocol):
-    """Pool that maps a function over items, in their order."""
+    """Protocol of a pool that maps a function over items and keeps their order."""
 
     def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """Return the results for the items, in their order."""
+        """Return the results for the items in the same order."""
 
 
 @dataclass(frozen=True)
 class ScreenedSubset:
-    """Subset with the initial guess of its fit, and its score on the grid: mean over folds of ln(1 - fit / 100)."""
+    """Subset of input terms, with the initial guess for its fit and its score.
+
+    The score is the mean over folds of ln(1 - fit / 100); lower is better.
+    """
 
     change: Change
     start: Mapping[str, float]
@@ -62,7 +68,7 @@ class ScreenedSubset:
 
 @dataclass(frozen=True)
 class Column:
-    """Input term with one of the integer values of its order."""
+    """Input term at one of the integer values of its order."""
 
     coefficient: str
     signal: str
@@ -70,13 +76,13 @@ class Column:
     names: tuple[str, ...]
 
     def term(self, term: Term, name: str) -> Term:
-        """Return the term at this order with a coefficient of its own."""
+        """Return the term at this order with a new coefficient name."""
         return replace(term, order=Order(self.order), coefficient=name)
 
 
 @dataclass(frozen=True)
 class BaseModel:
-    """Base model: own terms at integer orders with coefficients from a grid, and the columns of its input terms."""
+    """Terms of the output at integer orders, with coefficients from a grid, and the candidate input terms (columns)."""
 
     inside: NestedStructures
     variant: Variant
@@ -102,14 +108,17 @@ class BaseModel:
             yield from [(w,)] if len(self.own) == 1 else [(w, math.log(g)) for g in DAMPING_FACTORS]
 
     def coefficients(self, point: tuple[float, ...]) -> dict[str, float]:
-        """Return the own coefficients at a grid point: g ω^(α-ν), with g = 1 for the lowest of the own orders ν."""
+        """Return the coefficients of the output terms at a grid point.
+
+        They are g ω^(α-ν) for a term of order ν, with g = 1 for the lowest order.
+        """
         w = math.exp(point[0]) if point else 1.0
         shares = [1.0, math.exp(point[1]) if len(point) > 1 else 1.0]
         ordered = sorted(self.own, key=lambda item: item[1])
         return {n: -g * w ** (self.highest_order - order) for (n, order), g in zip(ordered, shares, strict=False)}
 
     def is_stable(self, point: tuple[float, ...]) -> bool:
-        """Whether the model is stable at a point; True if no own coefficient is free."""
+        """Whether the model is stable at a grid point; True if no coefficient of an output term is free."""
         if not point:
             return True
         values = self.coefficients(point)
@@ -127,16 +136,16 @@ class BaseModel:
 
 @dataclass
 class Products:
-    """Inner products of the responses of the columns and of the residual without inputs, by point and run."""
+    """Inner products of the column responses and of the residual without inputs, by grid point and run."""
 
     points: list[tuple[float, ...]]
     values: Floats
 
 
 def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> list[ScreenedSubset]:
-    """Return every subset at integer orders, best prediction first; empty if the screening does not apply.
+    """Return every subset of input terms at integer orders, best prediction first; [] if screening does not apply.
 
-    It needs several runs, or a validation run: blocks of one run share initial terms.
+    Screening requires several runs or a validation run, because blocks of one run share initial terms.
     """
     # Optional friction is not linear in its parameters; stepwise selection adds it to the best subset.
     inside = NestedStructures(inside.without_optional_friction)
@@ -162,7 +171,7 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
 
 
 def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[BaseModel]:
-    """Yield base models: at most two own terms at integer orders, with and without an offset."""
+    """Yield the base models: at most two output terms at integer orders, with and without an offset."""
     structure = inside.structure
     item = structure.equations[0]
     own = [t for t in item.terms if t.signal == item.output]
@@ -189,7 +198,7 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
 
 
 def _candidate_orders(inside: NestedStructures, term: Term, top: float) -> list[float | None]:
-    """Return the integer orders of an own term below the highest order, and None if the term is optional."""
+    """Return the integer orders that an output term may have below the highest order, and None if it is optional."""
     out: list[float | None] = [None] if term.coefficient in inside.droppable else []
     places = inside.integer_values(term.order.names[0]) if term.order.is_single else [term.order.constant]
     return out + [p for p in places if p < top]
@@ -203,7 +212,7 @@ def _base_model(
     free: tuple[tuple[str, float], ...],
     runs: tuple[Run, ...],
 ) -> BaseModel | None:
-    """Return a base model with every valid column; None if there is none, or if two terms share a coefficient."""
+    """Return a base model with all valid columns; None if there is no valid column or two terms share a coefficient."""
     item = inside.structure.equations[0]
     input_terms = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
     terms_of_output = [replace(t, order=Order(p)) for t, p in own]
@@ -246,7 +255,7 @@ def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset:
 
 
 def _is_valid_input_set(structure: Structure, terms: Sequence[Term], top: float, runs: Sequence[Run]) -> bool:
-    """Whether these terms form an equation that the runs can simulate."""
+    """Whether an equation with these input terms can be simulated on the runs."""
     try:
         candidate = fix_initial_conditions(_with_terms(structure, terms, top, "none"), runs)
         Objective(FreeProblem.of(candidate), runs[:1], [1.0], decimation=_decimation(runs)).experiments  # noqa: B018
@@ -262,9 +271,9 @@ def _decimation(runs: Sequence[Run]) -> int:
 def score_subsets(
     ground: BaseModel, folds: Folds, pool: TaskPool, points: Sequence[tuple[float, ...]] | None = None
 ) -> list[ScreenedSubset]:
-    """Score subsets of the columns of a base model by their residuals on validation data.
+    """Return subsets of the columns of a base model with scores from their residuals on validation data.
 
-    Own coefficients are those of given points, or of a grid refined around the best points.
+    The coefficients of output terms are those at the given `points`, or on a grid that is refined around the best ones.
     """
     problem = FreeProblem.of(ground.structure)
     grid = Objective(problem, ground.runs, [1.0], decimation=_decimation(ground.runs))
@@ -321,7 +330,7 @@ def _products(
     places: Sequence[int],
     point: tuple[float, ...],
 ) -> Floats | None:
-    """Return, for each run, the inner products of the column responses and the residual; None if one diverges."""
+    """Return, for each run, the inner products of column responses and residual at a grid point; None on divergence."""
     values = ground.coefficients(point)
     coefficients = [values.get(n, 0.0) for n in problem.coefficients]
     try:
@@ -337,7 +346,7 @@ def _products(
 
 
 def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
-    """Return a subset as a change to a variant; None if it is invalid."""
+    """Return the change that adds a subset of columns to a structure; None if the result is invalid."""
     columns = [ground.columns[k] for k in subset]
     whole = {**ground.variant.integer_order_values(), **{n: c.order for c in columns for n in c.names}}
     coefficients = ground.variant.coefficients | {c.coefficient for c in columns}
@@ -349,7 +358,7 @@ def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
 
 @dataclass(frozen=True)
 class SubsetScore:
-    """Score of a subset, its best grid point for each fold and for all runs, and its coefficients for all runs."""
+    """Score of a subset, its best grid point in each fold and over all runs, and its coefficients."""
 
     score: float
     points: tuple[int, ...]
@@ -358,16 +367,16 @@ class SubsetScore:
 
 @dataclass(frozen=True)
 class SubsetScorer:
-    """Scorer of subsets.
+    """Closed-form scoring of subsets of columns from inner products.
 
     Parameters
     ----------
     columns
         Columns of the base model.
     estimation_runs
-        Indices of the estimation runs of each fold, then of all runs.
+        Indices of the estimation runs of each fold. The last entry has the indices of all runs.
     validation_runs
-        Index of the validation run of each fold.
+        Index of the validation run in each fold.
     sizes
         Sum of squares of the output of each run about its mean.
     """
@@ -379,7 +388,7 @@ class SubsetScorer:
 
     @classmethod
     def of(cls, ground: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
-        """Return the scorer for the folds, whose runs are those of the base model."""
+        """Return the scorer of a base model and its folds."""
 
         def place(run: Run) -> int:
             return next(k for k, r in enumerate(ground.runs) if r is run)
@@ -394,7 +403,10 @@ class SubsetScorer:
         )
 
     def score_subset(self, products: Floats, pooled: Floats, subset: Sequence[int]) -> SubsetScore:
-        """Fit a subset on the runs of each fold at its best point, and score it on the validation run."""
+        """Return the score of a subset on validation runs.
+
+        It is fitted on the estimation runs of each fold, at the best grid point of the fold.
+        """
         keys = [*subset, -1]
         cut = pooled[:, :, keys][:, :, :, keys]
         matrix, right, rest = cut[..., :-1, :-1], cut[..., :-1, -1], cut[..., -1, -1]
@@ -413,7 +425,7 @@ class SubsetScorer:
         return SubsetScore(float(np.mean(scores)), tuple(points.tolist()), tuple(solutions[points[-1], -1].tolist()))
 
     def score_all(self, products: Products) -> dict[tuple[int, ...], SubsetScore]:
-        """Score every subset; if there are too many, extend the best of each size."""
+        """Return the scores of all subsets; if there are too many, only the best of each size are extended."""
         values = products.values
         pooled = np.stack([values[:, list(runs)].sum(axis=1) for runs in self.estimation_runs], axis=1)
         choices: dict[str, list[int]] = {}

@@ -1,4 +1,4 @@
-"""Structures nested in another one: fewer terms, integer or free orders, with and without an offset."""
+"""Structures nested in a given structure: fewer terms, integer or free orders, with or without an offset."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ INTEGER_ORDER_VALUES = (0.0, 1.0, 2.0, 3.0)
 
 @dataclass(frozen=True)
 class Variant:
-    """Structure nested in another one.
+    """Choice of terms, integer orders, offset and input parameters that defines a nested structure.
 
     Parameters
     ----------
     coefficients
-        Coefficients of its terms.
+        Names of the coefficients of its terms.
     integer_orders
-        Orders with integer values, by name; all others are free.
+        (name, value) of orders that are fixed to integers; all others are free.
     offset
-        Whether each run has an unknown constant.
+        Whether each run has an unknown constant offset.
     inputs
-        Names of its free delays and input nonlinearities; the other inputs have no delay and no nonlinearity.
+        Names of its free delays and input nonlinearities. Optional ones that are not named are absent.
     frictions
-        Names of its frictions, as in :attr:`NestedStructures.frictions`.
+        Names of its friction terms, as in :attr:`NestedStructures.frictions`.
     """
 
     coefficients: frozenset[str]
@@ -42,18 +42,18 @@ class Variant:
     frictions: frozenset[str] = frozenset()
 
     def integer_order_values(self) -> dict[str, float]:
-        """Integer orders by name."""
+        """Values of the orders that are fixed to integers, by name."""
         return dict(self.integer_orders)
 
     def with_integer_orders(self, values: Mapping[str, float | None]) -> Variant:
-        """Return the variant with some orders integer, or free where the value is None."""
+        """Return the variant with some orders fixed to integers, or free if the value is None."""
         orders = {**self.integer_order_values(), **values}
         return replace(self, integer_orders=tuple(sorted((n, v) for n, v in orders.items() if v is not None)))
 
 
 @dataclass(frozen=True)
 class Change:
-    """Change from one variant to another, with a description."""
+    """Variant that results from a change, with a description of the change."""
 
     words: str
     variant: Variant
@@ -61,18 +61,18 @@ class Change:
 
 @dataclass(frozen=True)
 class NestedStructures:
-    """A structure and all structures nested in it.
+    """Structure whose optional elements define the set of structures nested in it.
 
-    Optional elements are terms with a free coefficient (in a single equation without order or coefficient laws), an
-    allowed offset, free delays, free input nonlinearities, and friction with a free coefficient. An order that is a
-    single parameter may be fixed to an integer.
+    Optional elements are an offset if the structure allows one, free delays, free input nonlinearities, and friction
+    with a free coefficient. In a single equation without order or coefficient law, terms with a free coefficient are
+    also optional. An order that is a single parameter may be fixed to an integer.
     """
 
     structure: Structure
 
     @property
     def droppable(self) -> tuple[str, ...]:
-        """Coefficients of optional terms."""
+        """Names of the coefficients of optional terms."""
         structure = self.structure
         if structure.has_order_law or structure.coefficient_law or len(structure.equations) > 1:
             return ()
@@ -80,12 +80,15 @@ class NestedStructures:
 
     @property
     def offset_allowed(self) -> bool:
-        """Whether an offset is optional."""
+        """Whether the structures may have an offset."""
         return self.structure.offset in ("auto", "constant")
 
     @property
     def frictions(self) -> dict[str, str | None]:
-        """Optional frictions, each with the one that it requires: Stribeck friction requires Coulomb friction."""
+        """Optional friction terms by name, each with the friction term that it requires or None.
+
+        Stribeck friction requires Coulomb friction.
+        """
         out: dict[str, str | None] = {}
         for item in self.structure.equations:
             rubs = item.friction
@@ -99,7 +102,7 @@ class NestedStructures:
         return out
 
     def _with_frictions(self, item: Equation, rubs: frozenset[str]) -> Equation:
-        """Return an equation with the given optional frictions and all mandatory ones."""
+        """Return an equation with all mandatory friction terms and the given optional ones."""
         friction, own, choices = item.friction, f"friction of {item.output}", self.frictions
         if friction is None:
             return item
@@ -110,7 +113,7 @@ class NestedStructures:
 
     @property
     def without_optional_friction(self) -> Structure:
-        """Structure without its optional frictions."""
+        """Structure without its optional friction terms."""
         equations = tuple(self._with_frictions(e, frozenset()) for e in self.structure.equations)
         return replace(self.structure, equations=equations)
 
@@ -147,7 +150,10 @@ class NestedStructures:
         return replace(candidate, offset=offset)
 
     def is_valid(self, variant: Variant) -> bool:
-        """Whether a variant is valid: its own orders differ and are below the highest."""
+        """Whether a variant can be built, with distinct orders of each signal.
+
+        The orders of output terms must be below the order of the equation.
+        """
         try:
             candidate = self.build(variant)
         except ModelError:
@@ -162,7 +168,7 @@ class NestedStructures:
         return True
 
     def integer_values(self, name: str) -> list[float]:
-        """Integer values that a free order may take."""
+        """Return the integers to which a free order may be fixed."""
         problem = FreeProblem.of(self.structure)
         low, high = problem.bounds[problem.orders.index(name)]
         return [v for v in INTEGER_ORDER_VALUES if low <= v <= high and (v > 0 or name not in self._highest)] or [
@@ -174,7 +180,7 @@ class NestedStructures:
         return {n for e in self.structure.equations for n in e.order.names}
 
     def simplest(self) -> Iterator[Change]:
-        """Yield the simplest structures: integer orders, the output's own terms, and one input term."""
+        """Yield the simplest variants: integer orders, the terms of the output, and one input term."""
         free = [n for n in self.structure.order_names if n in self._highest]
         tops: list[dict[str, float]] = [{}]
         for name in free:
@@ -194,7 +200,7 @@ class NestedStructures:
                 yield from self._with_term(base, term)
 
     def highest_orders(self, variant: Variant) -> tuple[float | None, ...]:
-        """Integer values of the highest orders of a variant; None for a free one."""
+        """Return the order of each equation in a variant if it is fixed to an integer, else None."""
         orders = variant.integer_order_values()
         return tuple(orders.get(n) for n in sorted(self._highest))
 
@@ -205,7 +211,7 @@ class NestedStructures:
         return any(term in e.terms and term.column == e.output for e in self.structure.equations)
 
     def _with_own_terms(self, top: Mapping[str, float]) -> Variant | None:
-        """Return the variant of all own terms with distinct integer orders and all mandatory terms."""
+        """Return the variant with all terms of the outputs at distinct integer orders, and all mandatory terms."""
         droppable = self.droppable
         whole: dict[str, float] = dict(top)
         names_used: list[str] = []
@@ -249,7 +255,7 @@ class NestedStructures:
         return variant if self.is_valid(variant) or not alone else None
 
     def _with_term(self, variant: Variant, term: Term) -> Iterator[Change]:
-        """Yield variants with one more term, its order at each of its integer values."""
+        """Yield the variants with one more term, at each integer value of its order."""
         assert isinstance(term.coefficient, str)
         coefficients = variant.coefficients | {term.coefficient}
         if not term.order.names:
@@ -270,13 +276,13 @@ class NestedStructures:
                 yield Change(f"+ {self._term_in(one, term)}", one)
 
     def _term_in(self, variant: Variant, term: Term) -> str:
-        """Return a term of a variant as text."""
+        """Return the text of a term at its order in a variant."""
         candidate = self.build(variant)
         match = next(t for e in candidate.equations for t in e.terms if t.coefficient == term.coefficient)
         return str(match)
 
     def richest(self, variant: Variant) -> Variant:
-        """Return the variant with all terms for which an integer order is left that no other term has."""
+        """Return the variant extended by all terms for which an unused integer order remains."""
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
@@ -286,7 +292,7 @@ class NestedStructures:
         return variant
 
     def larger(self, variant: Variant) -> Iterator[Change]:
-        """Yield every variant with one more term, free order or offset."""
+        """Yield every valid variant with one more term, free order or offset."""
         for item in self.structure.equations:
             for term in item.terms:
                 if term.coefficient in self.droppable and term.coefficient not in variant.coefficients:
@@ -308,7 +314,7 @@ class NestedStructures:
                 yield Change(name, replace(variant, frictions=variant.frictions | {name}))
 
     def smaller(self, variant: Variant) -> Iterator[Change]:
-        """Yield every variant with one term, free order or offset fewer."""
+        """Yield every valid variant with one term, free order or offset fewer."""
         candidate = self.build(variant)
         for item in candidate.equations:
             for term in item.terms:
@@ -333,13 +339,13 @@ class NestedStructures:
 
 
 def describe_structure(structure: Structure) -> str:
-    """Return a structure as one line, with the output level that its equations do not show."""
+    """Return a structure as one line of text, including an output level, which the equations do not show."""
     level = ", with an output level" if structure.offset == "level" else ""
     return str(structure).replace("\n", "; ") + level
 
 
 def signature(structure: Structure) -> str:
-    """Return a text of a structure without parameter names; equal texts mean the same candidate."""
+    """Return a text that identifies a structure up to parameter names."""
     parts = []
     for item in structure.equations:
         terms = sorted(
@@ -353,12 +359,14 @@ def signature(structure: Structure) -> str:
 
 
 def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str, Structure]:
-    """Return candidates by name, the default name being the equation; one with ``offset="auto"`` gives two candidates.
+    """Return candidates by name; the default name of a candidate is its equation.
+
+    A structure with ``offset="auto"`` gives two candidates, with and without an offset.
 
     Raises
     ------
     ModelError
-        No candidate, an object that is not a structure, or two that differ in parameter names only.
+        If there is no candidate, an object is not a structure, or two candidates differ only in parameter names.
     """
     items = (
         list(structures.items())
@@ -393,7 +401,7 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
 
 
 def _content(structure: Structure) -> str:
-    """Return a text of a candidate that is independent of parameter names and of the order of its terms."""
+    """Return a text that identifies a candidate up to parameter names and the sequence of its terms."""
     if structure.has_order_law or structure.coefficient_law:
         return repr(structure)
     rest = (

@@ -1,4 +1,7 @@
-"""Checkpoint file of a structure selection: every finished fit and validation, for resumption."""
+"""Checkpoint file of a structure selection, with every finished fit and validation.
+
+An interrupted selection resumes from it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ def _digest(value: object) -> bytes:
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="selection"):
-    """First record: digests of runs, candidates and validation."""
+    """First record of the file: digests that identify runs, candidates and validation."""
 
     algorithm: int
     version: str
@@ -48,7 +51,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
     @classmethod
     def of(cls, runs: Sequence[Run], candidates: object, judges: Sequence[Run], words: str) -> Request:
-        """Build from runs, candidates, validation runs and the description of the validation."""
+        """Return the request of a selection; `judges` are the validation runs, `words` describe the validation."""
         return cls(
             ALGORITHM_VERSION,
             __version__,
@@ -58,7 +61,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
         )
 
     def difference(self, other: Request) -> str | None:
-        """Describe the difference to another request, or return None."""
+        """Return text on the first difference from another request; None if both are equal."""
         words = {
             "runs": "of other runs",
             "candidates": "of other candidates",
@@ -68,7 +71,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
 
 def _run_content(run: Run) -> list[object]:
-    """Return all data of a run that affect a fit."""
+    """Return all data of a run that affect a fit, for a digest."""
     own = run.sample_times
     times = [] if own is None else [own.times.tobytes(), {n: v.tobytes() for n, v in own.data.items()}]
     samples = {n: np.ascontiguousarray(run[n], "<f8").tobytes() for n in run.signals}
@@ -76,34 +79,37 @@ def _run_content(run: Run) -> list[object]:
 
 
 class FitError(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="refused"):
-    """Error of a candidate's fit."""
+    """Error of a candidate's fit, in the form in which it is stored."""
 
     kind: ErrorName
     words: str
 
     @classmethod
     def of(cls, error: FtlmError) -> FitError | None:
-        """Serialize an error; None for an internal error, which is not a result of a candidate."""
+        """Return the stored form of an error; None for an internal error, which is no property of a candidate."""
         return next((cls(n, str(error)) for n, kind in CANDIDATE_ERRORS.items() if type(error) is kind), None)
 
     def error(self) -> FtlmError:
-        """Deserialize the error."""
+        """Return the error from its stored form."""
         return CANDIDATE_ERRORS[self.kind](self.words)
 
 
 class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
-    """A stored fit; ``history`` distinguishes a history from given initial terms, which are stored alike."""
+    """Joint fit in the form in which it is stored.
+
+    A history and given exponents of initial terms look alike in it; ``history`` distinguishes them.
+    """
 
     joint: JointFit
     history: bool
 
     @classmethod
     def of(cls, joint: JointFit) -> StoredFit:
-        """Serialize a fit."""
+        """Return the stored form of a fit."""
         return cls(joint, isinstance(joint.initial, History))
 
     def inconsistency(self) -> str | None:
-        """Describe inconsistent data, or return None."""
+        """Return text on inconsistent stored data; None if the data are consistent."""
         joint, count = self.joint, len(self.joint.names)
         if (joint.covariance.shape, joint.finest_grid_values.shape) != ((count, count), (count,)):
             return f"a covariance or values of another size than its {count} parameters"
@@ -114,7 +120,7 @@ class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fi
         return None
 
     def fit(self) -> JointFit:
-        """Deserialize the fit."""
+        """Return the fit from its stored form."""
         initial = self.joint.initial
         if not self.history or isinstance(initial, str):
             return self.joint
@@ -122,13 +128,13 @@ class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fi
 
 
 class StoredTrial(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="judgement"):
-    """Validation of a fitted candidate; the key includes its fit."""
+    """Trial in the form in which it is stored, without its fit, which the record's key identifies."""
 
     trial: Trial
 
 
 class StoredSubsets(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
-    """Result of the best-subset search, as it is stored."""
+    """Result of a best-subset search in the form in which it is stored."""
 
     subsets: list[ScreenedSubset]
 
@@ -137,7 +143,7 @@ Answer = FitError | StoredFit | StoredTrial | StoredSubsets
 
 
 class StoredAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="kept"):
-    """Result of a step, with the digest of its arguments."""
+    """Result of one step as it is stored, with the digest of the step's arguments."""
 
     request: bytes
     answer: Answer
@@ -147,7 +153,10 @@ ANSWER_DECODER = msgspec.msgpack.Decoder(Request | StoredAnswer, dec_hook=decode
 
 
 class Store:
-    """Results of a selection so far, locked until closed; safe for concurrent threads."""
+    """Checkpoint file that is open for a selection, with the results so far.
+
+    The file is locked until it is closed. Threads may use the store concurrently.
+    """
 
     def __init__(self, path: str | os.PathLike[str], request: Request) -> None:
         self._answers: dict[bytes, Answer] = {}
@@ -167,7 +176,7 @@ class Store:
             raise
 
     def _take(self, number: int, payload: bytes, request: Request) -> None:
-        """Check the request in the first record, and store the answer of any other record."""
+        """Compare the first record with the request, or keep the result that any other record contains."""
         path = self._file.path
         try:
             record = ANSWER_DECODER.decode(payload)
@@ -216,7 +225,11 @@ class Store:
         write: Callable[[Result], Answer | None],
         read: Callable[[Answer], Result],
     ) -> Result:
-        """Return a stored result, or compute and store it; a None result is not stored."""
+        """Return the stored result of a step, or compute and store it.
+
+        `write` and `read` convert a result to and from its stored form. A result for which `write` returns None is not
+        stored.
+        """
         key = _digest(request)
         with self._lock:
             answer = self._answers.get(key)
@@ -238,7 +251,7 @@ class Store:
         refine: bool,
         compute: Callable[[], JointFit | FtlmError],
     ) -> JointFit | FtlmError:
-        """Return a fit on all runs, or its error."""
+        """Return the stored or computed fit of a structure on all runs, or the error of the fit."""
 
         def write(result: JointFit | FtlmError) -> Answer | None:
             if isinstance(result, JointFit):
@@ -257,7 +270,7 @@ class Store:
     def validation(
         self, name: str, structure: Structure, joint: JointFit, fine: bool, compute: Callable[[], Trial]
     ) -> Trial:
-        """Return the trial of a fitted candidate on validation data."""
+        """Return the stored or computed trial of a fitted candidate on validation data."""
 
         def read(answer: Answer) -> Trial:
             if not isinstance(answer, StoredTrial):
@@ -273,7 +286,7 @@ class Store:
         return self.recall_or_compute(request, compute, write, read)
 
     def subsets(self, structure: Structure, compute: Callable[[], list[ScreenedSubset]]) -> list[ScreenedSubset]:
-        """Return all screened subsets."""
+        """Return the stored or computed result of the best-subset search."""
 
         def read(answer: Answer) -> list[ScreenedSubset]:
             if not isinstance(answer, StoredSubsets):

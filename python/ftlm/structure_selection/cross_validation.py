@@ -1,4 +1,4 @@
-"""Cross-validation of a candidate structure: folds, fit, and score of the simulation on validation data."""
+"""Cross-validation of a structure: folds of the data, fits on them, and scores of simulations on validation data."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ MIN_FIT_PERCENT = -100.0
 
 @dataclass(frozen=True)
 class Fold:
-    """Estimation runs, and validation data: another run, or rows of a run whose outputs are masked in the fit."""
+    """Estimation runs and validation data of one fold.
+
+    The validation data are another run, or rows of an estimation run whose outputs are masked in the fit.
+    """
 
     runs: Runs
     validation_run: Run
@@ -51,7 +54,7 @@ class Fold:
 
     @property
     def has_estimation_excitation(self) -> bool:
-        """Whether an input changes in the estimation rows, or no input changes at all."""
+        """Whether an input changes in the estimation samples; True if no input ever changes."""
         inside = 0
         for run in self.runs:
             masked = self.rows if run is self.validation_run and self.rows is not None else (0, 0)
@@ -65,9 +68,9 @@ class Fold:
 
     @property
     def has_motion(self) -> bool:
-        """Whether the standard deviation of an output in the validation rows exceeds √2 times its noise.
+        """Whether an output in the validation samples varies by more than √2 times its noise standard deviation.
 
-        True for whole runs.
+        True if the validation data are a whole run.
         """
         if self.rows is None:
             return True
@@ -75,17 +78,17 @@ class Fold:
         return any(float(np.nanstd(y[rows])) > math.sqrt(2.0) * white_noise(y) for y, rows in pairs)
 
     def estimation_runs(self, outputs: Sequence[str]) -> Runs:
-        """Runs for the fit, with the validation samples of the given outputs masked."""
+        """Return the runs for the fit, in which validation samples of the given outputs are masked."""
         if self.rows is None:
             return self.runs
         return Runs(mask_outputs(r, outputs, self.rows) if r is self.validation_run else r for r in self.runs)
 
     def fit(self, model: Model) -> dict[str, float]:
-        """Return the fit of a simulation on the validation data in percent, by output.
+        """Return the fit of a simulation to the validation data in percent, by output.
 
-        A validation run has initial terms of its own; its residual is divided by the root of 1 - k/N for k terms and N
-        samples. A block has the initial terms that the rest of its run gives, and the first block of a run with nonzero
-        initial conditions those of the whole run.
+        Initial terms are fitted to a validation run; its residual is divided by the square root of 1 - k/N for k terms
+        and N samples. For a block of a run, the initial terms are fitted to the rest of the run. For the first block of
+        a run with nonzero initial conditions they are fitted to the whole run.
         """
         outputs = model.outputs
         if self.rows is None:
@@ -112,7 +115,7 @@ class Fold:
 
 
 def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run:
-    """Return a run with missing output samples in a range of rows."""
+    """Return a run in which the samples of some outputs in a range of rows are marked as missing."""
     signals = {n: np.array(run[n]) for n in run.outputs}
     for name in outputs:
         signals[name][rows[0] : rows[1]] = np.nan
@@ -134,19 +137,19 @@ MAX_SPLIT_FOLDS = 16
 
 @dataclass(frozen=True)
 class Folds:
-    """Estimation and validation data of all candidates.
+    """All folds of a validation, which are the same for every candidate.
 
     Parameters
     ----------
     runs
         Runs to which candidates are fitted.
     parts
-        Folds; the validation data of a fold are excluded from its fit.
+        Folds of the validation.
     description
-        Description of the validation.
+        Description of the validation as text.
     split
-        Whole runs of an unstable plant, for the final estimate, and the shortest duration [s] of the pieces of them
-        that are `runs`; None if `runs` are whole.
+        For an unstable plant, whose `runs` are pieces: the whole runs, for the final estimate, and the shortest
+        duration [s] of a piece. None if `runs` are whole.
     """
 
     runs: Runs
@@ -156,19 +159,20 @@ class Folds:
 
     @property
     def unseen_runs(self) -> list[Run]:
-        """Validation runs that are not estimation runs."""
+        """Validation runs that no fold uses for estimation."""
         return [f.validation_run for f in self.parts if not any(f.validation_run is r for r in self.runs)]
 
     @classmethod
     def of(cls, runs: Run | Sequence[Run], validation: str | Run | Sequence[Run]) -> Folds:
-        """Build folds by leaving out runs, leaving out blocks, or from separate validation runs.
+        """Return the folds of a validation that leaves out runs or blocks in turn, or uses separate validation runs.
 
         Raises
         ------
         ModelError
-            An unknown option, one run where several are needed, or a validation run that is an estimation run.
+            If the option is unknown, there is one run where several are required, or a validation run is an estimation
+            run.
         DataError
-            Runs that do not fit together, or that are too short to be cut.
+            If runs differ in names or units, or are too short to be divided.
         """
         every = as_runs(runs)
         if not isinstance(validation, (str, Run)) and not validation:
@@ -205,9 +209,11 @@ class Folds:
 
     @classmethod
     def of_pieces(cls, runs: Runs, duration: float) -> Folds:
-        """Build folds that leave out one piece of the runs of an unstable plant at a time.
+        """Return folds that leave out one piece of the runs of an unstable plant at a time.
 
-        Of more than :data:`MAX_SPLIT_FOLDS` pieces as many are used, spread evenly; the final estimate uses all.
+        `duration` is the shortest duration of a piece [s].
+
+        At most :data:`MAX_SPLIT_FOLDS` pieces are left out, spread evenly. The final estimate uses all pieces.
         """
         every = [piece for run in runs for piece in run.split(duration)]
         indices = np.unique(np.linspace(0, len(every) - 1, MAX_SPLIT_FOLDS).astype(int))
@@ -217,13 +223,13 @@ class Folds:
 
 
 def _same(one: Run, other: Run) -> bool:
-    """Whether two runs have the same samples."""
+    """Whether two runs have equal samples."""
     names = one.signals
     return one.length == other.length and all(np.array_equal(one[n], other[n], equal_nan=True) for n in names)
 
 
 def block_ranges(run: Run) -> list[tuple[int, int]]:
-    """Return row ranges of blocks of nearly equal length."""
+    """Return the (start, stop) rows of consecutive blocks of nearly equal length."""
     if run.length < MIN_BLOCK_SAMPLES * BLOCKS_PER_RUN:
         raise DataError(
             f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS_PER_RUN} blocks; give "
@@ -234,7 +240,7 @@ def block_ranges(run: Run) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate structure with its fit and its validation.
+    """Candidate structure with its fit and its validation.
 
     Parameters
     ----------
@@ -252,19 +258,19 @@ class Trial:
         ln(1 - fit / 100) of each output of each run or block; lower is better.
     bic
         Schwarz's criterion of the residual sum of squares, with an effective number of samples for correlated
-        residuals; None before the autocorrelation of the best residuals is known.
+        residuals. None until the autocorrelation of the best candidate's residuals is known.
     values, errors
-        Estimates and standard errors on all runs, by name.
+        Estimates and standard errors from all runs, by name.
     insignificant
-        Coefficients whose 95 % interval contains 0.
+        Names of coefficients whose 95 % interval contains 0.
     unstable
-        Whether the model has a pole with a positive real part. Inputs may hide the instability within a run.
+        Whether the model has a pole with a positive real part. The simulation may still be bounded within a run.
     failed
-        Reason of a failed fit; None for a valid trial.
+        Reason why the fit failed; None for a valid trial.
     joint
         Fit on all runs.
     refined
-        Whether the grid was refined until converged.
+        Whether the time step of the fit was refined until converged.
     """
 
     name: str
@@ -284,7 +290,7 @@ class Trial:
 
     @property
     def score(self) -> float:
-        """Mean of the scores; infinite without scores."""
+        """Mean of the scores; infinite without scores. Lower is better."""
         return float(np.mean(self.scores)) if self.scores else math.inf
 
     @property
@@ -295,7 +301,7 @@ class Trial:
 
     @property
     def parts(self) -> dict[str, float]:
-        """Fit in percent on each part of the validation data by name, in the order of the scores."""
+        """Fit in percent on each part of the validation data by name, in the sequence of the scores."""
         return {f"{output} of {name}": fit for name, part in self.validation.items() for output, fit in part.items()}
 
     @property
@@ -318,7 +324,8 @@ class Trial:
 def fix_initial_conditions(structure: Structure, runs: Sequence[Run]) -> Structure:
     """Return the structure with fixed initial conditions: rest, or Caputo's initial terms.
 
-    A history has more terms if more orders are free, so a richer candidate could fit more than its model explains.
+    They replace ``"auto"``, whose history (powers of t for past inputs) has more terms if more orders are free. A
+    richer candidate could then fit more than its model explains.
     """
     if structure.initial != "auto":
         return structure
@@ -334,11 +341,11 @@ def fit(
     refine: bool = True,
     near: JointFit | None = None,
 ) -> JointFit:
-    """Return the best of the fits from some initial guesses, or from an automatic initialization without any.
+    """Return the best output-error fit from some initial guesses; without any, from automatic ones.
 
-    A fit of this structure to nearly the same runs (`near`) is used as a warm start.
+    `near` is a fit of this structure to nearly the same runs, from which the fit starts.
 
-    Friction that the initial guesses omit is set to 0, where it may have no descent direction. Automatic initial
+    A friction coefficient that an initial guess omits starts at 0, where the gradient may be 0. Automatic initial
     guesses are therefore added.
     """
     fixed_structure = fix_initial_conditions(structure, runs)
@@ -363,12 +370,12 @@ def fit(
 
 
 def log_residual_power(joint: JointFit) -> float:
-    """Return the mean over outputs of ln(mean square residual), unweighted."""
+    """Return the mean over outputs of ln(mean square residual), with residuals in the unit of the output."""
     return float(np.mean([2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()]))
 
 
 def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
-    """Refit a candidate on each fold from its fit on all runs, and evaluate it on the validation data."""
+    """Return the trial of a candidate, refitted on each fold from its fit on all runs."""
     model = fitted_model(joint, structure)
     estimation = compare(model, folds.runs).fit
     grows = (
@@ -412,16 +419,16 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
 
 
 def _has_measured_drivers(structure: Structure) -> bool:
-    """Whether measured outputs act as inputs of the equations of other outputs."""
+    """Whether measured outputs enter the equations of other outputs as inputs."""
     others = ({*item.signals} - {item.output} for item in structure.equations)
     return structure.coupling == "measured" and any(name in structure.outputs for names in others for name in names)
 
 
 def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, refine: bool) -> dict[str, float]:
-    """Refit each equation alone on a fold, and return the fits of the outputs on the validation data.
+    """Return the fits in percent on the validation data by output, with each equation fitted alone.
 
-    Only the output of the equation is masked; other outputs are measured inputs. A parameter that equations share has
-    an estimate in each.
+    Only the output of the equation is masked; other outputs are measured inputs. A parameter that several equations
+    share is estimated separately in each.
     """
     fits: dict[str, float] = {}
     for output in structure.outputs:
@@ -432,11 +439,11 @@ def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, r
 
 
 def validation_score_bound(joint: JointFit, folds: Folds) -> float:
-    """Return a lower bound of the score on validation data from the fit on all runs; -infinity if there is none.
+    """Return a lower bound of the validation score, from the fit on all runs alone; -inf if there is none.
 
-    The fit without a fold cannot have smaller residuals than the full fit on all runs, nor larger ones on the rest. So
-    its residuals on that fold are at least those of the full fit. For several outputs this holds for the weighted sum
-    of squares, not for each output.
+    Compare the fit without a fold with the full fit. Its sum of squares over all runs cannot be smaller, and over the
+    remaining runs it cannot be larger. On the fold it is therefore at least that of the full fit. For several outputs
+    this holds for the weighted sum of squares, not for each output.
     """
     if not joint.converged:
         return -math.inf
@@ -463,7 +470,7 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
 
 
 def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
-    """Return a trial with another fit to all runs, on a grid that was refined until converged."""
+    """Return a trial whose fit to all runs is replaced by a more accurate one, with a refined time step."""
     estimation = compare(fitted_model(joint, trial.structure), folds.runs).fit
     return replace(
         trial,
@@ -477,13 +484,13 @@ def update_trial(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
 
 
 def insignificant_coefficients(joint: JointFit) -> tuple[str, ...]:
-    """Return the coefficients that do not differ significantly from 0."""
+    """Return the names of coefficients whose 95 % interval contains 0."""
     intervals = joint.intervals
     return tuple(n for n in joint.coefficients if intervals[n][0] <= 0.0 <= intervals[n][1])
 
 
 def parameter_count(structure: Structure, joint: JointFit, folds: Folds) -> int:
-    """Return the number of estimated parameters, offsets of the runs included."""
+    """Return the number of estimated parameters, including the offsets of the runs."""
     each = {"none": 0, "auto": 0, "level": 1, "constant": 1, "ramp": 2}[structure.offset]
     return len(joint.names) + each * len(structure.equations) * len(folds.runs)
 
@@ -497,9 +504,11 @@ def residual_variance_inflation(joint: JointFit) -> float:
 
 
 def schwarz_criterion(joint: JointFit, parameters: int, inflation: float) -> float:
-    """Return the Schwarz criterion (BIC) with `inflation` samples per effective sample; doi:10.1214/aos/1176344136.
+    """Return the Schwarz criterion (BIC) of a fit; doi:10.1214/aos/1176344136.
 
-    Initial terms count as parameters: a canceled pole and zero add one, which can model a level.
+    The number of samples is divided by `inflation`.
+
+    Initial terms count as parameters, because a canceled pole and zero add one that can model a level.
     """
     samples = joint.samples / inflation
     each = samples / max(len(joint.noise), 1)

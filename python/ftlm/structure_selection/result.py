@@ -29,27 +29,27 @@ UNSTABLE_NOTE = " (grows without bound)"
 
 @dataclass(frozen=True)
 class Selection(ReportMixin):
-    """Candidates evaluated on runs, the chosen one, and the reason.
+    """Result of a structure selection: validated candidates, the chosen one, and the reason.
 
     Parameters
     ----------
     trials
-        Validated candidates, best prediction first. Candidates that fail on parts that others predict come later, those
-        without a fit last.
+        Validated candidates, best prediction first. Candidates that fail on a part of the validation data that others
+        predict follow, and candidates without a fit are last.
     chosen
-        Index of the chosen one.
+        Index of the chosen candidate in `trials`.
     best
-        Identification of the chosen structure on all runs, also from automatic initial guesses.
+        Identification of the chosen structure on all runs.
     validation
-        Description of the validation.
+        Description of the validation as text.
     reason
-        Reason of the choice.
+        Reason for the choice.
     fitted
-        Total number of fitted candidates. Only the most promising ones of each step are validated.
+        Total number of fitted candidates, of which only the most promising ones of each step are validated.
     findings
         Findings on the choice.
     validated
-        Comparison of the identification with separate validation runs; None if runs or blocks were left out in turn.
+        Comparison of the chosen model with separate validation runs; None if runs or blocks were left out in turn.
     """
 
     trials: tuple[Trial, ...]
@@ -63,7 +63,7 @@ class Selection(ReportMixin):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
+        """Findings as sentences."""
         return texts(self.findings)
 
     @property
@@ -99,17 +99,17 @@ class Selection(ReportMixin):
         return self.best.validate(runs)
 
     def summary(self) -> str:
-        """Return the printed summary: that of the model, the candidates, and the reason of the choice."""
+        """Return the summary as text: that of the model, the candidates, and the reason for the choice."""
         return str(self)
 
     @property
     def winner(self) -> Trial:
-        """The chosen candidate."""
+        """Trial of the chosen candidate."""
         return self.trials[self.chosen]
 
     @property
     def structure(self) -> Structure:
-        """The chosen structure with the initial terms of its validation; it identifies ``best``."""
+        """Structure that was chosen, with the initial conditions of its validation."""
         return self.winner.structure if self.best.task is None else self.best.task.structure
 
     def _rows(self) -> list[list[Cell]]:
@@ -134,7 +134,7 @@ class Selection(ReportMixin):
         return out
 
     def table(self) -> Table:
-        """Return the candidates as a table of a page."""
+        """Return a table of the candidates, for an HTML page."""
         columns = (
             "structure",
             "parameters",
@@ -154,7 +154,7 @@ class Selection(ReportMixin):
         )
 
     def figure(self) -> LineChart:
-        """Return a chart of the fits of the best candidate with each number of parameters."""
+        """Return a chart of the best fit over the number of parameters."""
         best: dict[int, Trial] = {}
         for trial in (t for t in self.trials if t.failed is None):
             if trial.parameters not in best or trial.score < best[trial.parameters].score:
@@ -190,7 +190,7 @@ class Selection(ReportMixin):
         return Page("Selection of a structure", sections, self.winner.name)
 
     def to_frame(self) -> Any:
-        """Return the candidates as a pandas frame, by rank."""
+        """Return the candidates as a pandas DataFrame, one row per candidate, by rank."""
         rows = [
             {
                 "rank": k + 1,
@@ -209,11 +209,11 @@ class Selection(ReportMixin):
         return to_frame(rows, ["rank"])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the result as a dictionary for JSON."""
         return {**self.ranking_dict(), "identification": self.best.to_dict()}
 
     def ranking_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON, without the identification."""
+        """Return the candidates and the choice as a dictionary for JSON, without the identification."""
         return {
             "chosen": self.winner.name,
             "reason": self.reason,
@@ -257,7 +257,7 @@ class Selection(ReportMixin):
 
 
 def _row(trial: Trial) -> str:
-    """Text line of a candidate."""
+    """Return the text line of a candidate in the ranking."""
     if trial.failed is not None:
         return f"{'-':>9}{'-':>9}{'-':>10}{trial.parameters:>9}  {trial.name}: {trial.failed}"
     label = trial.name + (UNSTABLE_NOTE if trial.unstable else "")
@@ -266,5 +266,5 @@ def _row(trial: Trial) -> str:
 
 
 def format_fit(fit: float) -> str:
-    """Format a fit; values below the minimum are not distinguished."""
+    """Return a fit in percent as text; values below a minimum are shown as the minimum."""
     return f"{fit:.2f}" if not fit < MIN_PRINTED_FIT_PERCENT else f"< {MIN_PRINTED_FIT_PERCENT:.0f}"

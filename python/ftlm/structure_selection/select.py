@@ -1,4 +1,4 @@
-"""Selection of a structure by the prediction of validation data."""
+"""Selection of a structure by its prediction of validation data."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ INTEGER_TOLERANCE = 1e-9
 def automatic_problems(
     runs: Sequence[Run], delays: Delays | None = None, driven_by: Mapping[str, Sequence[str]] | None = None
 ) -> list[OutputProblem]:
-    """Return one problem per output of the runs, with the signals that drive the output.
+    """Return one selection problem for each output of the runs, with the signals that enter its equation.
 
     Raises
     ------
     ModelError
-        A driving signal that is not in the runs or is the output itself.
+        If a signal in `driven_by` is not in the runs or is the output itself.
     """
     first, drivers_by_output = runs[0], dict(driven_by or {})
     for output, drivers in drivers_by_output.items():
@@ -110,19 +110,19 @@ def select(
 ) -> Selection:
     """Choose the terms and orders that improve the prediction of validation data significantly.
 
-    The given structure is an upper bound. Forward selection starts from the simplest nested structure (integer orders,
-    own terms of the output, one input term) and adds one term, free order, delay, friction or offset at a time. Each
-    candidate is fitted by output error from the previous optimum. The two best by Schwarz's criterion are simulated on
-    the validation data (the second only if its residual on all runs leaves it a chance). After two steps without
-    improvement, backward elimination removes one thing at a time. Listed structures are all validated, from automatic
-    initial guesses.
+    A single given structure is an upper bound. Forward selection starts from the simplest nested structure (integer
+    orders, terms of the output, one input term) and adds one term, free order, delay, friction or offset at a time.
+    Each candidate is fitted by output error from the previous optimum. The best two by Schwarz's criterion are
+    simulated on the validation data; the second is skipped if its residual on all runs is too large. After two steps
+    without improvement, backward elimination removes one element at a time. If a list of structures is given, all of
+    them are fitted from automatic initial guesses and validated.
 
-    A candidate fails on a run or a block if its residual exceeds half of the output and twice the residual of another
-    candidate. Candidates with the fewest failures are eligible. Of those that predict as well as the best, the one with
-    the lowest Schwarz criterion is chosen, with a number of samples corrected for the autocorrelation of the residuals.
-    A candidate predicts as well if its residual is within 1 % of the best. Up to 5 % are tolerated if the difference
-    over three or more folds is not significant at 95 % or, with fewer folds, if the criterion is lower by 10. Ties are
-    broken by fewer parameters, lower order, and better prediction.
+    A candidate fails on a run or a block if its residual there exceeds half of the output and twice the residual of
+    another candidate. Candidates with the fewest failures are eligible. Of those that predict as well as the best, the
+    one with the lowest Schwarz criterion is chosen, with a number of samples corrected for the autocorrelation of the
+    residuals. A candidate predicts as well as the best if its residual is at most 1 % larger. Up to 5 % are tolerated
+    if the difference over three or more folds is not significant at 95 % or, with fewer folds, if its criterion is
+    lower by 10. Ties are decided by fewer parameters, then lower order, then better prediction.
 
     Parameters
     ----------
@@ -133,51 +133,53 @@ def select(
         ``"auto"``: every input (none for a free decay), integer orders 1 to 4 with zeros, delays, direct feedthrough,
         an integrator, an output level and a drift, then fractional orders. Fractional orders are chosen if they predict
         better, or as well with a Schwarz criterion lower by 10. Feedthrough is not tried if an input depends on the
-        output (a closed loop), because feedback within a row looks like feedthrough. Each output has its own selection,
-        and the chosen equations are identified together.
+        output (a closed loop), because feedback without delay looks like feedthrough. Each output has its own
+        selection, and the chosen equations are identified together.
     validation
-        ``"runs"``: each run is predicted by a fit on the others, the default for several runs. ``"blocks"``: each
-        quarter of every run by a fit on the rest, the default for one run. Or separate validation runs.
+        ``"runs"``: each run is predicted by a fit to the others; the default for several runs. ``"blocks"``: each
+        quarter of a run is predicted by a fit to the rest; the default for one run. Or separate validation runs.
     delay
-        With ``"auto"``: the delay of inputs by name [s], a number or (lower, upper) bounds of one to estimate. By
-        default no delay and delays of up to 60 samples are compared. An input has one delay: if it is not the same in
-        the equations of several outputs, equations without a free delay are chosen.
+        With ``"auto"``: delay of each input by name [s], a number, or bounds (lower, upper) for an estimate. By
+        default, structures without delays and with delays of up to 60 samples are compared. An input has a single
+        delay. If its estimates in the equations of several outputs differ, equations without free delays are chosen.
     driven_by
-        With ``"auto"``: names of the signals that drive an output, by output; by default all inputs. Other outputs act
-        with their measured values.
+        With ``"auto"``: names of the signals that enter the equation of each output; by default all inputs. Other
+        outputs enter with their measured values.
     threads
         Number of candidates fitted concurrently, by default all cores; the result does not depend on it.
     progress
-        Called with the number of fitted candidates and the number of candidates so far.
+        Callback with (fitted candidates, candidates so far).
     store
         Checkpoint file with every finished fit. The same call with the same file resumes an interrupted selection and
-        gives the same bits.
+        gives the same result bit for bit.
 
     Returns
     -------
     Selection
-        Prints well; ``.best`` is the chosen structure identified on all runs, ``.report`` writes a page.
+        Result that prints its summary. ``.best`` is the identification of the chosen structure on all runs, and
+        ``.report`` writes an HTML page.
 
     Raises
     ------
     DataError
-        Runs that do not fit together or the structure, that are too short to be cut, or without excitation; a store
-        of another selection, in use, damaged, or that cannot be written.
+        If runs differ in names or units, lack a signal of the structure, are too short to be divided, or have no
+        excitation; or if the checkpoint file belongs to another selection, is in use, is damaged or cannot be written.
     ModelError
-        No candidates, two that differ in parameter names only, more than 10 000, no validation run, an unknown option,
-        one run where several are needed, a validation run that is also an estimation run.
+        If there are no candidates or more than 10 000, two candidates differ only in parameter names, an option is
+        unknown, there is no validation run, there is one run where several are required, or a validation run is also an
+        estimation run.
     ConvergenceError
-        No candidate that can be fitted.
+        If no candidate can be fitted.
 
     Notes
     -----
-    Initial terms are Caputo's (none from rest, otherwise level and velocity) unless the structure states otherwise. A
-    history has more terms if more orders are free, so candidates could not be compared. Forward
-    selection costs one fit for each possible addition, at each step. For records of more than about 1800 samples the
-    candidates are prescreened on subsampled records, and only survivors are fitted. With three or more input terms in
-    one equation and validation on whole runs, every subset at integer orders is first scored in closed form on a grid
-    of the own coefficients, and selection starts from the best. For a list of more than 200 candidates a
-    ``UserWarning`` estimates the remaining time after the first ones.
+    Initial terms are Caputo's (none from rest, otherwise initial values such as position and velocity) unless the
+    structure states otherwise. A history (powers of t for past inputs) would have more terms if more orders are free,
+    so candidates could not be compared. Each step of forward selection takes one fit for each possible addition. For
+    records of more than about 1800 samples the candidates are prescreened on subsampled records, and only survivors are
+    fitted. With three or more input terms in one equation and validation on whole runs, every subset at integer orders
+    is first scored in closed form on a grid of the coefficients of output terms, and selection starts from the best
+    subset. For a list of more than 200 candidates a ``UserWarning`` estimates the remaining time after the first ones.
     """
     workers = check_threads(threads)
     several = [runs] if isinstance(runs, Run) else list(runs)
@@ -235,7 +237,7 @@ def _run_selection(
     every: Mapping[str, Structure],
     sought: Sequence[OutputProblem],
 ) -> Selection:
-    """Evaluate nested and listed structures, or automatic ones of outputs, and choose."""
+    """Return the selection among given structures, nested structures, or automatic structures of outputs."""
     if sought:
         selection = _select_automatically(work, sought)
         winner = selection.trials[selection.chosen]
@@ -255,7 +257,7 @@ def _run_selection(
 
 
 def _select_automatically(work: CandidateEvaluator, sought: Sequence[OutputProblem]) -> Selection:
-    """Choose an automatic structure of each output and identify them together."""
+    """Choose an automatic structure for each output, and identify the chosen equations together."""
     choices = []
     for problem in sought:
         work.trials = []
@@ -265,7 +267,7 @@ def _select_automatically(work: CandidateEvaluator, sought: Sequence[OutputProbl
 
 
 def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
-    """Return the duration [s] of pieces of the runs of an unstable plant, by linear fits; None for other plants."""
+    """Return the duration [s] of the pieces into which runs of an unstable plant are divided; None for other plants."""
     forms = [IntegerOrderForm(n, n - 1) for n in range(1, MAX_ORDER + 1)]
     tests = [least_squares_piece_test(p.runs, form.structure(p), p.runs[0].units) for p in sought for form in forms]
     return min((t for t in tests if t is not None), key=lambda t: t.residual).seconds if any(tests) else None
@@ -273,7 +275,7 @@ def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice among ranked trials, its reason, and the choices of single outputs that it combines."""
+    """Chosen trial among ranked trials, with the reason, and the choices for single outputs that it combines."""
 
     ranked: tuple[Trial, ...]
     winner: Trial
@@ -282,9 +284,9 @@ class Choice:
 
 
 def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice:
-    """Rank the trials and choose one.
+    """Rank the trials and choose one of them.
 
-    If integer orders are preferred, fractional ones are chosen only as :func:`_eligible_indices` says.
+    With `prefers_integer_orders`, the rule of :func:`_eligible_indices` decides on fractional orders.
     """
     fits = [t for t in work.trials if t.joint is not None]
     if not fits:
@@ -309,10 +311,10 @@ def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice
 
 
 def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Choice:
-    """Return the choice of one structure with the equations of several outputs.
+    """Return the choice of one structure that has the chosen equations of several outputs.
 
-    An input has one delay in a structure. If the outputs do not agree on it, their best candidates without a free delay
-    are combined.
+    An input has a single delay in a structure. If the chosen equations have different delays of an input, the best
+    candidates without free delays are combined instead.
     """
     agreed = _have_common_delays([c.winner for c in choices])
     if not agreed:
@@ -345,7 +347,7 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
 
 
 def _have_common_delays(winners: Sequence[Trial]) -> bool:
-    """Whether the estimated delays of each input agree within their errors, and no equation lacks them."""
+    """Whether the delay estimates of each input agree within their errors in all equations."""
     for name in {i.name for w in winners for i in w.structure.free_inputs}:
         signal = next(i.signal for w in winners for i in w.structure.free_inputs if i.name == name)
         driven = [w for w in winners if signal in w.structure.signals]
@@ -360,7 +362,7 @@ def _have_common_delays(winners: Sequence[Trial]) -> bool:
 
 
 def _without_free_delays(choice: Choice) -> Choice:
-    """Return the choice among candidates without a free delay; the same one if it has none or there is no other."""
+    """Return the choice among candidates without free delays, or the same choice if there are none."""
     ranked = [t for t in choice.ranked if t.failed is None and not t.structure.free_inputs]
     if not choice.winner.structure.free_inputs or not ranked:
         return choice
@@ -370,7 +372,7 @@ def _without_free_delays(choice: Choice) -> Choice:
 
 
 def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
-    """Identify the chosen structure on all runs, and add findings on the choice."""
+    """Return the selection whose chosen structure is identified on all runs, with findings on the choice."""
     folds, winner = work.folds, choice.winner
     structure = _with_validated_initial_conditions(winner, folds)
     if folds.split is None:
@@ -404,9 +406,10 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
 
 
 def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
-    """Return ranked trials with BIC, whose effective sample size is that of the residuals of the best prediction.
+    """Return ranked trials with BIC, whose effective number of samples is that of the best trial's residuals.
 
-    The whitest residuals would mislead: a high order can fit drifts and disturbances, and still predict worse.
+    The trial with the whitest residuals is not suitable for this, because a high order can fit drifts and disturbances
+    and still predict worse.
     """
     inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
     return [
@@ -417,8 +420,7 @@ def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
 def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: Identification) -> list[Finding]:
     """Return a finding on whether the fractional orders of the chosen candidate improve the prediction.
 
-    The rule is that of ``ftlm orders`` on validation data, compared with the best candidate whose orders are all
-    integers; candidates may have delays and offsets.
+    The chosen candidate is compared with the best one of integer orders by the rule of ``ftlm orders``.
     """
     orders = {n: v for n, v in winner.values.items() if n in winner.structure.order_names and n in result.orders}
     if not any(abs(v - round(v)) > INTEGER_TOLERANCE for v in orders.values()):
@@ -445,7 +447,10 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: I
 
 
 def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
-    """Return, for each trial, the parts that it predicts badly while a stable trial predicts them far better."""
+    """Return, for each trial, the names of the parts on which it fails.
+
+    It fails on a part if its prediction is bad while a stable trial predicts the part far better.
+    """
     scores_by_part = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
     least: dict[str, float] = {}
     for scores in (part for part, t in zip(scores_by_part, every, strict=True) if not t.unstable):
@@ -458,9 +463,9 @@ def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
 
 
 def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
-    """Sort trials, best first: fewest failures, then the mean score.
+    """Return trials sorted by the number of failures, then by the mean score, best first.
 
-    The mean score alone would offset a failure on one block by good fits on the others.
+    By the mean score alone, good fits on other blocks would compensate for a failure on one block.
     """
     failures = dict(zip(map(id, every), map(len, _failed_parts(every)), strict=True))
     return sorted(
@@ -469,7 +474,7 @@ def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
 
 
 def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
-    """Return the indices of trials that are no less stable, and fail no more often, than the best."""
+    """Return the indices of trials that are not less stable, and do not fail more often, than the best one."""
     best, failures = ranked[0], [len(f) for f in _failed_parts(ranked)]
     return [
         k
@@ -479,11 +484,14 @@ def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
 
 
 def _predicts_equally(trial: Trial, best: Trial) -> bool:
-    """Whether a trial predicts like the best: within 1 %, or up to 5 % if the difference over folds is not significant.
+    """Whether a trial predicts as well as the best one.
 
-    The best is the maximum over many candidates, so a limit of one standard error would reject a true structure in one
-    case of ten. If one block contains information that the others lack, omitting it costs the true structure far more
-    than 5 %. Very strong evidence on all samples keeps it eligible; with too few folds for a t-test only within 5 %.
+    Its residual is at most 1 % larger, or up to 5 % if the difference over folds is not significant.
+
+    The best trial is the best of many, so a limit of one standard error would reject a true structure in one case of
+    ten. If one block contains information that the others lack, the true structure predicts this block far worse than 5
+    %. Very strong evidence on all samples then makes it eligible. With too few folds for a t-test, it is eligible only
+    within 5 %.
     """
     differences = np.array(trial.scores) - np.array(best.scores)
     far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
@@ -497,10 +505,11 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
 
 
 def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
-    """Return the indices of eligible trials if integer orders are preferred, and a sentence on fractional orders.
+    """Return the indices of eligible trials if integer orders are preferred, and text on fractional orders.
 
-    Fractional orders predict better only if their residuals are 1 % smaller than those of the best integer orders, and
-    significantly over the folds. They are also eligible if they predict as well and their criterion is much lower.
+    Fractional orders are eligible if their residuals are significantly smaller over the folds, by at least 1 %, than
+    those of the best integer orders. They are also eligible if they predict as well and their Schwarz criterion is much
+    lower.
     """
     whole = [k for k in _peer_indices(ranked) if not has_memory(ranked[k].structure)]
     other = [k for k in near if has_memory(ranked[k].structure)]
@@ -519,7 +528,7 @@ def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[lis
 
 
 def _predicts_better(trial: Trial, other: Trial) -> bool:
-    """Whether the residuals of a trial are smaller than another's by 1 %, and significantly over folds."""
+    """Whether the residuals of a trial are smaller than another's by at least 1 %, and significantly over the folds."""
     differences = np.array(trial.scores) - np.array(other.scores)
     if differences.size < MIN_T_TEST_FOLDS or trial.score > other.score - SCORE_TOLERANCE:
         return False
@@ -530,7 +539,7 @@ def _predicts_better(trial: Trial, other: Trial) -> bool:
 def _winner(near: Sequence[Trial]) -> Trial:
     """Return the trial with the lowest Schwarz criterion; ties go to fewer parameters, then to the lower order.
 
-    From rest the derivative of an equation is equivalent to it, so the lower order is preferred.
+    From rest, an equation and its derivative are equivalent, so the lower order is preferred.
     """
     least = min(_bic(t) for t in near)
     alike = [t for t in near if _bic(t) <= least + BIC_TOLERANCE]
@@ -538,7 +547,7 @@ def _winner(near: Sequence[Trial]) -> Trial:
 
 
 def _total_integer_order(trial: Trial) -> int:
-    """Return the sum over equations of the highest order, rounded to an integer."""
+    """Return the sum of the orders of the equations, rounded to an integer."""
     return sum(round(e.order.substitute(trial.values).constant) for e in trial.structure.equations)
 
 
@@ -547,9 +556,10 @@ def _bic(trial: Trial) -> float:
 
 
 def _with_validated_initial_conditions(trial: Trial, folds: Folds) -> Structure:
-    """Return the structure with the initial terms of its validation.
+    """Return the structure of a trial with the initial conditions of its validation.
 
-    From rest no initial terms are needed, but they stay allowed: a later run may have nonzero initial conditions.
+    If the runs started from rest, the structure still allows initial terms, because a later run may have nonzero
+    initial conditions.
     """
     if trial.joint is None or (trial.structure.initial == "auto" and trial.joint.initial == "rest"):
         return trial.structure
@@ -557,7 +567,7 @@ def _with_validated_initial_conditions(trial: Trial, folds: Folds) -> Structure:
 
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
-    """Describe why the winner was chosen."""
+    """Return the reason for the choice of the winner as text."""
     text = (
         f"Chosen: {winner.name} ({winner.parameters} parameters, validation fit {format_fit(winner.validation_fit)} %)."
     )
@@ -577,7 +587,7 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
 
 
 def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
-    """Describe better candidates that fail on a part, and failures of the winner."""
+    """Return text on better candidates that fail on a part, and on failures of the winner."""
     failures = dict(zip(map(id, ranked), _failed_parts(ranked), strict=True))
     text = ""
     better = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.unstable == winner.unstable]

@@ -1,4 +1,7 @@
-"""Stepwise selection of a structure: forward, then backward, with prescreening on subsampled records."""
+"""Stepwise structure selection: forward selection, then backward elimination.
+
+Candidates are prescreened on subsampled records.
+"""
 
 from __future__ import annotations
 
@@ -44,11 +47,11 @@ Start = tuple[Structure, Sequence[Mapping[str, float]]]
 
 
 def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: TaskPool) -> list[int]:
-    """Return indices of the structures to fit on all samples, in their order.
+    """Return the indices of structures that are worth a fit on all samples, in ascending sequence.
 
-    A structure is excluded if its cost on subsampled records, with the budget of a rung of the multistart, exceeds the
-    lowest cost by the factor of the multistart. At least `least` structures remain. Records too short for subsampling
-    and structures that are not linear are not prescreened.
+    Each structure is fitted to subsampled records with a limited number of evaluations. It is excluded if its cost
+    exceeds the lowest cost by the factor that the multistart uses for successive halving. At least `least` structures
+    remain. All remain if records are too short for subsampling or a structure is nonlinear.
     """
     every = list(range(len(starts)))
     decimation = max(1, round(min(run.length - 1 for run in runs) / PRESCREEN_SAMPLES))
@@ -72,7 +75,7 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Ta
 def _prescreen_cost(
     runs: Sequence[Run], structure: Structure, points: Sequence[Mapping[str, float]], decimation: int
 ) -> float:
-    """Lowest cost of optimizations from some initial guesses on subsampled records, outputs weighted equally."""
+    """Return the lowest cost from some initial guesses on subsampled records, with equally weighted outputs."""
     problem = FreeProblem.of(structure)
     grid = Objective(
         problem,
@@ -115,7 +118,7 @@ VALIDATED_CHANGES = 2
 
 @dataclass
 class CandidateEvaluator:
-    """Evaluation of candidates, and its progress callback.
+    """Object that fits and validates candidates in parallel, with a progress callback and a checkpoint file.
 
     Parameters
     ----------
@@ -124,11 +127,11 @@ class CandidateEvaluator:
     threads
         Number of candidates evaluated concurrently; the result does not depend on it.
     progress
-        Called with the number of fitted candidates and the number of candidates so far.
+        Callback with (fitted candidates, candidates so far).
     clock
-        Clock in seconds.
+        Function that returns the time [s].
     store
-        Checkpoint file with the results of each step.
+        Checkpoint file with the results of each step, if any.
     """
 
     folds: Folds
@@ -141,12 +144,12 @@ class CandidateEvaluator:
     trials: list[Trial] = field(default_factory=list)
 
     def map_candidates(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """Return the results for candidates, in their order, with progress reports."""
+        """Return the results of a function for candidates, in the same order, with progress reports."""
         self.known_count += len(items)
         return self._in_order(work, items, self._report_progress)
 
     def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """Return the results for items, in their order, without progress reports."""
+        """Return the results of a function for items, in the same order, without progress reports."""
         return self._in_order(work, items, lambda: None)
 
     def _report_progress(self) -> None:
@@ -165,7 +168,7 @@ class CandidateEvaluator:
         return out
 
     def validate(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
-        """Evaluate a fitted candidate on validation data."""
+        """Return the trial of a fitted candidate on validation data; a failed fit gives a failed trial."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
 
@@ -178,7 +181,7 @@ class CandidateEvaluator:
         return compute() if self.store is None else self.store.validation(name, structure, joint, fine, compute)
 
     def refine_trial(self, trial: Trial) -> Trial:
-        """Return a candidate refitted until its parameters are independent of the step of the grid."""
+        """Return a trial refitted with a time step that is refined until the parameters converge."""
         if trial.refined:
             return trial
         joint = self.fit_candidate(trial.structure, [trial.values])
@@ -191,7 +194,7 @@ class CandidateEvaluator:
     def fit_candidate(
         self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
     ) -> JointFit | FtlmError:
-        """Fit a candidate on all runs; return the error if the fit fails."""
+        """Return the fit of a candidate on all runs, or the error of the fit."""
 
         def compute() -> JointFit | FtlmError:
             try:
@@ -202,7 +205,7 @@ class CandidateEvaluator:
         return compute() if self.store is None else self.store.fit(structure, starts, refine, compute)
 
     def best_subsets(self, inside: NestedStructures) -> list[ScreenedSubset]:
-        """Return every subset of input terms, best first."""
+        """Return every subset of input terms, best prediction first; see :func:`screen_subsets`."""
 
         def compute() -> list[ScreenedSubset]:
             return screen_subsets(inside, self.folds, self)
@@ -212,7 +215,7 @@ class CandidateEvaluator:
 
 @dataclass(frozen=True)
 class FittedVariant:
-    """A variant with its fit."""
+    """Variant (nested structure) with its fit."""
 
     change: Change
     joint: JointFit
@@ -222,9 +225,14 @@ class FittedVariant:
 def initial_guesses(
     structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
 ) -> list[dict[str, float]]:
-    """Return initial guesses from known `values`, the integers `whole` of orders that become free, and 0.
+    """Return initial guesses of a structure from the estimates `values` of a nested structure.
 
-    Coefficients that are not in `values` start at 0; friction that is not in `values` has no initial guess.
+    `whole` are the integers around which orders that become free start.
+
+    `whole` are the integer values of orders that become free.
+
+    A coefficient that is not in `values` starts at 0; a friction parameter that is not in `values` gets no initial
+    value.
     """
     problem = FreeProblem.of(structure)
     usual: dict[str, list[float]] = {}
@@ -241,13 +249,13 @@ def initial_guesses(
 
 
 def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[Trial]:
-    """Select structures stepwise from the simplest ones upwards, then downwards; return all validated trials in order.
+    """Select structures by forward selection and backward elimination, and return all trials in sequence.
 
-    Each integer value of the highest orders is an initial structure of its own: the best of the simplest structures
-    need not be nested in the best one. With several inputs, one may act as a proxy for the others, so the best
-    structure is also approached from the full structure at integer orders by backward elimination. If there are enough
-    input terms for best-subset screening, selection starts from the best subset. If no term is optional, the structure
-    with all orders free is a second initial structure.
+    Forward selection runs from a simplest structure for each integer value of the highest orders, because the best of
+    the simplest structures need not be nested in the best structure. With several inputs, one input may act as a proxy
+    for the others; backward elimination from the full structure at integer orders avoids this. If there are enough
+    input terms for best-subset screening, selection starts from the best subset. If no term is optional, it also starts
+    from the structure with all orders free.
     """
     subsets = work.best_subsets(inside)
     ends_from_subsets = _select_from_subsets(inside, work, subsets)
@@ -284,7 +292,7 @@ def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[
 def _eliminate_from_ends(
     inside: NestedStructures, work: CandidateEvaluator, ends: Sequence[tuple[Trial, FittedVariant]], keys: set[str]
 ) -> list[Trial]:
-    """Eliminate terms backward from each forward-selection result that is as good as the best."""
+    """Eliminate terms from each result of forward selection that is as good as the best; return the trials."""
     least = min(_ranking_key(trial) for trial, _ in ends)
     for trial, at in ends:
         if (trial.unstable, trial.score) <= (least[0], least[1] + SCORE_TOLERANCE):
@@ -293,9 +301,11 @@ def _eliminate_from_ends(
 
 
 def _select_from_full(inside: NestedStructures, work: CandidateEvaluator) -> list[Trial]:
-    """Select from integer orders upwards, and from all orders free downwards, for equations without optional terms.
+    """Return the trials for equations without optional terms, in which only orders are selected.
 
-    Forward selection from integer orders is skipped if their validation residual far exceeds that with all orders free.
+    Orders are made free one at a time, or fixed to integers one at a time from all orders free.
+
+    The former is skipped if the validation residual with integer orders far exceeds that with all orders free.
     """
     structure = inside.structure
     full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
@@ -323,7 +333,7 @@ def _select_from_full(inside: NestedStructures, work: CandidateEvaluator) -> lis
 def _select_from_subsets(
     inside: NestedStructures, work: CandidateEvaluator, subsets: Sequence[ScreenedSubset]
 ) -> list[tuple[Trial, FittedVariant]]:
-    """Fit and validate the best subsets; extend the best of them by free orders."""
+    """Return the trials of the best subsets, of which the best are extended by free orders."""
     if not subsets:
         return []
     best_subsets = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
@@ -346,7 +356,7 @@ def _select_from_subsets(
 
 
 def _ranking_key(trial: Trial) -> tuple[bool, float]:
-    """Sort key of a candidate: instability first, then the score."""
+    """Return the sort key of a trial: instability first, then the score."""
     return trial.unstable, trial.score
 
 
@@ -357,7 +367,7 @@ def _select_forward(
     keys: set[str],
     validated: Trial | None = None,
 ) -> tuple[Trial, FittedVariant]:
-    """Add one term, free order or offset at a time while the prediction improves; return the best result."""
+    """Add one term, free order or offset at a time while the prediction improves; return the best trial."""
     best = validated or _validate_variants(inside, work, [candidate])[0]
     best_at, idle = candidate, 0
     keys.add(_key(inside, candidate.change))
@@ -378,12 +388,12 @@ def _select_forward(
 
 
 def _max_relevant_score(best: Trial) -> float:
-    """Return the score above which a candidate is neither better than the best nor equal to it."""
+    """Return the score above which a candidate is neither better than the best nor equally good."""
     return math.inf if best.unstable else best.score + MAX_SCORE_TOLERANCE
 
 
 def _is_better(trial: Trial, than: Trial) -> bool:
-    """Whether a candidate predicts significantly better than another."""
+    """Whether a trial predicts significantly better than another."""
     return _ranking_key(trial) < (than.unstable, than.score - MIN_SCORE_IMPROVEMENT)
 
 
@@ -394,7 +404,7 @@ def _eliminate_from_full(
     others: Sequence[Mapping[str, float]],
     keys: set[str],
 ) -> tuple[Trial, FittedVariant] | None:
-    """Eliminate one term at a time from the full structure at integer orders; return the best result."""
+    """Eliminate one term at a time from the full structure at integer orders; return the best trial, or None."""
     full = inside.richest(low.change.variant)
     if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
         return None
@@ -433,10 +443,10 @@ def _validate_variants(
     limit: float = math.inf,
     margin: float = 0.0,
 ) -> list[Trial]:
-    """Evaluate fitted variants on validation data, without those that cannot be the best.
+    """Return the trials of fitted variants, except those that cannot be the best.
 
-    Variants from the first whose lower bound of the score exceeds `limit` are evaluated after those before it. They
-    are skipped if all their bounds exceed the best score so far by more than the margin.
+    Variants are evaluated in two batches. The second starts with the first variant whose lower bound of the score
+    exceeds `limit`. It is skipped if all its bounds exceed the best score of the first batch by more than `margin`.
     """
 
     def one(candidate: FittedVariant) -> Trial:
@@ -455,7 +465,10 @@ def _validate_variants(
 def _fit_changes(
     inside: NestedStructures, work: CandidateEvaluator, at: FittedVariant, changes: Sequence[Change]
 ) -> list[FittedVariant]:
-    """Fit changes from the current optimum, best first; for long records only survivors of the prescreening."""
+    """Return the fits of changed variants, sorted by BIC; they start from the current optimum.
+
+    For long records only survivors of the prescreening are fitted.
+    """
     values = at.joint.values_by_name
     starts: list[Start] = []
     for change in changes:
@@ -470,7 +483,7 @@ def _fit_changes(
 def _by_criterion(
     inside: NestedStructures, work: CandidateEvaluator, pairs: Sequence[tuple[Change, JointFit | FtlmError]]
 ) -> list[FittedVariant]:
-    """Sort fitted variants by Schwarz's criterion, with the smallest variance inflation of their residuals."""
+    """Return fitted variants sorted by BIC, which uses the smallest variance inflation of their residuals."""
     fits = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
     if not fits:
         return []
@@ -483,7 +496,10 @@ def _by_criterion(
 def _eliminate_backward(
     inside: NestedStructures, work: CandidateEvaluator, best: Trial, at: FittedVariant, keys: set[str]
 ) -> None:
-    """Eliminate one term, free order or offset at a time while the prediction does not get worse."""
+    """Remove one term, free order or offset at a time while the prediction does not get worse.
+
+    The trials are stored in the evaluator.
+    """
     while True:
         changes = [
             c for c in _untried_changes(inside, inside.smaller(at.change.variant), keys) if _is_adjacent_integer(c, at)
@@ -502,7 +518,7 @@ def _eliminate_backward(
 
 
 def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
-    """Whether each order that becomes an integer moves by less than 1 from its estimate."""
+    """Whether each order that a change fixes to an integer moves by less than 1 from its estimate."""
     values = at.joint.values_by_name
     return all(abs(v - values[n]) < 1.0 for n, v in change.variant.integer_orders if n in values)
 
@@ -512,7 +528,7 @@ def _key(inside: NestedStructures, change: Change) -> str:
 
 
 def _untried_changes(inside: NestedStructures, changes: Iterable[Change], keys: set[str]) -> list[Change]:
-    """Return changes to untried variants, each once."""
+    """Return the changes whose variant has not been tried, each variant once."""
     return list({key: c for c in changes if (key := _key(inside, c)) not in keys}.values())
 
 
@@ -521,7 +537,7 @@ def _name(inside: NestedStructures, candidate: FittedVariant) -> str:
 
 
 def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator) -> list[Trial]:
-    """Evaluate listed candidates, each from automatic initial guesses."""
+    """Return the trials of listed candidates, each fitted from automatic initial guesses."""
 
     def one(item: tuple[str, Structure]) -> Trial:
         name, structure = item
@@ -547,7 +563,7 @@ def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator)
 
 
 def format_duration(seconds: float) -> str:
-    """Format seconds as seconds, minutes or hours, with two digits."""
+    """Return a duration in seconds as text in seconds, minutes or hours, with two digits."""
     for unit, size in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 2.0 * size:
             return f"{seconds / size:.2g} {unit}"

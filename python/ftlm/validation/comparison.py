@@ -1,4 +1,4 @@
-"""Error metrics: error (45), RMSE, NR and fit."""
+"""Comparison of a model with measured runs: simulation error and equation error, with metrics and tables."""
 
 from __future__ import annotations
 
@@ -46,18 +46,19 @@ from ftlm.utils.validation import Floats, as_floats
 
 @dataclass(frozen=True)
 class Metrics:
-    """Error metrics of one output.
+    """Error metrics of one output: error (45), RMSE (46) and NR (47) of the paper, and fit.
 
     Parameters
     ----------
     error
-        Sum of absolute errors over the block pulses (paper (45)), in the unit of the output.
+        Sum of absolute errors over all samples (or block pulses), in the unit of the output; equation (45) of the
+        paper.
     rmse
-        Root mean square error (paper (46)).
+        Root mean square error, in the unit of the output; equation (46).
     nr
-        Normalized residual RMSE / sigma(y) (paper (47)).
+        Normalized residual: RMSE divided by the standard deviation of the output; equation (47).
     fit
-        100 (1 - ‖y - ŷ‖ / ‖y - mean‖) in percent.
+        Fit in percent: 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖).
     """
 
     error: float
@@ -66,7 +67,7 @@ class Metrics:
     fit: float
 
     def to_dict(self) -> dict[str, float | None]:
-        """Return a dictionary for JSON."""
+        """Return the metrics as a dictionary for JSON."""
         return attributes(self, ("error", "rmse", "nr", "fit"))
 
 
@@ -76,7 +77,7 @@ UNKNOWN_METRICS = Metrics(math.nan, math.nan, math.nan, math.nan)
 
 @check_arguments
 def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
-    """Return error (45), RMSE (46), NR (47) and fit of a prediction.
+    """Return error, RMSE, normalized residual and fit of a prediction; see :class:`Metrics`.
 
     Parameters
     ----------
@@ -86,12 +87,14 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     Returns
     -------
     Metrics
-        Not finite if the prediction is not; NR and fit of a constant measurement are meaningless.
+        Metrics that are not finite if the prediction is not finite. NR and fit are meaningless for a constant
+        measurement.
 
     Raises
     ------
     DataError
-        Not one-dimensional, empty or of different lengths; measured values that are not finite real numbers.
+        If an array is empty or not one-dimensional, the lengths differ, or a measured value is not a finite real
+        number.
     """
     y, prediction = as_floats("measured", measured), as_floats("predicted", predicted)
     if y.ndim != 1 or y.size == 0 or prediction.shape != y.shape:
@@ -102,7 +105,7 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
 
 
 def pooled_metrics(outputs: list[Floats], residuals: list[Floats]) -> Metrics:
-    """Return metrics over several runs without missing samples; the fit uses each run's own mean."""
+    """Return metrics over several runs from their measured outputs and residuals, without missing samples."""
     finite = [~np.isnan(y) for y in outputs]
     if not all(k.all() for k in finite):
         outputs = [y[k] for y, k in zip(outputs, finite, strict=True)]
@@ -130,37 +133,38 @@ VISIBLE_STEP_CHANGE = 1e-3
 
 @dataclass(frozen=True)
 class Comparison:
-    """Output error and equation error of a model on measured runs.
+    """Errors of a model on measured runs: output error of the simulation, and equation error.
 
     Parameters
     ----------
     output_error, equation_error
-        Metrics by output, over all runs: of the simulation, and of the equation with measured signals on its
-        right-hand side.
+        Metrics by output, over all runs. The output error is that of the simulation; the equation error is that of the
+        equation with measured signals on its right-hand side.
     per_run
-        The same for each run by name: (equation error, output error).
+        (equation error, output error) of each run by name, each as metrics by output.
     simulated, measured
-        By output, one array per run: samples at the sample times, or pulse means (see ``output_samples``). Missing
-        samples are NaN in ``measured`` and excluded from the output error; the equation error is unknown then.
+        Simulated and measured values by output, one array per run: samples at the sample times, or means over block
+        pulses if ``output_samples`` is False. Missing samples are NaN in ``measured`` and excluded from the output
+        error. With missing samples there is no equation error.
     step
-        Pulse width of each run [s], of the equation error.
+        Width of the block pulses of each run [s], for the equation error.
     m
-        Number of block pulses of the equation error.
+        Number of block pulses per run, for the equation error.
     initial
-        Coefficients of the initial terms of the simulation, one mapping per run: output -> exponent -> value. They
-        apply to that run only.
+        Coefficients of the initial terms (powers of t) in the simulation, one mapping per run: output -> exponent ->
+        value. They are valid for that run only.
     findings
-        Reasons to doubt these metrics.
+        Findings on reasons to doubt these metrics.
     times
         Time of each value of ``simulated`` and ``measured`` [s since the first sample], one array per run.
     output_samples
-        Whether the output error compares samples at the sample times; False for pulse means, as in the paper.
+        Whether samples at the sample times are compared; False for means over block pulses, as in the paper.
     offsets
-        Unknown constants of the equations, one mapping per run: output -> ``"constant"`` [unit of D^alpha y] (and
-        ``"ramp"`` [that unit/s]) -> value. Estimated on each run separately; empty for a model without an offset, and
-        for an output whose initial history makes the offset unidentifiable or whose simulation diverges.
+        Estimated offsets of the equations, one mapping per run: output -> ``"constant"`` [unit of D^alpha y] (and
+        ``"ramp"`` [that unit/s]) -> value. They are estimated on each run separately. Empty for a model without an
+        offset, and for an output whose initial terms make the offset unidentifiable or whose simulation diverges.
     without_equation_error
-        Outputs without an equation error, with the reason: friction acts on them, or samples are missing.
+        Reason by name, for each output without an equation error: friction acts on it, or samples are missing.
     """
 
     output_error: dict[str, Metrics]
@@ -179,7 +183,7 @@ class Comparison:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
+        """Findings as sentences."""
         return texts(self.findings)
 
     @property
@@ -191,7 +195,7 @@ class Comparison:
     fit_percent = fit
 
     def to_frame(self) -> Any:
-        """Return both errors of every run as a pandas frame, by run, output and kind of error."""
+        """Return both errors of every run as a pandas DataFrame, one row for each run, output and kind of error."""
         rows = [
             {"run": run, "output": name, "of": kind, "error": f.error, "rmse": f.rmse, "nr": f.nr, "fit": f.fit}
             for run, equation, output in self.per_run
@@ -201,7 +205,7 @@ class Comparison:
         return to_frame(rows, ["run", "output", "of"])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the comparison as a dictionary for JSON."""
         parts = ("run", "equation_error", "output_error")
         return {
             **attributes(self, ("m", "output_error", "equation_error")),
@@ -250,51 +254,49 @@ HIDDEN_OFFSET_NOTE = "not separately identifiable from the initial conditions; b
 
 @check_arguments
 def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
-    """Return equation error and output error of a model on measured runs.
+    """Compare a model with measured runs, and return its output error and equation error.
 
     The output error compares each sample y[k] with the simulation (free run: only inputs and initial conditions are
-    used) at the same time, on a grid refined until converged as in :func:`ftlm.simulate`. Initial values are fitted to
-    the samples of the run, none from rest. A history explains no more than inputs before the run could: its size has a
-    prior in units of the response to the inputs of the run. A run of an unstable plant is simulated in pieces as
-    in the identification, each with its own initial values. The fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
+    used) at the same time. The time step is refined until the simulation has converged, as in :func:`ftlm.simulate`.
+    Initial values are fitted to the samples of the run, unless the model starts from rest. Initial terms of a history
+    (past inputs) have a prior, so that they explain no more than plausible inputs before the run could. A run of an
+    unstable plant is simulated in pieces with their own initial values if the model was identified in this way. The fit
+    is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
 
     Parameters
     ----------
-    model
-        The model.
-    runs
-        One run or several with the same names and units.
-    m
-        Number of block pulses per run for the equation error; default as in the identification, or what runs carry.
+    model The model. runs One run or several with the same names and units. m Number of block pulses per run for the
+    equation error; by default as in the identification, or fewer for shorter runs.
 
     Returns
     -------
     Comparison
-        On the estimation data the metrics equal those of the identification. Initial terms, and offsets if the
-        structure has any, are estimated on each of these runs separately.
+        Comparison whose metrics equal those of the identification on the estimation data. Initial terms, and offsets if
+        the structure has any, are estimated on each run separately.
 
     Raises
     ------
     DataError
-        Runs that do not fit, a signal that is not there, a constant output.
+        If runs differ in names or units, a signal of the model is missing, or an output is constant.
     ModelError
-        An m that the runs do not carry.
+        If a run is too short for `m` pulses.
     """
     several, m = _check_arguments(model, runs, m)
     return compare_samples(model, several, simulate_runs(model, several), m=m)
 
 
 def simulate_runs(model: Model, runs: Sequence[Run]) -> list[OutputSamples]:
-    """Simulate each run, with initial terms fitted to it, on a grid refined until converged.
+    """Simulate each run with initial terms fitted to it, and return samples of the outputs.
 
-    A model that was identified from pieces of runs is simulated in such pieces, each with initial terms of its own.
+    The time step is refined until converged. A model that was identified from pieces of runs is simulated in such
+    pieces, each with its own initial terms.
     """
     duration = UNSET if model.estimate is None else model.estimate.piece_duration
     return [_simulate_pieces(model, [run] if duration is UNSET else run.split(duration)) for run in runs]
 
 
 def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:
-    """Return the simulation of consecutive pieces of a run as one; its initial terms are those of the first piece."""
+    """Return the concatenated simulations of consecutive pieces of a run, with the first piece's initial terms."""
     free = [
         simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, max_m=max(MAX_PULSES, 4 * run.length))
         for run in pieces
@@ -308,7 +310,7 @@ def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:
 
 
 def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, m: int) -> Comparison:
-    """Compare simulations sample by sample, and the equation error on m pulses, with these runs."""
+    """Return a comparison from finished simulations of runs; the equation error is computed on m block pulses."""
     full = records(runs, model.structure, m)
     parts = []
     for run, sampled, rec in zip(runs, free, full, strict=True):
@@ -326,14 +328,15 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
 
 
 def _is_unconverged(sampled: OutputSamples) -> bool:
-    """Whether halving the step still changes a finite simulation visibly."""
+    """Whether a simulation is finite, but halving the time step still changes it noticeably."""
     return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE_STEP_CHANGE))
 
 
 def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
-    """Return both errors on the pulse means of m block pulses, as in the paper's tables.
+    """Return output error and equation error on the means over m block pulses, as in the paper's tables.
 
-    Means average neighboring samples. They understate noise, and overstate errors if a period has few pulses.
+    A mean averages neighboring samples. These errors therefore understate noise, and overstate model errors if an
+    oscillation has few pulses per period.
     """
     several, m = _check_arguments(model, runs, m)
     check_no_missing(several, "figures of pulse means")
@@ -347,7 +350,7 @@ def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = No
 
 
 def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
-    """Return runs that have all signals of the model, and the number of pulses."""
+    """Return the runs and the number of pulses; raise if runs lack a signal of the model or are too short."""
     check_model(model)
     several = as_runs(runs)
     carried = min(run.length for run in several) - 1
@@ -359,15 +362,17 @@ def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> 
 
 
 def describe_missing_equation_errors(why: Mapping[str, str]) -> list[str]:
-    """Describe which outputs have no equation error, and why."""
+    """Return lines of text on outputs without an equation error, with the reasons."""
     return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
 
 
 def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
-    """Return offsets of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
+    """Return offsets of the equations, computed from their fitted responses c t^alpha / Gamma(alpha + 1).
 
-    Empty for an equation whose run has an initial history, since its powers of t make a constant unidentifiable, and
-    for one whose simulation diverges, which determines no constant.
+    `initial` has the coefficients of the powers of t by output and exponent. The result is output -> kind -> value.
+
+    The result is empty for an output with initial terms of a history, whose powers of t make a constant unidentifiable,
+    and for an output whose simulation diverges.
     """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
@@ -388,7 +393,7 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
 
 
 def describe_offsets(comparison: Comparison) -> list[str]:
-    """Describe the offsets of every run that has some, one line per output."""
+    """Return text on the offsets of every run that has any, one line per output."""
     lines = []
     for (run, _, _), offsets, initial in zip(comparison.per_run, comparison.offsets, comparison.initial, strict=False):
         for output, values in offsets.items():
@@ -408,14 +413,14 @@ def describe_offsets(comparison: Comparison) -> list[str]:
 
 
 def describe_initial_terms(comparison: Comparison) -> str:
-    """Return runs whose initial terms and levels were estimated on their own outputs, with their number."""
+    """Return text that names the runs whose initial terms and levels were estimated from their own outputs."""
     counts = [sum(map(len, terms.values())) for terms in comparison.initial]
     return ", ".join(f"{run[0]} ({n})" for run, n in zip(comparison.per_run, counts, strict=True) if n)
 
 
 @dataclass(frozen=True)
 class _RunErrors:
-    """Errors of a model on one run, by output: simulation, measurement, equation signal and equation error."""
+    """Data for the errors of one run, by output: simulation, measurement, equation signal and equation error."""
 
     step: float
     initial: dict[str, dict[float, float]]
@@ -434,9 +439,10 @@ def _run_errors(
     *,
     gaps: Container[str] = (),
 ) -> _RunErrors:
-    """Return the errors of one run, with all signals filtered by the sensor filter.
+    """Return the data for the errors of one run, after the sensor filter is applied to all signals.
 
-    An output with missing samples has no equation error: it would be that of the interpolated samples.
+    An output with missing samples (`gaps`) has no equation error, because it would be computed from interpolated
+    samples.
     """
     (step, means, sensor), inputs, powers = full.core(), list(full.inputs), full.start
     core = step, np.nan_to_num(means) if model.structure.has_nonlinear_terms else means, sensor
@@ -453,7 +459,7 @@ def _run_errors(
 def _pooled_comparison(
     model: Model, runs: Sequence[Run], parts: Sequence[_RunErrors], m: int, times: list[Floats], *, sampled: bool
 ) -> Comparison:
-    """Pool the errors of all runs into a comparison."""
+    """Return the comparison that pools the errors of all runs."""
     equation_error, output_error = _pooled_errors(parts)
     # The runs' own figures may be known where those of all of them are not.
     rubbed = {e.output for e in model.equations if e.friction is not None}
@@ -484,7 +490,7 @@ def _pooled_comparison(
 
 
 def _pooled_errors(parts: Sequence[_RunErrors]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
-    """Return metrics of the equation error and of the simulation, pooled over these runs."""
+    """Return (equation error, output error), each as metrics by output, pooled over runs."""
     outputs = parts[0].measured
     equation = {
         o: pooled_metrics([p.equation_signals[o] for p in parts], [p.equation_errors[o] for p in parts])
@@ -502,10 +508,10 @@ def _pooled_errors(parts: Sequence[_RunErrors]) -> tuple[dict[str, Metrics], dic
 def near_identity_findings(
     structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
 ) -> list[Finding]:
-    """Return findings where the equation error is misleading.
+    """Return findings on outputs whose equation error is misleadingly small.
 
-    Orders of an output's own terms close to alpha reproduce any smooth output from itself; only the simulation reveals
-    it.
+    If a term of the output has an order close to alpha, the equation predicts any smooth output from itself. Only the
+    simulation reveals that such a model is wrong.
     """
     findings = []
     for item in structure.equations:
@@ -535,7 +541,7 @@ def near_identity_findings(
 
 
 def validation_findings(own: Comparison, validation: Comparison) -> list[Finding]:
-    """Return findings on validation runs that are estimation runs, and on outputs whose fit drops on the others."""
+    """Return findings on validation runs that are also estimation runs, and on outputs whose fit drops."""
     findings = []
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
@@ -556,9 +562,11 @@ ALIGNMENT_ROWS, MIN_COMMON_ROWS = 8, 32
 
 
 def common_rows(one: Floats, other: Floats) -> int:
-    """Return the number of rows that two records, shape (outputs, rows), share as parts of one recording; 0 if none.
+    """Return the number of samples that two records have in common as parts of one recording; 0 if there are none.
 
-    Parts of one recording coincide from the first row of the later one on.
+    Both records have shape (outputs, samples).
+
+    They have samples in common if one of them contains the other's first samples and agrees with it from there on.
     """
     if one.shape == other.shape and np.array_equal(one, other, equal_nan=True):
         return int(one.shape[1])
@@ -596,15 +604,15 @@ _METRIC_LABELS = ("error (45)", "RMSE", "NR", "fit %")
 
 
 def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None) -> Table:
-    """Return equation error and output error side by side, a row for each output of each comparison.
+    """Return a table of equation error and output error, with a row for each output of each comparison.
 
     Parameters
     ----------
     compared
-        (role of the data, comparison), such as ``("estimation", result.comparison)``. Runs of a comparison with
-        several runs follow with their own rows.
+        Pairs (role of the data, comparison), such as ``("estimation", result.comparison)``. A comparison with several
+        runs has further rows for each run.
     units
-        Units of the outputs.
+        Units by output.
     """
     title = "Both errors"
     rows: list[list[Cell]] = []
@@ -657,12 +665,15 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
 
 
 def filter_state(exponent: float) -> str:
-    """Label of a negative exponent: -1 is an impulse, lower ones are its derivatives."""
+    """Return a label for an initial term of negative exponent: -1 is an impulse, -2 its derivative, and so on.
+
+    These terms represent the initial state of a sensor filter.
+    """
     return f"filter's state {round(-exponent)}"
 
 
 def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the simulations") -> Table | None:
-    """Return initial terms by run and output, or None where every run starts at rest."""
+    """Return a table of the initial terms by run and output; None if every run starts at rest."""
     rows: list[list[Cell]] = [
         [name, symbol_html(output), Exact(exponent) if exponent > -1 else filter_state(exponent), value]
         for (name, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True)
@@ -687,7 +698,7 @@ def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms o
 
 
 def warnings_html(warnings: Sequence[str]) -> Markup:
-    """Return warnings as an HTML list, or empty markup."""
+    """Return warnings as an HTML list; empty markup without warnings."""
     if not warnings:
         return Markup("")
     items = Markup("").join(Markup("<li>{}</li>").format(w) for w in warnings)
@@ -695,5 +706,5 @@ def warnings_html(warnings: Sequence[str]) -> Markup:
 
 
 def comparison_html(comparison: Comparison) -> str:
-    """Return both errors of every run, warnings first."""
+    """Return HTML with the warnings of a comparison and a table of both errors of every run."""
     return str(warnings_html(comparison.warnings) + errors_table([("compared", comparison)]).to_html())

@@ -1,4 +1,4 @@
-"""Data advice: checks of a run for faults and poor excitation before estimation, and signal statistics."""
+"""Checks of measured data before estimation: faults, poor excitation, and signal statistics."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ MIN_UNDECIDED_RATIO = 3.0
 
 @dataclass(frozen=True)
 class Advice:
-    """Findings about the data of a run before estimation; empty if the checks find nothing.
+    """Findings on the data of a run before estimation; empty if the checks find no fault.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class Advice:
         return len(self.findings)
 
     def to_dict(self) -> list[dict[str, Any]]:
-        """Return a dictionary for JSON."""
+        """Return the findings as a list of dictionaries for JSON."""
         return [f.to_dict() for f in self.findings]
 
     def __str__(self) -> str:
@@ -154,7 +154,7 @@ def _times(count: int) -> str:
 
 
 def _true_intervals(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Start indices and lengths of the intervals of consecutive true values."""
+    """Return the start indices and the lengths of all intervals of consecutive True values."""
     edges = np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))
     starts = np.flatnonzero(edges == 1)
     return starts, np.flatnonzero(edges == -1) - starts
@@ -175,7 +175,7 @@ def _constant(run: Run, name: str) -> Finding:
 
 
 def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
-    """Report the longest interval over which an output is exactly constant although it varies elsewhere."""
+    """Yield a finding on the longest interval over which an output is constant although it varies elsewhere."""
     y = run[name]
     still = np.diff(y) == 0
     starts, lengths = _true_intervals(still)
@@ -225,7 +225,7 @@ def _quantum(y: Floats) -> float:
 
 
 def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
-    """Whether an interval of equal values clips a moving signal: the signal is steep just before and after it."""
+    """Whether a signal is steep just before and after an interval of equal values, which shows clipping."""
     moving = np.abs(np.diff(y))
     typical = float(np.median(moving[moving > 0])) if np.any(moving > 0) else 0.0
     # A slow turning point that ends with an input step is steep on one side only.
@@ -319,13 +319,13 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
 
 
 def _jumps_near(u: Floats, at: int) -> bool:
-    """Whether an input moves by more than the share of its range that a wrap has, within a row of this one."""
+    """Whether an input jumps within one row of row `at`, by at least the share of its range that an angle wrap has."""
     near = np.abs(np.diff(u[at - 1 : at + 3]))
     return bool(np.any(near > WRAP_SHARE * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
-    """Number of spectral lines of an input, and the bin of the largest one."""
+    """Return the number of spectral lines of an input, and the FFT bin of the largest one."""
     x = u - np.mean(u)
     phase = 2 * np.pi * np.arange(x.size) / x.size
     window = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
@@ -351,10 +351,11 @@ def _excitation(run: Run, inputs: list[str]) -> Iterator[Finding]:
 
 
 def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
-    """Compare the number of spectral lines of the inputs with the free parameters of each equation.
+    """Yield a finding on each equation with more free parameters than the spectral lines of its inputs identify.
 
-    In steady state one spectral line identifies two parameters of each output it excites, and a constant level one.
-    Equations with friction or non-linear terms are skipped: their response contains harmonics of the input lines.
+    In steady state, one spectral line identifies two parameters of each output that it excites, and a constant level
+    identifies one. Equations with friction or nonlinear terms are skipped, because their response has harmonics of the
+    input lines.
     """
     run = run.with_interpolated_gaps()
     for item in structure.equations:
@@ -403,7 +404,10 @@ def _offset(run: Run, name: str) -> Iterator[Finding]:
 
 
 def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
-    """Test each output for a linear trend that first-order lags and integrals of the inputs do not explain."""
+    """Yield a finding on each output with a linear trend that the inputs do not explain.
+
+    First-order lags and integrals of the inputs are the regressors.
+    """
     m = min(DRIFT_PULSES, run.length - 1)
     if m < 4 * DRIFT_BLOCKS:
         return
@@ -438,7 +442,10 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
 
 
 def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
-    """Yield for each input the output that it answers most, by the test that residuals get."""
+    """Yield a finding on each input that depends on past outputs, with the output on which it depends most.
+
+    The test is the feedback test of residuals; see :func:`feedback_test`.
+    """
     rows = min(run.length, MAX_FEEDBACK_SAMPLES)
     signals = {name: run[name][:rows] for name in (*inputs, *outputs)}
     for u in inputs:
@@ -456,7 +463,7 @@ def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Findi
 
 @dataclass(frozen=True)
 class SignalFigures:
-    """Statistics of one signal, in its SI unit.
+    """Statistics of one signal in SI units.
 
     Parameters
     ----------
@@ -467,14 +474,14 @@ class SignalFigures:
     noise
         Standard deviation of the measurement noise, estimated from second differences.
     quantum
-        Smallest nonzero change between two samples (quantization step); 0 without one, and for an input under a
-        zero-order hold, whose values are commands and have no rounding error.
+        Quantization step: the smallest nonzero change between samples. 0 if there is none, and for a zero-order-hold
+        input, whose values are exact commands.
     at_extremes
-        Share of samples at the lowest or highest value: saturation or a two-level signal.
+        Fraction of samples at the lowest or highest value. A large fraction shows saturation or a two-level signal.
     constant
         Whether all samples are equal.
     at_rest
-        Whether the signal starts at zero within its noise.
+        Whether the first samples are zero within the noise.
     """
 
     name: str
@@ -494,7 +501,7 @@ class SignalFigures:
 
 @dataclass(frozen=True)
 class Inspection:
-    """Statistics of all signals of a run, with warnings.
+    """Statistics of all signals of a run, with findings about the data.
 
     Parameters
     ----------
@@ -517,11 +524,11 @@ class Inspection:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings, without the name of the run."""
+        """Findings as sentences, without the name of the run."""
         return tuple(f.sentence for f in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the statistics as a dictionary for JSON."""
         return attributes(self, ("run", "rows", "step", "duration", "signals", "findings", "warnings"))
 
     def __str__(self) -> str:
@@ -542,7 +549,7 @@ class Inspection:
 
 
 def inspect_run(run: Run) -> Inspection:
-    """Compute ranges, noise, quantization and rest of every signal of a run.
+    """Compute range, noise, quantization and initial rest of every signal of a run.
 
     Parameters
     ----------
@@ -552,7 +559,7 @@ def inspect_run(run: Run) -> Inspection:
     Returns
     -------
     Inspection
-        Prints as a table.
+        Statistics that print as a table.
     """
     signals = [_figures(run, name) for name in run.signals]
     findings = data_notes(run)
@@ -563,7 +570,7 @@ def inspect_run(run: Run) -> Inspection:
 
 
 def data_notes(run: Run) -> list[Finding]:
-    """Return how a run was read and processed as findings, and whether its rig stopped it."""
+    """Return notes, as findings, on how a run was read and processed, and on whether the rig stopped it."""
     notes = [make_finding("data_note", run=run.name, text=text) for text in run.warnings]
     faults = run.metadata.get("faults")
     if not (isinstance(faults, list) and faults):

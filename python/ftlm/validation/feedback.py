@@ -1,4 +1,4 @@
-"""Feedback test: whether an input answers what an output did before, by Granger's direction of causality."""
+"""Feedback test: whether an input depends on past values of an output (Granger causality)."""
 
 from __future__ import annotations
 
@@ -60,29 +60,30 @@ RIDGE_SHARE = 1e-10
 
 @dataclass(frozen=True)
 class FeedbackTest:
-    """Test whether an input depends on past values of an output (feedback).
+    """Result of the test whether an input depends on past values of an output (feedback).
 
     Parameters
     ----------
     state
-        ``"command"``: the input repeats itself, has few levels, or is determined by its own past. ``"none"``: no
-        feedback. ``"found"``: past outputs explain innovations of the input, as they do if it was measured with noise.
-        ``"undecided"``: see ``reason``.
+        Conclusion. ``"command"``: the input was generated in open loop, because it repeats itself, has few levels, or
+        is determined by its own past. ``"none"``: no feedback. ``"found"``: past outputs explain innovations of the
+        input; noise on the measured input has the same effect. ``"undecided"``: see ``reason``.
     reason
-        Reason in words; empty if there is none.
+        Reason for the conclusion as text; empty if there is none.
     ratio
-        Statistic over its limit in an open loop (99.5 % over all sets of regressors).
+        Test statistic divided by its limit: the 99.5 % quantile in open loop, over all sets of regressors.
     share
         Share of the variance of the input's innovation that past outputs explain.
     rows
-        Rows that were tested.
+        Number of samples that were tested.
     bias
-        Largest bias of a parameter by the feedback, in its standard errors; None if it is not known.
+        Largest bias that the feedback causes in a parameter, in standard errors of the parameter; None if unknown.
     same_row
-        Correlation between the innovations of input and output in the same row, relative to its 99.5 % limit, with its
-        sign. Feedback within the row and direct feedthrough both cause it.
+        Correlation between the innovations of input and output in the same sample, divided by its 99.5 % limit, with
+        its sign. Feedback without delay and direct feedthrough both cause it.
     response
-        Part of the input that past residuals explain, one array per run in the unit of the input; empty unless found.
+        Part of the input that past residuals explain, one array per run in the unit of the input; empty without
+        feedback.
     """
 
     state: FeedbackState
@@ -96,11 +97,11 @@ class FeedbackTest:
 
     @property
     def has_feedback(self) -> bool:
-        """Whether the input depends on past outputs."""
+        """Whether the test found that the input depends on past outputs."""
         return self.state == "found"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the result as a dictionary for JSON."""
         return attributes(self, ("state", "reason", "has_feedback", "ratio", "share", "rows", "bias"))
 
 
@@ -120,9 +121,9 @@ def feedback_test(
     residuals
         Residuals of the output, or the output itself, one array per run; NaN marks a missing sample.
     signal
-        The input.
+        Input, one array per run.
     others
-        Other inputs, whose past and present may explain the input.
+        Other inputs, each with one array per run. Their past and present values are regressors of the input.
     """
     runs = [k for k, u in enumerate(signal) if u.size >= MIN_FEEDBACK_ROWS]
     longest = sum(signal[k].size for k in runs)
@@ -188,7 +189,7 @@ def feedback_test(
 
 
 def _fill_missing(residuals: Floats) -> Floats:
-    """Return residuals with their mean at missing samples, which only reduces the power of the test."""
+    """Return residuals with missing samples replaced by the mean, which only reduces the power of the test."""
     is_missing = np.isnan(residuals)
     return (
         np.where(is_missing, np.mean(residuals[~is_missing]), residuals)
@@ -198,13 +199,16 @@ def _fill_missing(residuals: Floats) -> Floats:
 
 
 def _has_clock(changes: Sequence[NDArray[np.intp]]) -> bool:
-    """Whether changes fall on a grid of at least two rows, as those of a generated signal do."""
+    """Whether all changes of a signal fall on multiples of at least two rows, as for a generated signal.
+
+    `changes` are the rows of the changes in each run.
+    """
     gaps = np.concatenate([np.diff(c) for c in changes])
     return bool(gaps.size >= MAX_COMMAND_LEVELS and np.gcd.reduce(gaps) > 1)
 
 
 def _repeats(u: Floats) -> bool:
-    """Whether an input repeats itself exactly after at most half of the run."""
+    """Whether an input is exactly periodic, with a period of at most half the run."""
     x = u - u.mean()
     count = x.size
     power = np.abs(np.fft.rfft(x, 2 * count)) ** 2
@@ -215,13 +219,13 @@ def _repeats(u: Floats) -> bool:
 
 
 def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
-    """Columns of values ``first`` to ``last`` rows back, for rows from ``start`` on."""
+    """Return lagged values as columns, at lags ``first`` to ``last``, for rows from ``start`` on."""
     windows = sliding_window_view(x, last - first + 1)
     return windows[start - last : x.size - last][:, ::-1]
 
 
 def _line_regressors(u: Floats) -> list[Floats]:
-    """Return cosines and sines of the spectral lines of an input, which no number of lags can predict."""
+    """Return cosines and sines at the spectral lines of an input, which lags cannot predict."""
     count = u.size
     size = 1 << math.ceil(math.log2(8 * count))
     window, time, x = np.hanning(count - 1), np.arange(count), u - u.mean()
@@ -247,7 +251,10 @@ def _line_regressors(u: Floats) -> list[Floats]:
 
 
 def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
-    """Return the residual of a weighted regression of the targets on the past: small ridge, one refinement step."""
+    """Return the residual of a weighted ridge regression of the targets on the past.
+
+    The ridge is small, and one refinement step corrects it.
+    """
     weighted = past if weights is None else past * weights[:, None]
     gram = weighted.T @ past
     gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
@@ -258,7 +265,7 @@ def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -
 
 
 def _score_ratio(innovation: Floats, columns: Floats) -> float:
-    """Self-normalized score statistic over its limit."""
+    """Return the self-normalized score statistic of an innovation and regressors, divided by its limit."""
     score = columns.T @ innovation
     products = columns * innovation[:, None]
     spread = products.T @ products
@@ -268,7 +275,7 @@ def _score_ratio(innovation: Floats, columns: Floats) -> float:
 
 
 def _local_color(w: Floats, lags: int = 4) -> float:
-    """Mean squared correlation over short blocks, over its limit for white noise."""
+    """Return the mean squared autocorrelation over short blocks, divided by its limit for white noise."""
     count = w.size // LOCAL_ROWS
     if count < 4:
         return 0.0
@@ -280,7 +287,7 @@ def _local_color(w: Floats, lags: int = 4) -> float:
 
 
 def _local_past(w: Floats, past: Floats) -> float:
-    """Mean share of an innovation that the two last inputs explain over short blocks, over its limit."""
+    """Return the share of an innovation that the last two inputs explain over short blocks, divided by its limit."""
     count = w.size // LOCAL_ROWS
     if count < 1:
         return 0.0
@@ -296,7 +303,7 @@ def _local_past(w: Floats, past: Floats) -> float:
 
 
 class _Innovations:
-    """Innovations of an input and of an output over several runs, and the tests on them."""
+    """Innovations of an input and of an output over several runs, with the feedback test on them."""
 
     def __init__(self, missed: list[Floats], moves: list[Floats], others: list[list[Floats]], *, shift: int) -> None:
         shortest = min(u.size for u in moves)
@@ -342,7 +349,10 @@ class _Innovations:
         self.slow = self._stack_rows([np.convolve(e, memory)[: e.size] for e in outputs])
 
     def _clip_outliers(self, missed: list[Floats]) -> list[Floats]:
-        """Residuals about their mean in units of their deviation, without far outliers, which cost power alone."""
+        """Return residuals, centered and divided by their standard deviation, with far outliers clipped.
+
+        Outliers only reduce the power of the test.
+        """
         every = np.concatenate([e - e.mean() for e in missed])
         size = float(np.std(every)) or 1.0
         middle = float(np.median(every)) / size
@@ -353,7 +363,7 @@ class _Innovations:
         return np.concatenate([x[self.start :] for x in series])
 
     def _block_diagonal(self, columns: Sequence[Sequence[Floats]]) -> list[Floats]:
-        """Columns of each run, zero on the other runs."""
+        """Return columns that are nonzero in one run each, so that every run has its own coefficients."""
         out = []
         for (first, last), own in zip(self.places, columns, strict=True):
             for column in own:
@@ -363,7 +373,7 @@ class _Innovations:
         return out
 
     def _rows(self, offset: int) -> NDArray[np.intp]:
-        """Rows that have a past so far back in their own run."""
+        """Return the rows whose past within the same run reaches back far enough."""
         skip = max(INNOVATION_COUNTS) + 2 + offset
         return np.concatenate([np.arange(min(first + skip, last), last) for first, last in self.places])
 
@@ -376,7 +386,10 @@ class _Innovations:
         return np.column_stack([now, now - self.residuals[rows - lag - 1], self.slow[rows - lag], *innovations])
 
     def _ratio(self, offset: int, clipped: Floats) -> tuple[float, Floats, NDArray[np.intp]]:
-        """Largest statistic over its limit, its columns and rows, with outputs so many rows further back."""
+        """Return the largest statistic over its limit, with its regressors and rows.
+
+        `offset` is an additional delay of the outputs in samples.
+        """
         rows = self._rows(offset)
         # Through the same weights, so that the score is orthogonal to what was estimated.
         columns = _project_out(self.past[rows], self._regressors(rows, offset), self.weights[rows])
@@ -388,7 +401,7 @@ class _Innovations:
         return ratios[best], sets[best], rows
 
     def test(self) -> FeedbackTest:
-        """Run the test and the gates that an innovation must pass."""
+        """Return the result of the feedback test, after checks that the innovation is suitable."""
         count = self.inputs.size
         clipped = np.clip(self.innovation / max(self.scale, 1e-300), -INPUT_CLIP, INPUT_CLIP)
         clipped = clipped - clipped.mean()
@@ -439,10 +452,10 @@ class _Innovations:
         return result("found")
 
     def _present_ratio(self, clipped: Floats) -> float:
-        """Statistic over its limit of the output's innovation of the same row, with the sign of the correlation.
+        """Return the statistic of the output innovation in the same sample, divided by its limit, with its sign.
 
-        The past of the input of an integral controller contains the past outputs already, so that they explain no more
-        of it.
+        It detects integral control, where the past input already contains the past outputs, so that they explain
+        nothing more.
         """
         size = max(robust_deviation(self.present), 1e-300)
         present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)
@@ -451,9 +464,10 @@ class _Innovations:
         return math.copysign(ratio, float(clipped @ column[:, 0]))
 
     def _ratio_with_noisy_input(self, rows: NDArray[np.intp]) -> float:
-        """Least ratio if the measured input had noise: corrected least squares, over shares of the largest noise.
+        """Return the smallest statistic over its limit under the hypothesis that the input was measured with noise.
 
-        What acted on the machine is known better by its output than by the input's own noisy past.
+        Corrected least squares are computed for several noise levels of the input. If the input is noisy, the output
+        reveals the true past input better than its measurement, which can look like feedback.
         """
         past, y = self.past[rows], self.inputs[rows]
         weighted = past * self.weights[rows][:, None]
@@ -481,9 +495,11 @@ class _Innovations:
         return least
 
     def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
-        """Part of the input that answers the output, by run: its innovations through the input's own past.
+        """Return the part of the input that the feedback explains, one array per run.
 
-        Where an answer was found, what the input shares with the residual of the same row is an answer, too.
+        The explained innovations are filtered by the dependence of the input on its own past.
+
+        The part that is correlated with the residual of the same sample counts as feedback, too.
         """
         now = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
         columns = np.column_stack([columns, now / max(float(np.linalg.norm(now)), 1e-300)])

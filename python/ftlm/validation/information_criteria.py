@@ -15,18 +15,21 @@ from ftlm.validation.residual_tests import Residuals
 
 @dataclass(frozen=True)
 class InformationCriteria:
-    """Information criteria of a model: fit minus a penalty per parameter; lower is better on the same runs.
+    """Information criteria of a model: negative log likelihood plus a penalty per parameter; lower is better.
+
+    They compare models of the same runs.
 
     Parameters
     ----------
     parameters
         Number of estimated parameters: orders, coefficients, initial terms, and one noise level per output.
     samples
-        Residuals in all outputs and runs.
+        Number of residuals over all outputs and runs.
     log_likelihood
-        Of the residuals as white normal noise.
+        Log likelihood of the residuals as white normal noise.
     aic, aicc, bic
-        Akaike's criterion, the same corrected for few samples (infinite where there are too few), Schwarz's.
+        Akaike's criterion, Akaike's criterion corrected for few samples (infinite if there are too few), and Schwarz's
+        criterion.
     """
 
     parameters: int
@@ -37,7 +40,7 @@ class InformationCriteria:
     bic: float
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """Return a dictionary for JSON."""
+        """Return the criteria as a dictionary for JSON."""
         return attributes(self, ("parameters", "samples", "log_likelihood", "aic", "aicc", "bic"))
 
     def __str__(self) -> str:
@@ -49,29 +52,29 @@ class InformationCriteria:
 
 @check_arguments
 def information_criteria(tests: Residuals, parameters: int) -> InformationCriteria:
-    """Return AIC, AICc and BIC of a model from its residuals; orders count like coefficients.
+    """Return AIC, AICc and BIC of a model from its residuals; free orders count like coefficients.
 
     Parameters
     ----------
     tests
-        From :func:`ftlm.resid` on the runs that the model was identified from.
+        Result of :func:`ftlm.resid` on the runs that the model was identified from.
     parameters
-        Free orders and free coefficients; initial terms and noise levels are added here.
+        Number of free orders and free coefficients. The function adds initial terms and noise levels.
 
     Returns
     -------
     InformationCriteria
-        Comparable between models of the same outputs on the same runs. Correlated residuals exaggerate the
-        significance of differences.
+        Criteria that are comparable between models of the same outputs on the same runs. Correlated residuals
+        exaggerate the differences.
 
     Raises
     ------
     ModelError
-        An invalid number of parameters.
+        If the number of parameters is not a nonnegative integer.
 
     Notes
     -----
-    doi:10.1109/TAC.1974.1100705, doi:10.1093/biomet/76.2.297, doi:10.1214/aos/1176344136.
+    AIC: doi:10.1109/TAC.1974.1100705. AICc: doi:10.1093/biomet/76.2.297. BIC: doi:10.1214/aos/1176344136.
     """
     count = check_integer("parameters", parameters, 0)
     counts = {name: sum(drop_missing(r).size for r in output.residuals) for name, output in tests.outputs.items()}
@@ -86,7 +89,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
 
 
 def criteria_of_likelihood(log_likelihood: float, parameters: int, samples: int) -> InformationCriteria:
-    """Return AIC, AICc and BIC from a log likelihood, and the numbers of all estimated parameters and samples."""
+    """Return AIC, AICc and BIC from a log likelihood, the number of estimated parameters and the number of samples."""
     k = parameters
     aic = 2 * k - 2 * log_likelihood
     degrees_of_freedom = samples - k - 1
@@ -95,7 +98,7 @@ def criteria_of_likelihood(log_likelihood: float, parameters: int, samples: int)
 
 
 def information_table(information: InformationCriteria) -> Table:
-    """Return AIC, AICc and BIC with the numbers of parameters and samples."""
+    """Return a table of AIC, AICc, BIC, and the numbers of parameters and samples."""
     criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
     # Differences count, not sizes: all digits before the point.
     rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]

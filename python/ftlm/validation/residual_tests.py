@@ -1,4 +1,4 @@
-"""Residual tests: whiteness, independence of the inputs, feedback."""
+"""Residual tests: whiteness, independence from the inputs, and feedback."""
 
 from __future__ import annotations
 
@@ -53,24 +53,24 @@ SENSITIVITY_RANK_TOLERANCE = 1e-10
 
 @dataclass(frozen=True)
 class CorrelationTest:
-    """Correlations of residuals, and a test whether they are significant.
+    """Auto- or cross-correlations of residuals, with a test of their significance.
 
     Parameters
     ----------
     lags
-        Lags in samples; at a lag k > 0 the residual is k samples later than the other signal.
+        Lags in samples. At a lag k > 0, the residual is k samples later than the other signal.
     values
         Correlation at each lag.
     band
-        Half-width of the 99 % band of one correlation.
+        Half-width of the 99 % confidence band of a single correlation.
     statistic, limit
         Test statistic and its 99 % limit for a true model. Whiteness: the sum over all positive lags.
         Independence: the largest correlation at lags >= 0, against a simultaneous band for all of them.
     passed
         Whether the test is conclusive and the statistic within its limit; False if the residuals are not finite.
     conclusive
-        Whether the test could fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant.
-        Then it has neither passed nor failed.
+        Whether the test can fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant;
+        the test then neither passes nor fails.
     first
         Smallest tested lag: 1 if only the correlation at lag 0 exceeds the limit, otherwise 0.
     """
@@ -91,12 +91,12 @@ class CorrelationTest:
 
     @property
     def verdict(self) -> str:
-        """Result as text: ``"passed"``, ``"failed"`` or ``"undecided"``."""
+        """Conclusion as text: ``"passed"``, ``"failed"`` or ``"undecided"``."""
         return "undecided" if not self.conclusive else "passed" if self.passed else "failed"
 
     @property
     def outside(self) -> int:
-        """Number of correlations outside the band (lag 0 of an autocorrelation not counted); 1 % are expected."""
+        """Number of correlations outside the band, without lag 0 of an autocorrelation; 1 % are expected."""
         return int(np.sum((np.abs(self.values) > self.band) & (self.values != 1.0)))
 
     @property
@@ -107,14 +107,14 @@ class CorrelationTest:
         return int(self.lags[at]), float(self.values[at])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the test as a dictionary for JSON."""
         rows = {"lags": self.lags.tolist(), "values": json_value(self.values.tolist())}
         return rows | attributes(self, ("band", "statistic", "limit", "passed", "conclusive"))
 
 
 @dataclass(frozen=True)
 class OutputResiduals:
-    """Residuals of one output over all runs.
+    """Residuals of one output over all runs, with the tests on them.
 
     Parameters
     ----------
@@ -128,13 +128,14 @@ class OutputResiduals:
     whiteness
         Test of the autocorrelations.
     inputs
-        Test of the cross-correlations with each input. Both signals pass the whitening filter of the residuals.
+        Tests of the cross-correlations with each input, by name. Both signals are filtered by the whitening filter of
+        the residuals.
     feedback_tests
         Feedback test of each input of the equation.
     direction
         Test of the cross-correlations with the sign of the simulated velocity; None for equations with friction.
     sign_slope
-        Slope of tanh in the friction term of the output; infinite for sign(D y), the term of an order above 1.
+        Slope s of the friction term tanh(s y) that `direction` tests; infinite for the term sign(D y).
     """
 
     residuals: list[Floats]
@@ -148,7 +149,7 @@ class OutputResiduals:
 
     @property
     def follows_direction(self) -> bool:
-        """Whether residuals depend on the direction of motion, but not on an input, and no feedback was found."""
+        """Whether residuals depend on the direction of motion but not on an input, without feedback."""
         return self.direction is not None and self.direction.failed and self.is_noise and not self.feedback
 
     @property
@@ -158,12 +159,12 @@ class OutputResiduals:
 
     @property
     def has_colored_correlation(self) -> bool:
-        """Whether the residuals are finite, not white, and correlated with an input."""
+        """Whether the residuals are finite, colored, and correlated with an input."""
         return math.isfinite(self.rms) and not self.whiteness.passed and any(t.failed for t in self.inputs.values())
 
     @property
     def is_noise(self) -> bool:
-        """Whether the residuals are uncorrelated with every input that varies, as far as the tests are conclusive."""
+        """Whether no conclusive test shows a correlation of the residuals with a varying input."""
         return all(test.passed for test in self.informative_tests.values())
 
     @property
@@ -172,14 +173,14 @@ class OutputResiduals:
         return {n: t for n, t in self.inputs.items() if t.conclusive or not math.isnan(t.limit)} or self.inputs
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return residual statistics and tests as a dictionary for JSON."""
         tests = attributes(self, ("rms", "nr", "whiteness", "inputs", "feedback"))
         return tests | {"loops": json_value(self.feedback_tests)}
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residual tests of a model on runs.
+    """Results of the residual tests of a model on some runs.
 
     Parameters
     ----------
@@ -190,7 +191,7 @@ class Residuals:
     step
         Sampling step of each run [s].
     refinement
-        Pulses per sampling interval of the simulation.
+        Number of block pulses per sampling interval in the simulation.
     initial_terms
         Number of initial terms that were fitted to these runs.
     """
@@ -203,17 +204,20 @@ class Residuals:
 
     @property
     def white(self) -> dict[str, bool]:
-        """Whether the residuals of each output could be white noise."""
+        """Result of the whiteness test by output; True if the residuals may be white noise."""
         return {name: output.whiteness.passed for name, output in self.outputs.items()}
 
     @property
     def independent(self) -> dict[str, bool]:
-        """Whether the residuals of each output are independent of all earlier inputs; False if inconclusive."""
+        """Result of the independence test by output; True if the residuals are uncorrelated with all earlier inputs.
+
+        False if the test is inconclusive.
+        """
         return {name: all(t.passed for t in output.informative_tests.values()) for name, output in self.outputs.items()}
 
     @property
     def tests(self) -> list[tuple[str, str, CorrelationTest]]:
-        """Every test with its output and its input, which is empty for whiteness."""
+        """All tests as (output, input, test); the input is empty for a whiteness test."""
         return [
             (name, signal, test)
             for name, output in self.outputs.items()
@@ -222,7 +226,7 @@ class Residuals:
 
     @property
     def independence(self) -> dict[str, str]:
-        """Independence of the residuals of each output: ``"yes"``, ``"no"`` or ``"undecided"``."""
+        """Result of the independence test by output as text: ``"yes"``, ``"no"`` or ``"undecided"``."""
         return {
             name: "no" if any(t.failed for t in output.inputs.values()) else "yes" if free else "undecided"
             for (name, output), free in zip(self.outputs.items(), self.independent.values(), strict=True)
@@ -234,23 +238,26 @@ class Residuals:
 
     @property
     def passed(self) -> bool:
-        """Whether all residuals pass both tests; False if one is inconclusive, constant inputs excepted."""
+        """Whether the residuals of all outputs pass both tests.
+
+        False if a test is inconclusive, except for constant inputs.
+        """
         return all(test.passed for test in self._informative_tests)
 
     @property
     def conclusive(self) -> bool:
-        """Whether every test is conclusive, constant inputs excepted, or one has failed."""
+        """Whether one test has failed or every test is conclusive, except for constant inputs."""
         return any(test.failed for test in self._informative_tests) or all(
             test.conclusive for test in self._informative_tests
         )
 
     @property
     def verdict(self) -> str:
-        """Result as text: ``"passed"``, ``"FAILED"`` if one test has failed, or ``"undecided"``."""
+        """Conclusion as text: ``"passed"``, ``"FAILED"`` if one test has failed, or ``"undecided"``."""
         return "passed" if self.passed else "FAILED" if self.conclusive else "undecided"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the results as a dictionary for JSON."""
         return attributes(self, ("passed", "conclusive", "runs", "refinement", "outputs"))
 
     def __str__(self) -> str:
@@ -279,10 +286,10 @@ DEFAULT_LAGS = 25
 
 @check_arguments
 def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) -> Residuals:
-    """Test whether the residuals of a simulation are white, and independent of the inputs.
+    """Test whether the residuals of a simulation are white and independent of the inputs.
 
-    Residuals are measured minus simulated samples, with initial terms and offsets fitted to each run, on a grid refined
-    until converged. Each run is centered about its own mean; runs are pooled.
+    Residuals are measured minus simulated samples. Initial terms and offsets are fitted to each run, and the time step
+    is refined until converged. The mean of each run is subtracted before the runs are pooled.
 
     Parameters
     ----------
@@ -291,33 +298,33 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     runs
         One run or several with the same names and units, each of at least ``2 * lags + 3`` rows.
     lags
-        Largest lag in samples; the default is the convention of the field.
+        Largest lag in samples; 25 by default, as in Ljung's book.
 
     Returns
     -------
     Residuals
-        Its attribute ``passed`` covers both tests; it prints as a table.
+        Test results, which print as a table. ``passed`` is True if both tests pass.
 
     Raises
     ------
     DataError
-        Runs that do not fit the model, or are too short for these lags.
+        If runs lack a signal of the model or are too short for these lags.
     ModelError
-        An invalid number of lags, an equation that cannot be solved for its output.
+        If the number of lags is invalid, or an equation cannot be solved for its output.
 
     Notes
     -----
-    Whiteness: the statistic is the sum over all lags k of (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)², its limit the 99 % quantile of
-    χ² (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). The variance of the noise may change within a run.
-    The 99 % band of one autocorrelation of white noise is ±2.576/√N.
+    Whiteness: the statistic is the sum over all lags k of (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)², and its limit is the 99 %
+    quantile of χ² (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). The variance of the noise may change
+    within a run. The 99 % band of one autocorrelation of white noise is ±2.576/√N.
 
-    Independence: residuals and input pass the filter that whitens the residuals, an autoregression whose order
-    minimizes the Bayesian information criterion. Without it, chance correlations of two slow signals hide a missing
-    dead time (Box and Jenkins, chapter 11). The statistic is the largest correlation at lags >= 0, its limit the
-    simultaneous 99 % band of all of them (Šidák). The variance of one correlation of independent signals is Bartlett's
-    Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), but at least that for white residuals, and at least the mean of Σ eₜ² uₜ₋ₖ²
-    over all lags, which allows for noise that grows with the input. If the model has no feedthrough and only lag 0 is
-    outside, feedback or feedthrough within one sample explains it, and the other lags decide.
+    Independence: residuals and input are filtered by the whitening filter of the residuals, an autoregression whose
+    order minimizes BIC. Without it, chance correlations of two slow signals hide a missing dead time (Box and Jenkins,
+    chapter 11). The statistic is the largest correlation at lags >= 0, and its limit is the simultaneous 99 % band of
+    all of them (Šidák). The variance of one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N
+    (doi:10.2307/2983611), but at least that for white residuals, and at least the mean of Σ eₜ² uₜ₋ₖ² over all lags,
+    which allows for noise that grows with the input. If the model has no feedthrough and only lag 0 is outside the
+    band, feedback or feedthrough within one sample explains it, and only the other lags are tested.
 
     A test with a limit above 1 or with a constant input is inconclusive. Feedback: see :class:`ftlm.FeedbackTest`.
     """
@@ -348,10 +355,11 @@ def run_residual_tests(
     lags: int,
     sensitivities: Callable[[], Mapping[str, list[Floats]]] | None = None,
 ) -> Residuals:
-    """Run both tests on the residuals of simulations at the inner samples of these runs.
+    """Run whiteness, independence and feedback tests on the residuals of finished simulations of runs.
 
-    ``sensitivities`` returns, by output, the sensitivities to the fitted parameters, one array per run with shape
-    (parameters, samples). It is called only if colored residuals are correlated with an input.
+    The first and last sample of each run are omitted. ``sensitivities`` is a function that returns, by output, the
+    sensitivities to the fitted parameters, one array per run with shape (parameters, samples). It is called only if
+    colored residuals are correlated with an input.
     """
     check_run_lengths(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
@@ -394,7 +402,7 @@ def _test_output(
     commands: Mapping[str, bool],
     run_inputs: Sequence[str],
 ) -> OutputResiduals:
-    """Run all tests of one output without its missing samples; they fail if residuals are not finite.
+    """Run all tests of one output on its residuals without missing samples; tests fail if residuals are not finite.
 
     ``commands`` states for each input of the equation whether the model has direct feedthrough from it.
     """
@@ -425,7 +433,10 @@ def _test_output(
 
 
 def _test_direction(output: OutputResiduals, velocities: Sequence[Floats], lags: int, order: float) -> OutputResiduals:
-    """Test whether residuals depend on the sign of a simulated velocity, as they do if dry friction is missing."""
+    """Return the residuals of an output with a test of their dependence on the sign of a simulated velocity.
+
+    Missing dry friction causes such a dependence.
+    """
     largest = max(float(np.max(np.abs(v))) for v in velocities)
     if not 0.0 < largest < math.inf:
         return output
@@ -440,10 +451,10 @@ def _test_beyond_parameters(
     signals: Mapping[str, list[Floats]],
     lags: int,
 ) -> OutputResiduals:
-    """Return the tests, where failures that errors of the parameters explain are passed.
+    """Return the tests of an output, in which failures that parameter errors explain count as passed.
 
-    Least squares ignores the color of the noise, so errors of the parameters alone can correlate residuals with an
-    input. One generalized least-squares step removes that part of the residuals.
+    The fit minimizes squared residuals and ignores the color of the noise, so parameter errors alone can correlate
+    residuals with an input. One generalized least-squares step removes that part of the residuals before the test.
     """
     inputs = dict(output.inputs)
     for name, test in output.inputs.items():
@@ -470,18 +481,19 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """AR noise model of residuals without their response to an input.
+    """Autoregressive noise model of residuals from which the response to an input is removed.
 
     Parameters
     ----------
     filter
         Whitening filter: coefficients 1, a₁, …, aₙ.
     start
-        Row of the first innovation.
+        Sample index of the first innovation.
     innovations
         Innovations of the noise, one array per run.
     inflation
-        Correction of the mean square of the innovations for the fitted coefficients: rows / (rows - coefficients).
+        Factor that corrects the mean square of the innovations for the fitted coefficients: samples / (samples -
+        coefficients).
     """
 
     filter: Floats
@@ -491,22 +503,22 @@ class NoiseModel:
 
     @classmethod
     def fit(cls, series: list[Floats], signal: list[Floats], lags: int) -> NoiseModel:
-        """Fit an ARX model to residuals and one input, and return its noise part; an AR model without a signal.
+        """Return the noise part of an ARX model fitted to residuals and one input; an AR model without an input.
 
-        An AR model of the residuals alone would include the response to a periodic or slow input, and so hide it.
-        Responses to other inputs count as noise.
+        An AR model of the residuals alone would also describe the response to a periodic or slow input, and its test
+        would not detect this response. Responses to other inputs count as noise.
         """
         through, start, innovations, parameters = _core.arx_model(series, [signal] if signal else [], lags)
         rows = sum(row.size for row in innovations)
         return cls(through, start, innovations, rows / max(rows - parameters, 1))
 
     def whiten(self, series: list[Floats]) -> list[Floats]:
-        """Return series after the whitening filter, from the first row of the innovations on."""
+        """Return series filtered by the whitening filter, from the sample of the first innovation on."""
         lead = self.start - (self.filter.size - 1)
         return [np.ascontiguousarray(row[lead:]) for row in whiten_series(series, self.filter)]
 
     def subtract(self, series: list[Floats], directions: Sequence[Floats]) -> list[Floats]:
-        """Return series without their projection onto directions, by generalized least squares.
+        """Return series minus their generalized least-squares projection onto directions.
 
         ``directions`` has one array per series, shape (directions, samples). If the numbers of samples differ, the
         series are returned unchanged.
@@ -525,7 +537,7 @@ class NoiseModel:
 def _independence(
     series: list[Floats], signal: list[Floats], noise: NoiseModel, lags: int, *, first: int
 ) -> CorrelationTest:
-    """Test the largest correlation at lags from ``first`` on against the simultaneous band of all of them."""
+    """Return the test of cross-correlations at lags from ``first`` on against a simultaneous 99 % band."""
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
         return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, conclusive=False)
@@ -546,7 +558,7 @@ def _independence(
 
 
 def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> float:
-    """Return the mean variance of the correlations at lags >= 0, from the squared products of both signals."""
+    """Return the mean variance of the cross-correlations at lags >= 0, from products of the squared signals."""
     powers = [(e * e, v * v) for e, v in zip(white, (v - v.mean() for v in signal), strict=True)]
     total = sum(float(e.sum()) for e, _ in powers) * sum(float(v.sum()) for _, v in powers)
     each = [sum(dot(e[k:], v[: e.size - k]) for e, v in powers if e.size > k) for k in range(lags + 1)]
@@ -554,14 +566,17 @@ def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> f
 
 
 def sign_tanh_slope(velocities: Sequence[Floats]) -> float:
-    """Return the slope of a tanh that replaces the sign of a measured velocity; infinite if it has one sign."""
+    """Return the slope s with which tanh(s v) replaces the sign of a measured velocity v.
+
+    It is infinite if the velocity never changes sign.
+    """
     low, high = (float(f([f(v) for v in velocities])) for f in (np.nanmin, np.nanmax))
     largest = max(-low, high)
     return SIGN_TANH_SLOPE / largest if min(-low, high) > MIN_REVERSAL_RATIO * largest else math.inf
 
 
 def friction_term(output: str, coefficient: str, tanh_slope: float = math.inf) -> str:
-    """Return the text of Coulomb friction that opposes D y, or y itself by a tanh if its slope is finite."""
+    """Return the text of a Coulomb friction term: ``sign(D y)``, or ``tanh(s y)`` for a finite slope s."""
     velocity = f"sign(D {output})" if math.isinf(tanh_slope) else f"tanh({tanh_slope:.3g} {output})"
     return f"- {coefficient}*{velocity}"
 
@@ -613,7 +628,7 @@ def feedback_finding(name: str, signal: str, output: OutputResiduals) -> Finding
 
 
 def residual_findings(tests: Residuals, *, floor: float = NEGLIGIBLE_RESIDUAL_RATIO) -> list[Finding]:
-    """Return findings on failed residual tests; outputs with an NR of at most ``floor`` are skipped."""
+    """Return findings on failed residual tests, except for outputs whose NR is at most ``floor``."""
     return failed_tests(replace(tests, outputs={n: o for n, o in tests.outputs.items() if not o.nr <= floor}))
 
 
