@@ -1,4 +1,4 @@
-"""Analysis of a model: frequency response, poles, modes, steady state, step response, and forms for other tools."""
+"""Analysis of a model: frequency response, poles, modes, steady state, time responses, and export to other tools."""
 
 from ftlm.analysis.conversion import control_text, export_text, json_text, matlab_text, to_ss, to_tf
 from ftlm.analysis.frequency_response import (

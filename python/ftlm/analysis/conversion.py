@@ -1,4 +1,4 @@
-"""Conversion of models to and from other tools: python-control, MATLAB with FOMCON, JSON."""
+"""Conversion of models from and to python-control, and to MATLAB with FOMCON and JSON."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ftlm.utils.validation import Floats
 
 
 def _comment(text: str, mark: str) -> str:
-    """Return a text as comment lines, so that no name can start a line of code."""
+    """Return a text as comment lines, so that a name with line breaks cannot inject code."""
     lines = re.split(r"[\r\n\u2028\u2029\x0b\x0c\x85]+", text)
     return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
@@ -52,7 +52,7 @@ def json_text(model: Model) -> str:
     Raises
     ------
     ModelError
-        An input that saturates or has a dead zone, or friction: there is no transfer function.
+        If an input has a saturation or a dead zone, or the model has friction, so that there is no transfer function.
     """
     check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
@@ -77,7 +77,7 @@ def json_text(model: Model) -> str:
 
 @check_arguments
 def matlab_text(model: Model) -> str:
-    """Return a MATLAB script with the transfer functions as vectors, and as FOMCON ``fotf`` objects if available.
+    """Return a MATLAB script that defines the transfer functions as vectors, and as FOMCON ``fotf`` objects.
 
     Parameters
     ----------
@@ -136,14 +136,14 @@ def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> 
     model
         A linear model.
     band
-        Frequencies (low, high) within which it is to hold [rad/s].
+        Frequency band (low, high) of the approximation [rad/s].
     order
-        Of Oustaloup's filter, 1 to 50.
+        Order of Oustaloup's filter, 1 to 50.
 
     Raises
     ------
     ModelError
-        As :func:`to_control`, which it does not need installed.
+        In the cases of :func:`to_control`, except that python-control need not be installed.
     """
     near = approximate(model, band=band, order=order)
 
@@ -176,7 +176,10 @@ def export_text(
     band: tuple[float, float] | None = None,
     order: int = 5,
 ) -> str:
-    """Return a model as text for another tool; raise ModelError for an unknown tool or a missing band."""
+    """Return a model as text for another tool: a Python script, a MATLAB script, or JSON.
+
+    Raise ModelError for an unknown tool or a missing band.
+    """
     if to == "json":
         return json_text(model)
     if to == "matlab":
@@ -202,7 +205,7 @@ _LABEL_PATTERN = re.compile(r"([A-Za-z]+)\[(\d+)\]")
 def to_tf(model: Model) -> Any:
     """Return a model of integer orders as a python-control TransferFunction, without approximation.
 
-    Delays of inputs are not part of it; see the attribute ``delay``.
+    Delays of inputs are not part of the transfer function; see the attribute ``delay``.
 
     Parameters
     ----------
@@ -212,19 +215,19 @@ def to_tf(model: Model) -> Any:
     Returns
     -------
     control.TransferFunction
-        With named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders is
-        included). Its attribute ``delay`` has the delay [s] of each input, which python-control's systems cannot have.
+        System with named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders
+        is included). Its attribute ``delay`` has the delay [s] of each input, which python-control cannot represent.
 
     Warns
     -----
     UserWarning
-        Where an input has a delay.
+        If an input has a delay.
 
     Raises
     ------
     ModelError
-        A fractional order, friction, an input with saturation or dead zone, an input that passes the sensor filter, or
-        python-control is not installed.
+        If an order is fractional, the model has friction, an input has a saturation, a dead zone or the sensor filter,
+        or python-control is not installed.
     """
     control = python_control()
     check_no_input_nonlinearity(model, "a transfer function")
@@ -245,31 +248,32 @@ def to_tf(model: Model) -> Any:
 def to_ss(model: Model, *, step: float | None = None) -> Any:
     """Return a model of integer orders as a python-control StateSpace, without approximation.
 
-    Its matrices ``A``, ``B``, ``C`` and ``D`` are those that ``scipy.signal.StateSpace`` takes.
+    ``scipy.signal.StateSpace`` accepts its matrices ``A``, ``B``, ``C`` and ``D``.
 
     Parameters
     ----------
     model
         A linear model of integer orders; equations are coupled.
     step
-        Sampling interval [s] of a system in discrete time, exact for inputs that are constant between samples. It
-        contains the delays of inputs, of any length, as states. None for continuous time.
+        Sampling interval [s] for a discrete-time system, which is exact for inputs that are constant between samples.
+        Delays of inputs, of any length, become states. None for continuous time.
 
     Returns
     -------
     control.StateSpace
-        With named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders is
-        included). In continuous time its attribute ``delay`` has the delay [s] of each input.
+        System with named inputs and outputs, from the inputs to the measured outputs (a sensor filter of integer orders
+        is included). In continuous time, its attribute ``delay`` has the delay [s] of each input.
 
     Warns
     -----
     UserWarning
-        Where an input has a delay, in continuous time.
+        If an input has a delay, in continuous time.
 
     Raises
     ------
     ModelError
-        As :func:`to_tf`; a step that is not positive; an input that acts before its sample, in discrete time.
+        In the cases of :func:`to_tf`, if the step is not positive, or if an input has a negative delay in discrete
+        time.
     """
     control = python_control()
     check_linear(model.equations, "a linear system in state space")
@@ -296,7 +300,7 @@ def to_ss(model: Model, *, step: float | None = None) -> Any:
 
 
 def _with_delay(system: Any, delay: Mapping[str, float]) -> Any:
-    """Return a system with the attribute `delay`, and warn about each."""
+    """Return a system with an attribute `delay`, and warn about each delay that is not 0."""
     system.delay = {name: seconds for name, seconds in delay.items() if seconds}
     for name, seconds in system.delay.items():
         warnings.warn(
@@ -309,7 +313,10 @@ def _with_delay(system: Any, delay: Mapping[str, float]) -> Any:
 
 
 def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...], Floats, Floats]:
-    """Return the filtered signals, numerator and denominator of the sensor filter; raise for a filtered input."""
+    """Return the filtered signals, numerator and denominator of the sensor filter.
+
+    Raise ModelError if an input is filtered.
+    """
     sensor = model.structure.sensor_filter
     if sensor is None:
         return (), np.ones(1), np.ones(1)
@@ -324,7 +331,10 @@ def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...]
 def _filter_output(
     a: Floats, b: Floats, c: Floats, d: Floats, output: int, top: Floats, bottom: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return a state space whose output passes top / bottom, in observer form; both have the same length."""
+    """Return a state space in which one output is filtered by top / bottom, in observer form.
+
+    `top` and `bottom` are polynomials with the same number of coefficients.
+    """
     count, own = bottom.size - 1, a.shape[0]
     top, bottom = top / bottom[0], bottom / bottom[0]
     shift = np.eye(count, k=1)
@@ -341,10 +351,10 @@ def _filter_output(
 def _sample_system(
     a: Floats, b: Floats, c: Floats, d: Floats, delays: Sequence[float], step: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the state space at multiples of the step, for held inputs; late inputs are further states.
+    """Return the discrete-time state space for zero-order-hold inputs; delays of inputs become states.
 
-    An input that acts in the middle of an interval has the effect of its two last values there (Åström and Wittenmark,
-    Computer-Controlled Systems, section 2.3).
+    For a delay that is not a multiple of the step, the last two values of the input act within an interval (Åström and
+    Wittenmark, Computer-Controlled Systems, section 2.3).
     """
     expm = importlib.import_module("scipy.linalg").expm
 
@@ -375,7 +385,10 @@ def _sample_system(
 
 
 def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
-    """Coefficients of a polynomial in descending powers from (coefficient, power) pairs; raise for other powers."""
+    """Return polynomial coefficients in descending powers from (coefficient, power) pairs.
+
+    Raise ModelError for a power that is not an integer.
+    """
     bad_power = next((p for _, p in pairs if abs(p - round(p)) > POWER_TOLERANCE or p < -POWER_TOLERANCE), None)
     if bad_power is not None:
         raise ModelError(
@@ -389,7 +402,7 @@ def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
 
 
 def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> Structure:
-    """Return the equations of a python-control system; see :meth:`ftlm.Model.from_control`."""
+    """Return the structure that corresponds to a python-control system; see :meth:`ftlm.Model.from_control`."""
     if getattr(system, "dt", None) not in (0, None):
         raise ModelError(
             f"the system is sampled (dt = {system.dt}); an equation is of continuous time: design it there"
@@ -416,7 +429,10 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
 
 
 def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
-    """Return an equation D^n y = … as text, from a denominator and one numerator per input, highest powers first."""
+    """Return an equation D^n y = … as text, from a denominator and a numerator for each input.
+
+    Polynomials have their highest power first.
+    """
     order = bottom.size - 1
     if not 0 < order <= MAX_ORDER:
         raise ModelError(f"{output} is of order {order}; an equation has an order from 1 to {MAX_ORDER:g}")
@@ -432,7 +448,7 @@ def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Seq
 
 
 def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
-    """Return a common monic denominator of each output, and the numerators over it."""
+    """Return, for each output, a common monic denominator and the numerators of all inputs over it."""
     fractions = []
     for top, bottom in zip(tops, bottoms, strict=True):
         own = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in bottom]
@@ -458,7 +474,7 @@ def _product(factors: Sequence[Floats]) -> Floats:
 
 
 def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
-    """Return C adj(sI - A) B + D det(sI - A) by Leverrier's recursion, without leading rounding errors."""
+    """Return, for each output, the monic denominator and the numerators of the transfer functions."""
     count = a.shape[0]
     bottom, powers = [1.0], [np.eye(count)]
     for k in range(1, count + 1):

@@ -1,4 +1,4 @@
-"""Frequency response: transfer functions, exact response, its standard deviation, step response."""
+"""Frequency response of a model: transfer functions, exact response, standard deviation, and step response."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DERIVATIVE_STEP_RATIO = 1e-6
 
 
 def check_no_input_nonlinearity(model: Model, what: str) -> None:
-    """Raise ModelError for a saturation or a dead zone in a linear analysis."""
+    """Raise ModelError if an input has a saturation or a dead zone; `what` names the linear analysis."""
     for limit in model.structure.limits:
         raise ModelError(
             f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.law]} before it acts, which {what} does not know; "
@@ -44,7 +44,10 @@ def check_no_input_nonlinearity(model: Model, what: str) -> None:
 
 
 def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
-    """Input signals of the response: all but the outputs; of uncoupled equations, other outputs too."""
+    """Return the names of the inputs of a response: all signals but the outputs.
+
+    For equations that are not coupled, other outputs are inputs too.
+    """
     if coupled:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
     read = [t.signal for e in model.equations for t in e.terms if t.signal != e.output]
@@ -52,14 +55,14 @@ def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
 
 
 def add_polynomial(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
-    """Add a multiple of a polynomial to another one in place; nearly equal powers are one."""
+    """Add a multiple of a polynomial to another one in place; nearly equal powers are merged."""
     for power, value in other.items():
         at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
         into[at] = into.get(at, 0.0) + factor * value
 
 
 def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:
-    """Return the product of two polynomials."""
+    """Return the product of two polynomials with real powers."""
     out: Polynomial = {}
     for (p, x), (q, y) in itertools.product(a.items(), b.items()):
         add_polynomial(out, {round(p + q, 9): x * y})
@@ -67,7 +70,10 @@ def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:
 
 
 def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
-    """Return polynomials of D^alpha y minus own and coupled terms, by output, and those of every other signal."""
+    """Return the polynomials in s that multiply each output in an equation, and those that multiply each other signal.
+
+    Terms of outputs are moved to the left-hand side.
+    """
     check_linear([item], "a frequency response")
     polynomials: list[Polynomial] = [{} for _ in names]
     right: dict[str, Polynomial] = {}
@@ -82,7 +88,7 @@ def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Pol
 
 
 def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
-    """Determinant by permutations: exact in the powers, for a few outputs."""
+    """Return the determinant of a small matrix of polynomials, by the sum over permutations."""
     n = len(matrix)
     out: Polynomial = {}
     size: Polynomial = {}
@@ -105,11 +111,10 @@ class TransferFunctions:
     Parameters
     ----------
     outputs, inputs
-        Names.
-    denominator
-        (coefficient, power) pairs by output, highest power first; coupled outputs share it.
+        Signal names. denominator Denominator of each output as (coefficient, power) pairs, highest power first. Coupled
+        outputs have the same denominator.
     numerators
-        The same by output and input; empty if an input has no effect on an output.
+        Numerator by output and input as such pairs; empty if an input has no effect on an output.
     delay
         Delay of each input [s].
     """
@@ -122,13 +127,13 @@ class TransferFunctions:
 
 
 def coupled_outputs(model: Model, *, coupled: bool) -> list[tuple[str, ...]]:
-    """Groups of outputs whose equations are solved together."""
+    """Return groups of outputs whose equations are solved together."""
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
 @check_arguments
 def transfer_functions(model: Model, *, coupling: str = "simulated") -> TransferFunctions:
-    """Transfer functions of a model by Cramer's rule, without the sensor filter.
+    """Return the transfer functions of a model, by Cramer's rule, without the sensor filter.
 
     Parameters
     ----------
@@ -173,33 +178,32 @@ def _coefficient_pairs(polynomial: Polynomial) -> tuple[tuple[float, float], ...
 
 
 def is_coupled(coupling: str) -> bool:
-    """Whether all equations are coupled; raises ModelError for an unknown coupling."""
+    """Return whether all equations are coupled; raise ModelError for an unknown coupling."""
     check_choice("coupling", coupling, ("simulated", "measured"))
     return coupling == "simulated"
 
 
 @check_arguments
 def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
-    """Exact frequency response with fractional orders.
+    """Return the exact frequency response of a model, with its fractional orders.
 
     Parameters
     ----------
     model
         The model.
     w
-        Angular frequencies [rad/s], shape (W,), finite, >= 0.
+        Angular frequencies [rad/s], shape (W,), finite and nonnegative.
     coupling
         ``"simulated"``: coupled equations, with all signals but the outputs as inputs. ``"measured"``: each equation
         alone, with the other outputs among its inputs (in the order of ``model.structure.signals``).
     sensor
-        Whether signals are measured ones: filtered outputs pass the sensor filter, and the response to a filtered input
-        is divided by the filter.
+        Whether the sensor filter is included: the response of a filtered output is multiplied by the filter, and the
+        response to a filtered input is divided by it.
 
     Returns
     -------
     ndarray of complex, shape (outputs, inputs, W)
-        In SI units of output over input; infinite at a pole. A Coulomb signal counts as an input; its nonlinear effect
-        on the angle is not included.
+        Response in SI units of output over input; infinite at a pole.
 
     Raises
     ------
@@ -257,7 +261,7 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
 
 
 def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
-    """Value of a sum of powers at complex frequencies."""
+    """Return the values of a polynomial with real powers at complex frequencies s."""
     total = np.zeros(s.shape, dtype=np.complex128)
     for power, coefficient in polynomial.items():
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -267,7 +271,7 @@ def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
 
 @check_arguments
 def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated") -> tuple[Floats, Floats]:
-    """Standard deviations of the frequency response, from the covariance of the model by the delta method.
+    """Return standard deviations of gain and phase of the frequency response, by the delta method.
 
     Parameters
     ----------
@@ -284,7 +288,7 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
     Raises
     ------
     ModelError
-        A model without covariance.
+        If the model has no covariance.
     """
     matrix = covariance_of(model)
     if matrix is None:
@@ -312,14 +316,17 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
 
 
 def covariance_of(model: Model) -> Floats | None:
-    """Return the covariance of :func:`parameter_vector`; None if the model has none."""
+    """Return the covariance matrix of :func:`parameter_vector`; None if the model has none."""
     if model.estimate is None or model.estimate.covariance is None:
         return None
     return np.asarray(model.estimate.covariance, dtype=np.float64)
 
 
 def parameter_vector(model: Model) -> Floats:
-    """All numbers of a model as a vector: alpha of each equation, then order and coefficient of each term."""
+    """Return all orders and coefficients of a model as a vector, equation by equation.
+
+    For each equation it has alpha, then order and coefficient of each term.
+    """
     numbers: list[float] = []
     for item in model.equations:
         numbers += [item.order.constant, *(v for t in item.terms for v in (t.order.constant, float(t.fixed or 0.0)))]
@@ -327,7 +334,7 @@ def parameter_vector(model: Model) -> Floats:
 
 
 def with_parameter_vector(model: Model, numbers: Floats) -> Model:
-    """Return the model with other numbers, in the order of :func:`parameter_vector`."""
+    """Return the model with other orders and coefficients, given as in :func:`parameter_vector`."""
     at = iter(numbers.tolist())
     equations = []
     for item in model.equations:
@@ -341,7 +348,10 @@ def with_parameter_vector(model: Model, numbers: Floats) -> Model:
 
 
 def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
-    """Return an equation without range checks of its orders, for derivatives at an end of the range."""
+    """Return an equation with other orders and terms, without range checks.
+
+    Numerical derivatives at a limit of the range require it.
+    """
     new = copy.copy(item)
     vars(new).update(order=order, terms=terms)
     return new
@@ -349,30 +359,28 @@ def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) ->
 
 @check_arguments
 def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
-    """Response of every output to a unit step of every input, from rest.
+    """Return the response of every output to a unit step of every input, from rest.
 
     Parameters
     ----------
     model
-        The model; its equations are coupled.
-    time
-        Uniform time points from 0 [s], shape (N,), N >= 3.
+        The model; its equations are coupled. time Uniform time points from 0 [s], shape (N,), N >= 3.
     tolerance
         Tolerance of the simulation; see :func:`ftlm.simulate`.
 
     Returns
     -------
     ndarray, shape (outputs, inputs, N)
-        Sensor filter and delays included; the step acts just after time 0.
+        Responses, including sensor filter and delays. The step acts just after time 0.
 
     Raises
     ------
     DataError
-        Instants that are not regular from 0.
+        If the time points are not uniform from 0.
     ModelError
         An input that saturates or has a dead zone.
     ConvergenceError
-        A model so unstable that the response overflows.
+        If the response of an unstable model overflows.
     """
     check_no_input_nonlinearity(model, "a step response")
     t = as_floats("time", time)

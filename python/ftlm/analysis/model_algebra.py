@@ -1,4 +1,4 @@
-"""Transfer functions as models and their connections, for real powers of s; linear models of non-linear ones."""
+"""Models from transfer functions with real powers of s, their connections, and linearization of models."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class Ratio:
-    """Numerator and denominator in powers of s, and a delay [s]."""
+    """Transfer function: numerator and denominator with real powers of s, and a delay [s]."""
 
     top: Polynomial
     bottom: Polynomial
     delay: float
 
     def model(self, output: str, signal: str, *, improper_order: float = 0.0) -> Model:
-        """Return the equation of this transfer function, whose numerator may be higher by `improper_order`."""
+        """Return the model of this transfer function as an equation.
+
+        The order of the numerator may exceed that of the denominator by less than `improper_order`.
+        """
         bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
         if not bottom or not top:
             raise ModelError(f"the {'denominator' if top else 'numerator'} is 0; there is no such model")
@@ -78,8 +81,8 @@ def transfer_function(
     ----------
     num, den
         Coefficients of s^n, …, s, 1 as in python-control and MATLAB; or pairs (coefficient, power) for fractional
-        powers: FOMCON's ``fotf(a, na, b, nb)`` has
-        the numerator ``list(zip(b, nb))`` and the denominator ``list(zip(a, na))``.
+        powers. FOMCON's ``fotf(a, na, b, nb)`` has the numerator ``list(zip(b, nb))`` and the denominator ``list(zip(a,
+        na))``.
     delay
         Delay of the input [s], ≥ 0.
     output, input
@@ -88,12 +91,12 @@ def transfer_function(
     Returns
     -------
     Model
-        ``output = num / den exp(-s delay) input`` as an equation, divided by the coefficient of its highest power.
+        Model of ``output = num / den exp(-s delay) input``, as an equation with leading coefficient 1.
 
     Raises
     ------
     ModelError
-        The numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
+        If the numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
         a list is empty or of another form, or a number is not finite.
 
     Examples
@@ -105,7 +108,10 @@ def transfer_function(
 
 
 def _polynomial(name: str, values_argument: Sequence[float] | Sequence[Pair]) -> Polynomial:
-    """Return a polynomial from coefficients of descending powers or from pairs (coefficient, power)."""
+    """Return (coefficient, power) pairs from coefficients of descending powers or from such pairs.
+
+    Raise ModelError for other input.
+    """
     values = list(values_argument)
     pairs = [v if isinstance(v, (tuple, list)) else (v, len(values) - 1.0 - k) for k, v in enumerate(values)]
     out: Polynomial = {}
@@ -121,7 +127,10 @@ def _polynomial(name: str, values_argument: Sequence[float] | Sequence[Pair]) ->
 
 
 def _ratio(model: Model, what: str) -> tuple[Ratio, str, str]:
-    """Return the transfer function of a linear model of one output and one input, and their names."""
+    """Return the transfer function of a linear model of one output and one input, with their names.
+
+    `what` names the operation in messages.
+    """
     check_no_input_nonlinearity(model, what)
     if model.structure.has_friction or model.structure.sensor_filter is not None:
         raise ModelError(
@@ -140,14 +149,14 @@ def _ratio(model: Model, what: str) -> tuple[Ratio, str, str]:
 
 
 def series(first: Model, second: Model) -> Model:
-    """Return the series connection: the output of `first` is the input of `second`. Delays add up."""
+    """Return the series connection, in which the output of `first` is the input of `second`; delays are added."""
     (a, _, signal), (b, output, _) = _ratio(first, "a series"), _ratio(second, "a series")
     top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
     return Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
 
 
 def parallel(first: Model, second: Model) -> Model:
-    """Return the parallel connection: the sum of both outputs from one input. Both delays must be equal."""
+    """Return the parallel connection, the sum of both outputs from one input; the delays must be equal."""
     (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
     if a.delay != b.delay:
         raise ModelError(
@@ -161,7 +170,7 @@ def parallel(first: Model, second: Model) -> Model:
 
 
 def feedback(forward: Model, back: Model | float, sign: int) -> Model:
-    """Return the closed loop; see :meth:`ftlm.Model.feedback`."""
+    """Return the closed loop of two models; see :meth:`ftlm.Model.feedback`."""
     if sign not in (-1, 1):
         raise ModelError(f"{parameter('sign', sign)}; give -1 for negative feedback or 1")
     a, output, signal = _ratio(forward, "feedback")
@@ -188,7 +197,7 @@ def inverse(model: Model) -> Model:
 
 
 def _distinct_name(output: str, signal: str) -> str:
-    """Return the name of an output that is not that of the input."""
+    """Return the name of an output, changed if it equals that of the input."""
     return output if output != signal else f"{output}_out"
 
 
@@ -211,7 +220,7 @@ def linearize(model: Model, at: Mapping[str, float]) -> Model:
 
 
 def _channel_of(name: str) -> Channel:
-    """Return the channel that a text such as ``y`` or ``D^0.5 y`` names."""
+    """Return (signal, order of the derivative) for a text such as ``y`` or ``D^0.5 y``."""
     parsed = EquationParser(name).parse_expression()
     if parsed.operation != "channel":
         raise ModelError(f"the operating point {name!r} is not a signal or derivative of one; write 'y' or 'D y'")
@@ -219,7 +228,7 @@ def _channel_of(name: str) -> Channel:
 
 
 def _linearized_equation(item: Equation, values: Mapping[Channel, float]) -> Equation:
-    """Return an equation with every non-linear term replaced by its derivatives; constants are dropped."""
+    """Return an equation in which every nonlinear term is replaced by its first-order terms, without constants."""
     if not item.nonlinear_terms:
         return item
     terms = [t for t in item.terms if t.nonlinear is None]

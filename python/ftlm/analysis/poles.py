@@ -50,22 +50,22 @@ AXIS_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Stability:
-    """Whether bounded inputs give bounded outputs, and why.
+    """Result of a stability test: whether bounded inputs give bounded outputs, with the reason.
 
     Parameters
     ----------
     stable
-        No pole on the right of the imaginary axis or on it, the origin included.
+        Whether no pole has a nonnegative real part; a pole at the origin also makes the model unstable.
     unstable_poles
-        Number of poles with a positive real part; NaN where a pole on the axis leaves it open.
+        Number of poles with a positive real part; NaN if a pole on the imaginary axis prevents the count.
     origin_order
-        Power of s by which an input that never ends is integrated: 0 for none, 1 for an integrator.
+        Order of the pole at s = 0: 0 for none, 1 for an integrator.
     on_axis
-        Whether a pole lies on the imaginary axis as far as can be told (the origin not counted).
+        Whether a pole other than the origin lies on the imaginary axis, within numerical accuracy.
     method
-        ``"poles"`` (Matignon's criterion) or ``"argument principle"``.
+        Method used: ``"poles"`` (Matignon's criterion) or ``"argument principle"``.
     base
-        Common base of all orders, or None.
+        Largest number of which all orders are multiples, or None.
     """
 
     stable: bool
@@ -93,7 +93,7 @@ class Stability:
 
 
 def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
-    """Return the characteristic function, a sum of c s^p, of each group of coupled equations."""
+    """Return the characteristic function of each group of coupled equations, as a sum of c s^p."""
     return [
         determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names])
         for names in coupled_outputs(model, coupled=coupled)
@@ -101,7 +101,7 @@ def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
 
 
 def common_base(powers: Sequence[float]) -> float | None:
-    """Return the largest q of which all powers are multiples; None if it is below 0.01."""
+    """Return the largest number of which all powers are multiples; None if it is below 0.01."""
     powers = [p for p in powers if abs(p) > POWER_TOLERANCE]
     fractions = [Fraction(p).limit_denominator(1000) for p in powers]
     if any(abs(float(f) - p) > 1e-8 for f, p in zip(fractions, powers, strict=True)):
@@ -114,7 +114,7 @@ def common_base(powers: Sequence[float]) -> float | None:
 
 
 def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
-    """Return the base q and the nonzero roots in s^q of a commensurate polynomial.
+    """Return the common base q of a polynomial's powers, and its nonzero roots in the variable s^q.
 
     None without a common base, or if frequencies or coefficients overflow.
     """
@@ -155,18 +155,19 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     -------
     ndarray of complex
         Values of s [rad/s], sorted by magnitude, without s = 0. With fractional orders ``|arg s| < pi``; with integer
-        orders the negative real axis is included. Roots on other sheets are not poles: they only shape how a response
-        dies away.
+        orders the negative real axis is included. Roots on other sheets are not poles; they only affect how a response
+        decays.
 
     Raises
     ------
     ModelError
-        Poles outside the floating-point range, or another number of poles than the argument principle counts.
+        If poles are outside the floating-point range, or their number differs from that of the argument principle.
 
     Notes
     -----
-    Orders with a common base q give a polynomial in s^q, whose roots are those of its companion matrix. Other orders:
-    Newton's method in ln s, and the argument principle checks that all roots were found.
+    If the orders have a common base q, the characteristic function is a polynomial in s^q, whose roots are the
+    eigenvalues of its companion matrix. Otherwise Newton's method in ln s finds the roots, and the argument principle
+    verifies their number.
     """
     every = [s for p in characteristic(model, coupled=is_coupled(coupling)) for s in _principal_roots(p, "poles")]
     return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
@@ -181,18 +182,18 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
     model
         The model; its equations are coupled.
     output, input
-        Names of the signals; default the only ones.
+        Names of the signals; not required if there is only one of each.
 
     Returns
     -------
     ndarray of complex
         Values of s [rad/s], sorted by magnitude, without s = 0. With fractional orders ``|arg s| < pi``; with integer
-        orders the negative real axis is included. Zeros that a pole cancels are included.
+        orders the negative real axis is included. Zeros that a pole cancels are also returned.
 
     Raises
     ------
     ModelError
-        A name that is not known, several signals and none named, or zeros that overflow.
+        If a name is unknown, there are several signals and none is named, or zeros overflow.
     """
     transfer = transfer_functions(model)
     pair = []
@@ -209,9 +210,9 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
 
 
 def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
-    """Return the roots of a sum of c s^p on the principal sheet with their conjugates.
+    """Return the roots of a sum of c s^p on the principal sheet, with their conjugates.
 
-    ``what`` is "poles" or "zeros" in errors.
+    ``what`` is "poles" or "zeros", for messages.
     """
     upper = zeros_of(polynomial, math.pi)
     if not _whole_orders(polynomial):
@@ -234,13 +235,13 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
 
 
 def _whole_orders(polynomial: Polynomial) -> bool:
-    """Whether all powers of s differ by whole numbers, so that there is one sheet."""
+    """Whether all powers of s differ by integers, so that there is a single Riemann sheet."""
     lowest = min(polynomial)
     return all(abs(p - lowest - round(p - lowest)) < POWER_TOLERANCE for p in polynomial)
 
 
 def _pole(w: complex) -> complex:
-    """Return s = exp(w); on the real axis without the rounding of pi."""
+    """Return s = exp(w), exactly real if w is on the negative real axis."""
     if abs(w.imag) in (0.0, math.pi):
         return complex(math.copysign(math.exp(w.real), 1.0 if w.imag == 0.0 else -1.0))
     return cmath.exp(w)
@@ -248,19 +249,20 @@ def _pole(w: complex) -> complex:
 
 @check_arguments
 def stability(model: Model, *, coupling: str = "simulated") -> Stability:
-    """Whether a model is stable: by its poles where orders are commensurate, else by the argument principle.
+    """Test whether a model is stable, by its poles or by the argument principle.
 
     Parameters
     ----------
     model
         The model.
     coupling
-        See :func:`frequency_response`; a model may be stable as a whole and not equation by equation, or the reverse.
+        See :func:`frequency_response`. The coupled equations may be stable although single equations are not, and vice
+        versa.
 
     Returns
     -------
     Stability
-        True where stable; prints why not.
+        Result that is True if the model is stable, and prints the reason if it is not.
 
     Raises
     ------
@@ -269,10 +271,10 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
 
     Notes
     -----
-    Matignon (1996): roots lambda in s^q are stable where ``|arg lambda| > q pi/2``. Without a common base the number of
-    zeros of the characteristic function D(s) on the right is (p_max − p_min)/2 − Φ/π, Φ the turn of D(jω) from ω = 0 to
-    ∞ and p the powers of its highest and lowest term: the argument principle on the right half plane, where s^p has one
-    value. Delays of inputs do not matter.
+    If the orders have a common base q, the roots lambda of the polynomial in s^q are stable for ``|arg lambda| > q
+    pi/2`` (Matignon 1996). Otherwise the number of zeros of the characteristic function D(s) with positive real part is
+    (p_max − p_min)/2 − Φ/π by the argument principle, where Φ is the change of arg D(jω) from ω = 0 to ∞, and p_max and
+    p_min are the highest and lowest power. Delays of inputs do not affect stability.
     """
     coupled = is_coupled(coupling)
     unstable, on_axis, method, base = 0.0, False, "poles", None
@@ -299,9 +301,10 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
 
 
 def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
-    """Number of zeros right of the imaginary axis by the argument principle, and whether one is on the axis.
+    """Return the number of zeros with a positive real part, by the argument principle, and whether one is on the axis.
 
-    Another angle [rad] counts the zeros with a smaller argument; on the surface of ln s it may exceed pi.
+    With another `angle` [rad], the zeros with a smaller argument are counted. On the Riemann surface of ln s the angle
+    may exceed pi.
     """
     lowest, highest = min(polynomial), max(polynomial)
     if highest - lowest < POWER_TOLERANCE:
@@ -310,7 +313,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     values = np.array(list(polynomial.values()))
 
     def shares(at: float, omega: float) -> float:
-        """Size of all other terms relative to the term of one power."""
+        """Return the magnitude of all other terms relative to that of the term with power `at`."""
         sizes = np.abs(values) * omega ** (powers - at)
         return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
 
@@ -326,7 +329,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     log_omega = np.linspace(math.log(low), math.log(high), 2001)
 
     def curve(logs: Floats) -> tuple[Complex, Floats]:
-        """D(jω) divided by the sum of the sizes of its terms, and that sum."""
+        """Return D(jω) divided by the sum of the magnitudes of its terms, and the logarithm of that sum."""
         exponents = np.outer(powers, logs) + np.log(np.abs(values))[:, None]
         shift = exponents.max(axis=0)
         sizes = np.exp(exponents - shift)
@@ -390,7 +393,7 @@ class Mode:
         Whether it is a complex pole pair. A relaxation is exponential for integer orders and a power of time for
         others.
     frequency_error, damping_error, time_constant_error
-        Standard errors from the covariance of the model; None where it has none.
+        Standard errors from the covariance of the model; None without a covariance.
     """
 
     pole: complex
@@ -420,7 +423,7 @@ class Mode:
 
 @check_arguments
 def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
-    """Return the modes of a model for any orders, slowest first: frequency, damping and time constant of its poles.
+    """Return the modes of a model of any orders, slowest first: frequency, damping and time constant of its poles.
 
     Parameters
     ----------
@@ -442,10 +445,10 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
 
     Notes
     -----
-    Poles are the zeros of D(s), a sum of c s^p, with abs(arg s) < pi. Orders need no common base: Newton's method in
-    ln s starts from the roots of D with rounded orders. A zero on the negative axis, or within its uncertainty of it,
-    is a relaxation. A model with orders below 1 may have no pole and relax as a power of time. Then the zeros up to
-    arg s = 2 pi give its time constants, as (c_0/c_p)^(-1/p) does for D^p y = -c_0/c_p y.
+    Poles are the zeros of the characteristic function D(s), a sum of c s^p, with abs(arg s) < pi. Orders need no common
+    base, because Newton's method in ln s starts from the roots of D with rounded orders. A zero on the negative axis,
+    within its uncertainty, is a relaxation. A model with orders below 1 may have no pole, and decays as a power of
+    time. The zeros up to arg s = 2 pi then give its time constants, such as (c_0/c_p)^(-1/p) for D^p y = -c_0/c_p y.
     """
     check_model(model)
     coupled = is_coupled(coupling)
@@ -459,7 +462,10 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
 
 
 def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
-    """Return the mode of a zero in ln s, with the standard deviations of its parts."""
+    """Return the mode of a zero w = ln s.
+
+    `spread` has the standard deviations of Re w, Im w and ln abs(Re s).
+    """
     size, angle = math.exp(w.real), w.imag
     # Of a pole that hardly anything tells nobody may say that it is real, let alone that it dies away.
     sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), REAL_AXIS_ANGLE_RAD)
@@ -480,7 +486,7 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
 
 
 def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
-    """Return zeros, also those beyond the principal sheet: up to two turns, or to the first zero if it is farther."""
+    """Return zeros beyond the principal sheet as ln s: up to arg s = 2 pi, or up to the first zero if it is farther."""
     powers = np.array(list(polynomial))
     gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
     zeros = zeros_of(polynomial, max(MAX_SHEET_ANGLE_RAD, math.pi / gap) + REAL_AXIS_ANGLE_RAD)
@@ -489,7 +495,7 @@ def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
 
 
 def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RAD) -> list[complex]:
-    """Zeros of a sum of c s^p as ln s, slowest first, 0 <= Im <= reach; those at the origin are excluded."""
+    """Return the zeros of a sum of c s^p as ln s, slowest first, with 0 <= Im <= reach, without s = 0."""
     powers = np.array(list(polynomial))
     lowest, highest = float(powers.min()), float(powers.max())
     if highest - lowest < POWER_TOLERANCE:
@@ -520,7 +526,7 @@ def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RA
 
 
 def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
-    """Zeros of the sum with orders rounded to a base, as ln s."""
+    """Return initial guesses for zeros as ln s, from the sum with orders rounded to multiples of a base."""
     rounded: Polynomial = {}
     for power, value in polynomial.items():
         near = round(round(power / base) * base, 9)
@@ -535,7 +541,10 @@ def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
 
 
 def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
-    """Zeros of the sum of each pair of terms, as ln s, for distant zeros with close orders."""
+    """Return initial guesses for zeros as ln s, from the sum of each pair of terms.
+
+    They are accurate for distant zeros if orders are close.
+    """
     out = []
     for i, j in itertools.combinations(range(powers.size), 2):
         difference = powers[j] - powers[i]
@@ -547,7 +556,7 @@ def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
 
 
 def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
-    """Zeros reached by Newton's method from these seeds."""
+    """Return the zeros to which Newton's method converges from the initial guesses `w`."""
     if not w.size:
         return []
     for _ in range(MAX_NEWTON_ITERATIONS):
@@ -571,7 +580,10 @@ def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]
 def _standard_deviations(
     model: Model, at: int, zeros: Complex, *, coupled: bool
 ) -> Sequence[tuple[float, float, float] | None]:
-    """Standard deviations of Re and Im of ln s at each zero, and of ln abs(Re s): d ln s = -dD / (dD/d ln s)."""
+    """Return, for each zero, the standard deviations of Re ln s, Im ln s and ln abs(Re s); None without a covariance.
+
+    They follow from d ln s = -dD / (dD/d ln s).
+    """
     matrix = covariance_of(model)
     if matrix is None or not zeros.size:
         return [None] * zeros.size
@@ -582,7 +594,7 @@ def _standard_deviations(
     _, unit = _terms(zeros, np.array(list(own)), np.array(list(own.values())))
 
     def value(numbers: Floats) -> tuple[Complex, Complex]:
-        """D and dD / d ln s at the zeros, in units of the largest term of the model."""
+        """Return D and dD / d ln s at the zeros, divided by the largest term of the model."""
         polynomial = characteristic(with_parameter_vector(model, numbers), coupled=coupled)[at]
         powers = np.array(list(polynomial))
         terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
@@ -606,20 +618,20 @@ def _standard_deviations(
 
 @dataclass(frozen=True)
 class SteadyState:
-    """Steady state of an output under a unit step of an input.
+    """Final behavior of an output after a unit step of an input.
 
     Parameters
     ----------
     output, input
         Names.
     gain
-        Final value of the output: 0 if it returns, infinite if it diverges.
+        Final value of the output; 0 if it returns to 0, infinite if it grows without bound.
     error
-        Standard error of the rate; None without a covariance.
+        Standard error of `rate`; None without a covariance.
     order
-        Order of growth: 0 for none, 1 for an integrator, below 0 if the output returns to 0.
+        Exponent of the growth t^order: 0 for a finite gain, 1 for an integrator, negative if the output returns to 0.
     rate
-        Final coefficient of t^order/Gamma(order + 1); the gain if the order is 0.
+        Coefficient of t^order/Gamma(order + 1) for large t; the gain if the order is 0.
     order_error
         Standard error of the order, 0 for a fixed order; None without a covariance.
     """
@@ -635,7 +647,7 @@ class SteadyState:
 
 @check_arguments
 def steady_states(model: Model) -> tuple[SteadyState, ...]:
-    """Return the steady state of every output for every input that affects it, with coupled equations.
+    """Return the final behavior of every output after a step of every input that affects it, with coupled equations.
 
     Parameters
     ----------
@@ -673,7 +685,7 @@ def steady_states(model: Model) -> tuple[SteadyState, ...]:
 
 
 def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
-    """Order and coefficient of the final behavior of every response."""
+    """Return (order, coefficient) of the final behavior t^order of every step response, by output and input."""
     transfer = transfer_functions(model)
     sensor = model.structure.sensor_filter
     out = {}
@@ -694,18 +706,18 @@ def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
 
 @check_arguments
 def dcgain(model: Model) -> Floats:
-    """Steady-state gain of every output from every input that is not modelled.
+    """Return the steady-state gain of every output from every input that is not itself an output.
 
     Parameters
     ----------
     model
-        The model; its equations act together.
+        The model; its equations are coupled.
 
     Returns
     -------
     ndarray, shape (outputs, inputs)
-        In SI units of output over input: 0 where an input does not reach the output or its effect dies away, infinite
-        where it is integrated. Inputs are in the order of :func:`ftlm.analysis.transfer_functions`.
+        Gains in SI units of output over input. They are 0 if an input does not affect the output or its effect decays,
+        and infinite if it is integrated. Inputs are in the order of :func:`ftlm.analysis.transfer_functions`.
 
     Raises
     ------
@@ -721,9 +733,9 @@ def dcgain(model: Model) -> Floats:
 
 
 def settling_time(model: Model) -> float:
-    """Return the duration of a response chart [s]: some time constants of the slowest mode.
+    """Return a duration for response charts [s]: a few time constants of the slowest mode.
 
-    At most fifty periods of the fastest oscillation, so that a chart resolves it.
+    It is at most fifty periods of the fastest oscillation, so that a chart resolves the oscillation.
     """
     model_modes = modes(model)
     if not model_modes:

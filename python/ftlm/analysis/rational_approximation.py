@@ -36,7 +36,7 @@ PADE_ORDER = 4
 
 
 def identifier(name: str) -> str:
-    """Return a name that is valid in MATLAB, Python and python-control."""
+    """Return a name changed so that it is valid in MATLAB, Python and python-control."""
     plain = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")[:60]
     return plain if plain and plain[0].isalpha() else f"x_{plain}"
 
@@ -48,19 +48,17 @@ class Approximation:
     Parameters
     ----------
     a, b, c, d
-        State space; inputs and outputs in the order of their names.
+        State-space matrices. Rows and columns follow the sequence of `outputs` and `inputs`.
     outputs, inputs
-        Names.
-    band
-        Frequency band of the approximation [rad/s].
+        Signal names. band Frequency band of the approximation [rad/s].
     order
-        Order of Oustaloup's filter: one operator has 2 order + 1 poles.
+        Order of Oustaloup's filter; each fractional operator has 2 order + 1 poles.
     gain_error, phase_error
-        Largest errors over the band by output and input [dB], [degrees].
+        Largest gain error [dB] and phase error [degrees] over the band, by output and input.
     stable
         Whether the approximation is stable.
     warnings
-        Limits of its use.
+        Warnings about limits of its use.
     """
 
     a: Floats
@@ -83,7 +81,7 @@ class Approximation:
 
     @check_arguments
     def frequency_response(self, w: Sequence[float] | Floats) -> NDArray[np.complex128]:
-        """Response of the approximation, shape (outputs, inputs, W)."""
+        """Return the complex response at angular frequencies w [rad/s], shape (outputs, inputs, W)."""
         omega = check_vector("w", as_floats("w", w))
         system = 1j * omega[:, None, None] * np.eye(self.states) - self.a
         response = self.c @ np.linalg.solve(system, np.broadcast_to(self.b, (omega.size, *self.b.shape))) + self.d
@@ -99,7 +97,10 @@ class Approximation:
 
 
 def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
-    """Poles, residues and direct gain of Oustaloup's filter for s^power, 0 < power < 1 (doi:10.1109/81.817385)."""
+    """Return poles, residues and direct gain of Oustaloup's filter for s^power, 0 < power < 1.
+
+    Source: doi:10.1109/81.817385.
+    """
     low, high = band
     k = np.arange(-order, order + 1) + order
     count = 2 * order + 1
@@ -116,7 +117,7 @@ def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floa
 
 
 class _Builder:
-    """Collector of states; each element reads inputs u, outputs y, or states."""
+    """Builder of state-space matrices, to which filters and delays are added one at a time."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         self.a: list[dict[int, float]] = []
@@ -162,7 +163,7 @@ def _sum(signals: Iterable[_Signal]) -> _Signal:
 
 
 def _filter_signal(builder: _Builder, signal: _Signal, power: float, band: tuple[float, float], order: int) -> _Signal:
-    """Apply Oustaloup's filter for s^power to a signal, with one state per pole."""
+    """Add Oustaloup's filter for s^power to a signal, one state per pole, and return the filtered signal."""
     roots, residues, gain = oustaloup(power, band, order)
     states, u, y = _scale_signal(signal, gain)
     for pole, residue in zip(roots.tolist(), residues.tolist(), strict=True):
@@ -174,7 +175,7 @@ def _filter_signal(builder: _Builder, signal: _Signal, power: float, band: tuple
 
 
 def _delay_input(builder: _Builder, source: int, delay: float) -> _Signal:
-    """Apply Padé's approximation of a delay to an input, in observer form."""
+    """Add Padé's approximation of a delay [s] to an input, in observer form, and return the delayed signal."""
     # Coefficients of sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k, x = -s tau above and + below.
     f, n = math.factorial, PADE_ORDER
     c = [f(2 * n - k) * f(n) / (f(2 * n) * f(k) * f(n - k)) for k in range(n + 1)]
@@ -196,7 +197,7 @@ def _delay_input(builder: _Builder, source: int, delay: float) -> _Signal:
 
 @check_arguments
 def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> Approximation:
-    """Approximate a model by a rational state-space system.
+    """Return a rational state-space system that approximates a model within a frequency band.
 
     Parameters
     ----------
@@ -205,7 +206,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     band
         Frequency band (low, high) of the approximation [rad/s], 0 < low < high.
     order
-        Of Oustaloup's filter, 1 to 50: each distinct integral of fractional order gets 2 order + 1 poles.
+        Order of Oustaloup's filter, 1 to 50; each distinct integral of fractional order has 2 order + 1 poles.
 
     Returns
     -------
@@ -215,12 +216,13 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     Raises
     ------
     ModelError
-        Invalid band or order, or equations that cannot be solved for their outputs.
+        If band or order is invalid, or the equations cannot be solved for their outputs.
 
     Notes
     -----
-    Filters extend two decades beyond the band on both sides, since Oustaloup's phase is poor near its ends. Integer
-    orders are exact. Delays have Padé's approximation of order 4. The sensor filter is excluded.
+    Oustaloup's filters extend two decades beyond the band on both sides, because their phase is inaccurate near the
+    ends. Integer orders are exact. Delays are replaced by Padé's approximation of order 4. The sensor filter is not
+    included.
     """
     low, high = frequency_pair(band)
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
@@ -245,16 +247,18 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
 def state_space_matrices(
     model: Model, delays: Mapping[str, float], reach: tuple[float, float], count: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return A, B, C and D of a model with coupled equations; inputs in the order of the response.
+    """Return the state-space matrices A, B, C and D of a model with coupled equations.
+
+    Inputs have the order of :func:`response_inputs`.
 
     Parameters
     ----------
     model
         A linear model. A model of integer orders is represented exactly.
     delays
-        Delays of inputs [s] to approximate.
+        Delays of inputs [s] by name, which are approximated.
     reach, count
-        Frequencies [rad/s] and order of the filters of fractional orders.
+        Frequency band [rad/s] and order of the filters that approximate fractional orders.
     """
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
     builder = _Builder(len(inputs), len(outputs))
@@ -301,7 +305,7 @@ def state_space_matrices(
 
 
 def _with_errors(model: Model, system: Approximation) -> Approximation:
-    """Return the approximation with its errors and warnings on its stability."""
+    """Return the approximation with its gain and phase errors, stability, and warnings."""
     low, high = system.band
     omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
     exact = frequency_response(model, omega, sensor=False)
@@ -335,7 +339,7 @@ def _with_errors(model: Model, system: Approximation) -> Approximation:
 
 @check_arguments
 def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> Any:
-    """Return a python-control system that approximates a model within a band.
+    """Return a python-control system that approximates a model within a frequency band.
 
     Parameters
     ----------
@@ -345,17 +349,18 @@ def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> An
     Returns
     -------
     control.StateSpace
-        With named inputs and outputs; its attribute ``approximation`` is the :class:`Approximation` with the errors.
+        System with named inputs and outputs. Its attribute ``approximation`` is the :class:`Approximation`, which has
+        the errors.
 
     Warns
     -----
     UserWarning
-        Where the approximation is too far off for a margin to be read from it.
+        If the errors are too large for stability margins to be computed from the approximation.
 
     Raises
     ------
     ModelError
-        python-control is not installed; see also :func:`approximate`.
+        If python-control is not installed; see also :func:`approximate`.
     """
     control = python_control()
     near = approximate(model, band=band, order=order)

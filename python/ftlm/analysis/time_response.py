@@ -1,4 +1,4 @@
-"""Step and impulse responses of a model, with standard deviation."""
+"""Step and impulse responses of a model, with their standard deviation."""
 
 from __future__ import annotations
 
@@ -37,12 +37,11 @@ class Response:
     kind
         ``"step"`` or ``"impulse"``.
     outputs, inputs
-        Names.
-    time
-        Time points [s], shape (N,). For an impulse they are the centers of the intervals, and values are means over the
-        intervals, which stay finite if orders below 1 make the response infinite at 0.
+        Signal names. time Time points [s], shape (N,). For an impulse they are centers of sampling intervals, and the
+        values are means over the intervals. The means are finite even if orders below 1 make the response infinite at
+        0.
     values
-        Shape (outputs, inputs, N).
+        Responses of shape (outputs, inputs, N).
     deviation
         Standard deviation of the values from the covariance of the model, to first order; None without a covariance.
     """
@@ -56,7 +55,7 @@ class Response:
 
 
 def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step") -> Response:
-    """Response of a model to unit steps or impulses, from rest, with coupled equations.
+    """Return the response of a model to unit steps or impulses, from rest, with coupled equations.
 
     Parameters
     ----------
@@ -70,11 +69,11 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     Raises
     ------
     DataError
-        Instants that are not regular from 0.
+        If the time points are not uniform from 0.
     ModelError
         An input that saturates or has a dead zone.
     ConvergenceError
-        A model so unstable that the response overflows.
+        If the response of an unstable model overflows.
     """
     check_model(model)
     if time is None:

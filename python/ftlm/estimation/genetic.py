@@ -61,8 +61,8 @@ MAX_DEFAULT_EVALUATIONS = 1_000_000
 class GeneticRun:
     """Result of the genetic algorithm: the best candidate, and the error and number of evaluations of each seed.
 
-    The error is the sum of absolute simulation errors (45) of the paper, or the RMSE (46) for the norm ``"l2"``. Under an
-    order law it is summed over outputs, each divided by the standard deviation of the output.
+    The error is the sum of absolute simulation errors (45) of the paper, or the RMSE (46) for the norm ``"l2"``. Under
+    an order law it is summed over outputs, each divided by the standard deviation of the output.
     """
 
     orders: dict[str, float]

@@ -208,7 +208,8 @@ class MultiInnovationTrace:
     coefficients
         Coefficients by name, one value for each of these steps.
     error
-        Sum of absolute errors (45) of the model's simulation from rest after each of these steps; infinite if it diverges.
+        Sum of absolute errors (45) of the model's simulation from rest after each of these steps; infinite if the
+        simulation diverges.
     innovation_length
         Innovation length p.
     """

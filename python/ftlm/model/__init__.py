@@ -1,1 +1,1 @@
-"""Models, their files and their typesetting."""
+"""Models, their parameters and their files."""

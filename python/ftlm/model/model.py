@@ -1,4 +1,4 @@
-"""Data of an identified model: structure with fixed parameters, and details of its estimation."""
+"""Identified model: structure with fixed parameters, and details of its estimation."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ if TYPE_CHECKING:
 
 
 class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Free parameters of an output-error fit with their covariance, for the design of the next experiment.
+    """Free parameters of an output-error fit, with covariance and noise, from which the next experiment is designed.
 
     Parameters
     ----------
     names
-        Free orders, free coefficients, then delays and limits of inputs.
+        Names of the free orders, the free coefficients, then the free delays and limits of inputs.
     orders
         Every order of the model as an expression of free orders: for each equation alpha, then each term's order.
     products
-        Coefficients that a law derives from others: sign and factors by name.
+        Coefficients that follow from a coefficient law: (sign, names of the factors) by name.
     covariance
         Covariance of the free parameters in the order of `names`; None if it is not finite.
     noise
         Standard deviation of the output error of each measured output, by name.
     refinement
-        Block pulses per sampling interval of the finest simulation grid.
+        Number of block pulses per sampling interval on the finest time grid of the fit.
     """
 
     names: tuple[str, ...]
@@ -56,7 +56,7 @@ class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Details of the estimation of a model, stored with it so that a report needs no other file.
+    """Details of a model's estimation, which are stored with it so that a report requires no other file.
 
     Parameters
     ----------
@@ -65,28 +65,28 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     runs
         Names of the runs.
     values, standard_errors
-        Estimated orders and coefficients by name, and their standard errors where available.
+        Estimates of orders and coefficients by name, and their standard errors if available.
     covariance
         Covariance of all parameters in the order of the equations: alpha, then order and coefficient of each term, then
         friction coefficients (fc, fs, vs). None if the estimator gives none. It is singular if laws relate parameters.
     fit
-        Fit of the simulated outputs on these runs [%], by output.
+        Fit of the simulation to these runs in percent, by output.
     information
-        Information criteria, where available.
+        Information criteria, if available.
     warnings
-        Sentences in files of earlier versions, which are shown and not judged.
+        Warnings in files of earlier versions, which are printed and do not affect the verdict.
     intervals
-        95 % profile-likelihood intervals of the values that have one; None for an unbounded end. Other values have
-        Wald intervals of ± 1.96 standard errors. Unset if no value has one.
+        95 % profile-likelihood intervals (low, high) by name, with None for an unbounded side. Parameters that are not
+        listed have Wald intervals of ± 1.96 standard errors. Unset if there are none.
     free
-        Free parameters of the output-error fit, for the design of the next experiment. Unset for other methods.
+        Free parameters of the output-error fit, with their covariance. Unset for other methods.
     findings
         Findings about data, fit and model. Unset if there are none.
     against
-        Findings against the model at identification, used by its verdict. Unset if there are none.
+        Findings against the model at its identification, from which its verdict follows. Unset if there are none.
     piece_duration
-        Shortest duration [s] of the pieces into which the runs of an unstable plant were split, each with its own
-        initial values; comparisons split other runs likewise. Unset if whole runs were simulated.
+        Shortest duration [s] of the pieces, with separate initial values, into which the runs of an unstable plant were
+        split. Comparisons split other runs in the same way. Unset if whole runs were simulated.
     """
 
     method: str
@@ -105,7 +105,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def known_findings(self) -> tuple[Finding, ...]:
-        """Findings, with the sentences of earlier versions as notes."""
+        """Findings, including warnings of earlier versions as notes."""
         old = tuple(Finding("earlier_sentence", numbers={"text": text}) for text in self.warnings)
         return old if self.findings is UNSET else (*old, *self.findings)
 
@@ -113,7 +113,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 @check_arguments
 @dataclass(frozen=True)
 class Model:
-    """Structure with numerical orders and coefficients.
+    """Model: a structure with numerical orders and coefficients.
 
     Parameters
     ----------
@@ -122,18 +122,18 @@ class Model:
     orders
         Estimated values of the free orders by name.
     units
-        SI units of the signals, where known.
+        SI units of the signals by name, as far as known.
     m
-        Number of block pulses of the identification, the default of comparisons.
+        Number of block pulses of the identification, which comparisons use by default.
     about
-        Metadata about the origin of the model.
+        Metadata on the origin of the model, such as method and runs.
     estimate
         Standard errors, covariance and warnings of the identification; None for a model defined by hand.
 
     Raises
     ------
     ModelError
-        A free order or coefficient without a value, or a value that is not finite.
+        If a free order or coefficient has no value, or a value is not finite.
     """
 
     structure: Structure
@@ -181,19 +181,19 @@ class Model:
     def linearized(self, at: Mapping[str, float]) -> Model:
         """Return the linear model of small deviations from an operating point.
 
-        Every non-linear term is replaced by its derivatives with respect to its signals; constants are dropped, so that
-        outputs and inputs of the linear model count from the point.
+        Every nonlinear term is replaced by its first-order expansion. Constants are dropped, so signals of the linear
+        model are deviations from the operating point.
 
         Parameters
         ----------
         at
-            Values of the signals in non-linear terms, such as ``{"y": 0.3, "u": 1.0}``. Derivatives are 0 unless given,
+            Values of the signals in nonlinear terms, such as ``{"y": 0.3, "u": 1.0}``. Derivatives are 0 unless given,
             as in ``{"y": 0.3, "D y": 0.1}``.
 
         Raises
         ------
         ModelError
-            A signal without a value, a name that is in no non-linear term, or a point without a derivative.
+            If a signal has no value, a name is in no nonlinear term, or a term has no derivative at the point.
         """
         from ftlm.analysis.model_algebra import linearize
 
@@ -215,21 +215,21 @@ class Model:
 
     @check_arguments
     def compare(self, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
-        """Compare with measured runs by equation error and output error; see :func:`ftlm.compare`."""
+        """Compare the model with measured runs by equation error and output error; see :func:`ftlm.compare`."""
         from ftlm.validation.comparison import compare
 
         return compare(self, runs, m=m)
 
     @check_arguments
     def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
-        """Test residuals for whiteness and independence of the inputs; see :func:`ftlm.resid`."""
+        """Test whether residuals are white and independent of the inputs; see :func:`ftlm.resid`."""
         from ftlm.validation.residual_tests import resid
 
         return resid(self, runs, lags=lags)
 
     @check_arguments
     def frequency_response(self, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
-        """Exact response at angular frequencies [rad/s], shape (outputs, inputs, W).
+        """Return the exact complex frequency response, shape (outputs, inputs, W), at angular frequencies w [rad/s].
 
         See :func:`ftlm.analysis.frequency_response`.
         """
@@ -239,21 +239,21 @@ class Model:
 
     @check_arguments
     def step_response(self, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
-        """Response to unit steps, shape (outputs, inputs, N); see :func:`ftlm.analysis.step_response`."""
+        """Return the response to unit steps, shape (outputs, inputs, N); see :func:`ftlm.analysis.step_response`."""
         from ftlm.analysis.frequency_response import step_response
 
         return step_response(self, time, tolerance=tolerance)
 
     @check_arguments
     def stability(self, *, coupling: str = "simulated") -> Stability:
-        """Test stability, with the reason for instability; see :func:`ftlm.analysis.stability`."""
+        """Return whether the model is stable, with the reason; see :func:`ftlm.analysis.stability`."""
         from ftlm.analysis.poles import stability
 
         return stability(self, coupling=coupling)
 
     @check_arguments
     def is_stable(self, *, coupling: str = "simulated") -> bool:
-        """Whether bounded inputs give bounded outputs; an integrator is not stable in this sense."""
+        """Return whether bounded inputs give bounded outputs; an integrator is not stable in this sense."""
         return self.stability(coupling=coupling).stable
 
     @check_arguments
@@ -264,7 +264,7 @@ class Model:
         return poles(self, coupling=coupling)
 
     def zeros(self, output: str | None = None, input: str | None = None) -> Complex:
-        """Return the zeros of a transfer function on the principal sheet [rad/s]; see :func:`ftlm.analysis.zeros`."""
+        """Return the zeros of a transfer function [rad/s] on the principal sheet; see :func:`ftlm.analysis.zeros`."""
         from ftlm.analysis.poles import zeros
 
         return zeros(self, output, input)
@@ -277,33 +277,34 @@ class Model:
         return modes(self, coupling=coupling)
 
     def dcgain(self) -> Floats:
-        """Steady-state gain, shape (outputs, inputs); see :func:`ftlm.analysis.dcgain`."""
+        """Return the steady-state gains, shape (outputs, inputs); see :func:`ftlm.analysis.dcgain`."""
         from ftlm.analysis.poles import dcgain
 
         return dcgain(self)
 
     @check_arguments
     def step(self, time: ArrayLike | None = None) -> TimeResponse:
-        """Response to unit steps from rest with its standard deviation, plotted in notebooks.
+        """Return the response to unit steps from rest with its standard deviation; notebooks show it as a plot.
 
         Parameters
         ----------
         time
-            Regular sample times from 0 [s], at least 3; by default until the response has settled.
+            Uniform sample times from 0 [s], at least 3; by default up to the settling time.
 
         Returns
         -------
         TimeResponse
-            ``.time``, ``.values`` of shape (outputs, inputs, N), ``.deviation`` from the covariance or None.
+            Response with ``.time``, ``.values`` of shape (outputs, inputs, N), and ``.deviation``, the standard
+            deviation from the covariance or None.
 
         Raises
         ------
         DataError
-            Sample times that are not regular from 0.
+            If the sample times are not uniform from 0.
         ModelError
             An input with saturation or dead zone.
         ConvergenceError
-            An unstable model whose response overflows.
+            If the response of an unstable model overflows.
         """
         from ftlm.plot.model_charts import time_response
 
@@ -311,29 +312,29 @@ class Model:
 
     @check_arguments
     def impulse(self, time: ArrayLike | None = None) -> TimeResponse:
-        """Response to unit impulses, averaged over each sampling interval; otherwise as :meth:`step`."""
+        """Return the response to unit impulses, averaged over each sampling interval; otherwise like :meth:`step`."""
         from ftlm.plot.model_charts import time_response
 
         return time_response(self, time, "impulse")
 
     @check_arguments
     def bode(self, w: ArrayLike | None = None) -> Bode:
-        """Gain and phase with 95 % bands, plotted in notebooks.
+        """Return gain and phase of the frequency response with 95 % bands; notebooks show them as a plot.
 
         Parameters
         ----------
         w
-            Angular frequencies [rad/s]; by default around the corner frequencies of the model.
+            Angular frequencies [rad/s]; by default a range around the corner frequencies of the model.
 
         Returns
         -------
         Bode
-            ``.frequency``, ``.curves`` with gain [dB] and phase [degrees].
+            Result with ``.frequency`` [rad/s] and ``.curves``, which have gain [dB] and phase [degrees].
 
         Raises
         ------
         DataError
-            Frequencies that are not finite numbers from 0.
+            If a frequency is negative or not finite.
         ModelError
             An input with saturation or dead zone.
         """
@@ -345,21 +346,22 @@ class Model:
     def from_control(
         cls, system: Any, *, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None
     ) -> Model:
-        """Convert a continuous system of python-control to a model of integer orders, one equation per output.
+        """Return a model of integer orders, one equation per output, from a continuous-time python-control system.
 
         Parameters
         ----------
         system
-            ``control.StateSpace`` or ``control.TransferFunction``. Equations represent the transfer behavior.
-            Uncontrollable or unobservable parts cancel only if they cancel exactly.
+            ``control.StateSpace`` or ``control.TransferFunction``. The equations represent its transfer functions.
+            Uncontrollable or unobservable parts are removed only if they cancel exactly.
         inputs, outputs
-            Names of the signals; default the system's own, ``u[0]`` as ``u``, or ``u0`` beside others.
+            Names of the signals. By default those of the system, where ``u[0]`` becomes ``u``, or ``u0`` if there are
+            several.
 
         Raises
         ------
         ModelError
-            A discrete-time system, another type, an output without dynamics or input, more zeros than poles, an order
-            above 10, invalid or too few names.
+            If the system is discrete-time or of another type, an output has no dynamics or no input, there are more
+            zeros than poles, an order is above 10, or names are invalid or too few.
         """
         from ftlm.analysis.conversion import structure_of
 
@@ -367,21 +369,22 @@ class Model:
 
     @check_arguments
     def to_control(self, *, band: tuple[float, float], order: int = 5) -> Any:
-        """Convert to python-control by Oustaloup's approximation; see :func:`ftlm.analysis.to_control`."""
+        """Return a python-control system by Oustaloup's approximation; see :func:`ftlm.analysis.to_control`."""
         from ftlm.analysis.rational_approximation import to_control
 
         return to_control(self, band=band, order=order)
 
     @check_arguments
     def series(self, following: Model) -> Model:
-        """Return the model of `following` driven by the output of this one, exactly.
+        """Return the exact series connection: the output of this model is the input of `following`.
 
-        Both have one output and one input. Delays add up; common factors are not cancelled.
+        Both models must have one output and one input. Their delays are added. Common factors are not canceled.
 
         Raises
         ------
         ModelError
-            More than one output or input, friction, a saturation, a dead zone, a sensor filter; an order above 10.
+            If a model has more than one output or input, friction, a saturation, a dead zone or a sensor filter, or an
+            order exceeds 10.
         """
         from ftlm.analysis.model_algebra import series
 
@@ -389,14 +392,14 @@ class Model:
 
     @check_arguments
     def parallel(self, other: Model) -> Model:
-        """Return the model whose output is the sum of both outputs from the same input, exactly.
+        """Return the exact parallel connection: the sum of both outputs from the same input.
 
-        Both have one output and one input; common factors are not cancelled.
+        Both models must have one output and one input. Common factors are not canceled.
 
         Raises
         ------
         ModelError
-            Different delays, and everything that :meth:`series` refuses.
+            If the delays differ, or in the cases of :meth:`series`.
         """
         from ftlm.analysis.model_algebra import parallel
 
@@ -404,7 +407,7 @@ class Model:
 
     @check_arguments
     def feedback(self, back: Model | float = 1.0, *, sign: int = -1) -> Model:
-        """Return the closed loop G / (1 - sign G H) of this model G, exactly.
+        """Return the exact closed loop G / (1 - sign G H), where G is this model.
 
         Parameters
         ----------
@@ -416,19 +419,19 @@ class Model:
         Raises
         ------
         ModelError
-            A delay in the loop, and everything that :meth:`series` refuses.
+            If there is a delay in the loop, or in the cases of :meth:`series`.
         """
         from ftlm.analysis.model_algebra import feedback
 
         return feedback(self, back, sign)
 
     def inverse(self) -> Model:
-        """Return the model from the output to the input, exactly.
+        """Return the exact inverse model, from the output to the input.
 
         Raises
         ------
         ModelError
-            A delay; a strictly proper model, whose inverse is improper; and everything that :meth:`series` refuses.
+            If the model has a delay or is strictly proper (its inverse is improper), or in the cases of :meth:`series`.
         """
         from ftlm.analysis.model_algebra import inverse
 
@@ -442,14 +445,14 @@ class Model:
 
     @check_arguments
     def to_ss(self, *, step: float | None = None) -> Any:
-        """Convert a model of integer orders to a state space of python-control; see :func:`ftlm.analysis.to_ss`."""
+        """Return a model of integer orders as an exact python-control StateSpace; see :func:`ftlm.analysis.to_ss`."""
         from ftlm.analysis.conversion import to_ss
 
         return to_ss(self, step=step)
 
     @check_arguments
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the model as JSON, atomically.
+        """Write the model to a JSON file, atomically, and return the path.
 
         Parameters
         ----------
@@ -461,7 +464,7 @@ class Model:
         Raises
         ------
         DataError
-            The file exists and ``force`` is not set, or cannot be written.
+            If the file exists and ``force`` is False, or it cannot be written.
         """
         from ftlm.model.serialization import write_model
 
@@ -477,6 +480,6 @@ class Model:
 
 
 def check_model(model: object) -> None:
-    """Raise if an object is not a model."""
+    """Raise ModelError if an object is not a model."""
     if not isinstance(model, Model):
         raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")

@@ -15,7 +15,7 @@ from ftlm.utils.files import to_frame
 
 @dataclass(frozen=True)
 class Parameter:
-    """Parameter of an identified model.
+    """Parameter of an identified model: value, standard error, interval and unit.
 
     Parameters
     ----------
@@ -24,15 +24,15 @@ class Parameter:
     value
         Estimate, or the given value of a fixed parameter.
     standard_error
-        Standard error; NaN if the parameter is fixed or the method gives none, infinite if the data do not determine
-        it.
+        Standard error; NaN if the parameter is fixed or the method gives none, infinite if the parameter is not
+        identifiable.
     interval
-        Ends of the 95 % confidence interval, by standard errors or profile likelihood; infinite where the data do not
-        bound the parameter, NaN where there is no standard error.
+        (low, high) of the 95 % confidence interval, from the standard error or by profile likelihood. A bound is
+        infinite if the data do not bound the parameter, and NaN without a standard error.
     unit
-        Unit; empty if the parameter is dimensionless or the unit of a signal is unknown.
+        SI unit; empty if the parameter is dimensionless or the unit of a signal is unknown.
     fixed
-        Whether the value was given and not estimated.
+        Whether the value was given by the user, not estimated.
     """
 
     name: str
@@ -69,7 +69,7 @@ def parameter_estimates(
     model
         Model or circuit, for the units.
     values, errors, intervals
-        Values, and standard errors and 95 % intervals of those that have them.
+        Values by name; standard errors and 95 % intervals by name for those that have them.
     free
         Names of the estimated parameters; the others are fixed.
     """
@@ -82,7 +82,7 @@ def parameter_estimates(
 
 
 def parameter_frame(parameters: Iterable[Parameter], reference_values: Mapping[str, float]) -> Any:
-    """Return parameters as a pandas frame by name: value, standard error, 95 % interval, unit, nominal value."""
+    """Return a pandas DataFrame of parameters: value, standard error, 95 % interval, unit, nominal value."""
     rows = [
         {
             "parameter": p.name,
@@ -100,7 +100,7 @@ def parameter_frame(parameters: Iterable[Parameter], reference_values: Mapping[s
 
 
 def parameter_units(model: Model) -> dict[str, str]:
-    """Return the unit of every named coefficient, friction, delay and limit whose unit is known."""
+    """Return the units of coefficients, friction, delays and limits by name, as far as known."""
     out = {}
     for item in model.equations:
         alpha = item.order.constant

@@ -1,4 +1,4 @@
-"""Model file: JSON schema, reading and writing."""
+"""Model file: its JSON schema, and functions that read and write it."""
 
 from __future__ import annotations
 
@@ -30,9 +30,11 @@ STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA, NONLINEAR_SCHEMA, PIE
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Term of an equation: coefficient without its factor, name of the free parameter it was.
+    """Term of an equation in a model file.
 
-    A non-linear term has the text of its expression.
+    The coefficient is stored without its factor, with the name of the parameter that it was.
+
+    A nonlinear term is stored with the text of its expression.
     """
 
     signal: str
@@ -44,18 +46,18 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, item: Term) -> TermFile:
-        """Convert a term to its file form."""
+        """Return the file form of a term."""
         shape = UNSET if item.nonlinear is None else str(item.nonlinear)
         return cls(item.signal, item.order.constant, float(item.coefficient), item.factor, item.name, shape)
 
     def term(self) -> Term:
-        """Return the term."""
+        """Return the term from its file form."""
         shape = UNSET if isinstance(self.expression, UnsetType) else EquationParser(self.expression).parse_expression()
         return Term(self.signal, Order(self.order), self.coefficient, self.factor, self.name, shape)
 
 
 class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Stribeck part of a friction: coefficient without its factor, speed of its decay."""
+    """Stribeck term of friction in a model file: coefficient without its factor, and Stribeck speed."""
 
     coefficient: float
     speed: float
@@ -65,7 +67,7 @@ class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Friction of an equation's output: Coulomb coefficient without its factor."""
+    """Friction of an equation in a model file: Coulomb coefficient without its factor, and any Stribeck term."""
 
     coefficient: float
     factor: float = -1.0
@@ -74,7 +76,7 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, rubs: Friction) -> FrictionFile:
-        """Convert a friction to its file form."""
+        """Return the file form of a friction."""
         out, near = cls(float(rubs.coefficient), rubs.factor, rubs.name), rubs.stribeck
         if near is not None:
             more = StribeckFile(float(near.coefficient), float(near.speed), near.factor, near.name, near.speed_name)
@@ -82,19 +84,19 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
         return out
 
     def friction(self) -> Friction:
-        """Return the friction."""
+        """Return the friction from its file form."""
         s = self.stribeck
         near = UNSET if s is UNSET else Stribeck(s.coefficient, s.speed, s.factor, s.name, s.speed_name)
         return Friction(self.coefficient, self.factor, self.name, near)
 
     @property
     def count(self) -> int:
-        """Number of parameters."""
+        """Number of friction parameters."""
         return 1 if self.stribeck is UNSET else 3
 
 
 class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Saturation or dead zone of an input, in its unit."""
+    """Saturation or dead zone of an input in a model file, in the unit of the input."""
 
     signal: str
     law: NonlinearityKind
@@ -102,7 +104,7 @@ class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Equation with numerical orders."""
+    """Equation with numerical orders in a model file."""
 
     output: str
     order: float
@@ -111,25 +113,25 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, item: Equation) -> EquationFile:
-        """Convert an equation to its file form."""
+        """Return the file form of an equation."""
         terms = [TermFile.of(t) for t in item.terms]
         friction = UNSET if item.friction is None else FrictionFile.of(item.friction)
         return cls(item.output, item.order.constant, terms, friction)
 
     def equation(self) -> Equation:
-        """Return the equation."""
+        """Return the equation from its file form."""
         terms = tuple(t.term() for t in self.terms)
         rubs = UNSET if self.friction is UNSET else self.friction.friction()
         return Equation(self.output, Order(self.order), terms, rubs)
 
     @property
     def count(self) -> int:
-        """Number of parameters, as in a covariance."""
+        """Number of parameters of the equation in a covariance: orders, coefficients and friction."""
         return 1 + 2 * len(self.terms) + (0 if self.friction is UNSET else self.friction.count)
 
     @property
     def schema(self) -> int:
-        """Schema version that friction and non-linear terms need."""
+        """Smallest schema version that can represent the equation."""
         if any(t.expression is not UNSET for t in self.terms):
             return NONLINEAR_SCHEMA
         if self.friction is UNSET:
@@ -138,7 +140,10 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Sensor filter of outputs, which every version reads, or of any signals."""
+    """Sensor filter in a model file.
+
+    A filter of outputs is stored so that every version can read it, one of any signals in a newer form.
+    """
 
     numerator: tuple[tuple[float, float], ...]
     denominator: tuple[tuple[float, float], ...]
@@ -147,7 +152,7 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, structure: Structure) -> FilterFile | None:
-        """Convert the sensor filter of a structure; None without one."""
+        """Return the file form of a structure's sensor filter; None without a filter."""
         sensor = structure.sensor_filter
         if sensor is None:
             return None
@@ -156,10 +161,12 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
         return cls(sensor.numerator, sensor.denominator, signals=sensor.signals)
 
     def sensor(self, *, followed: Collection[str]) -> SensorFilter | None:
-        """Return the sensor filter; ``followed`` are the outputs of coupled equations, else empty.
+        """Return the sensor filter from its file form; None if it applies to no signal.
 
-        A filter of outputs applies to the coupled outputs, or without coupling to every signal it names. An input named
-        beside coupled outputs is ignored.
+        ``followed`` are the outputs of coupled equations; it is empty with measured coupling.
+
+        A filter in the old form applies to the coupled outputs that it names, or with measured coupling to every signal
+        that it names.
         """
         if isinstance(self.signals, UnsetType) == isinstance(self.outputs, UnsetType):
             raise ModelError("its sensor filter has neither signals nor outputs, or both; one of them names them")
@@ -171,7 +178,7 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Model without data that only identification needs."""
+    """File form of a model, without data that only the identification requires."""
 
     format: Literal["ftlm-model"]
     schema: int
@@ -191,7 +198,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, model: Model) -> ModelFile:
-        """Convert a model to its file form."""
+        """Return the file form of a model."""
         s = model.structure
         # Absent fields are omitted, so that files of older structures do not change.
         offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
@@ -218,12 +225,12 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def restore_model(self) -> Model:
-        """Return the model.
+        """Return the model from its file form.
 
         Raises
         ------
         ModelError
-            Invalid equations, or a covariance of the wrong size.
+            If an equation is invalid, or the covariance has the wrong size.
         """
         followed = [e.output for e in self.equations] if self.coupling == "simulated" else []
         sensor = None if self.sensor_filter is None else self.sensor_filter.sensor(followed=followed)
@@ -258,7 +265,10 @@ def schema_of(
     sensor: FilterFile | None,
     estimate: Estimate | None,
 ) -> int:
-    """Smallest schema version that contains all parts of a model, so that older files do not change."""
+    """Return the smallest schema version that can represent all parts of a model.
+
+    Files of models without newer features therefore do not change.
+    """
     profiled = estimate is not None and estimate.intervals is not UNSET
     doubted = estimate is not None and not (estimate.findings is UNSET and estimate.against is UNSET)
     is_partial = sensor is not None and not isinstance(sensor.signals, UnsetType)
@@ -276,7 +286,7 @@ def schema_of(
 
 
 def write_model(model: Model, path: str | os.PathLike[str], *, force: bool) -> Path:
-    """Write a model as JSON, atomically."""
+    """Write a model to a JSON file, atomically, and return the path; see :meth:`ftlm.Model.save`."""
     data = msgspec.json.format(msgspec.json.encode(ModelFile.of(model)), indent=2)
     return write_atomically(path, data + b"\n", force=force)
 
@@ -293,12 +303,14 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     Returns
     -------
     Model
-        Bit-identical model, without data that only identification needs (order grids, laws, references).
+        Model with bit-identical numbers, without data that only the identification requires (order grids, laws, nominal
+        values).
 
     Raises
     ------
     DataError
-        A file that does not exist, is not a model (with the place), has a later schema, or exceeds 1 MiB.
+        If the file does not exist, is not a model (the message has the position), has a later schema version, or
+        exceeds 1 MiB.
     """
     read = MODEL_FORMAT.read(path)
     of = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)

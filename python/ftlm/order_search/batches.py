@@ -1,4 +1,7 @@
-"""Batches of an order search: evaluation in this process or on an executor, bookkeeping and checkpoints."""
+"""Batches of an order search: evaluation in this process or on an executor, and checkpoints.
+
+A round is a group of candidates of one equation that the core evaluates together.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ ProgressCallback = Callable[[int, int, int], None]
 
 @dataclass(frozen=True)
 class SearchProblem(ABC, Generic[Table]):
-    """Search problem: data shared by all rounds of a search, and its reduction to a table."""
+    """Data that all batches of an order search share, with the functions of the core that evaluate them."""
 
     runs: tuple[CoreRecord, ...]
     inputs: list[bool]
@@ -60,23 +63,23 @@ class SearchProblem(ABC, Generic[Table]):
     @property
     @abstractmethod
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core after the runs."""
+        """Arguments of the core that follow the records."""
 
     def core(self, *more: Any) -> tuple[Any, ...]:
-        """Return all arguments of the core, with further ones appended."""
+        """Return all arguments of the core; `more` are appended."""
         return list(self.runs), *self.core_arguments, *more
 
     @abstractmethod
     def search(self, progress: ProgressCallback | None) -> Table:
-        """Run the whole search in this process."""
+        """Run the whole search in this process, and return its table."""
 
     @abstractmethod
     def build_evaluator(self) -> _core.OrderSearch | _core.StageSearch:
-        """Build the evaluator shared by all blocks of the search."""
+        """Return the core's evaluator, which all blocks of the search share."""
 
     @property
     def key(self) -> str:
-        """Digest that identifies the search among workers."""
+        """Digest that identifies the search among several searches of a worker."""
         digest = hashlib.blake2b(digest_size=16)
         for step, means, sensor in self.runs:
             digest.update(msgspec.msgpack.encode((step, means.shape, sensor is None)))
@@ -88,44 +91,47 @@ class SearchProblem(ABC, Generic[Table]):
 
 @dataclass(frozen=True)
 class EquationProblem(SearchProblem["_core._Found"]):
-    """Search problem of one equation: output, values of its order, and signal, values and freedom of each term."""
+    """Order search of one equation: its output, grid values of its order, and of the order of each term."""
 
     orders: tuple[int, list[float], list[tuple[int, list[float], bool]]]
     fixed: list[float | None]
 
     @property
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core after the runs."""
+        """Arguments of the core that follow the records."""
         return self.orders, self.inputs, self.fixed, self.initial, self.settings.core_arguments(self.threads)
 
     def search(self, progress: ProgressCallback | None) -> _core._Found:
-        """Run the whole search in this process."""
+        """Run the whole search in this process, and return its table."""
         return _core.search(*self.core(progress))
 
     def build_evaluator(self) -> _core.OrderSearch:
-        """Build the evaluator shared by all rounds."""
+        """Return the core's evaluator, which all rounds share."""
         return _core.OrderSearch(*self.core())
 
     def plan(self, algorithm: int | None = None) -> tuple[int, list[int], int]:
-        """Return number of candidates, ends of the batches by this or an earlier algorithm, and algorithm version."""
+        """Return (number of candidates, end of each batch, version of the algorithm).
+
+        `algorithm` is an earlier version, whose batches a checkpoint file may have.
+        """
         return _core.search_plan(
             self.orders, self.inputs, self.initial, self.settings.core_arguments(self.threads), algorithm
         )
 
     @property
     def samples(self) -> int:
-        """Total number of pulses of all records."""
+        """Total number of block pulses of all records."""
         return sum(int(means.shape[1]) for _, means, _ in self.runs)
 
     def join(self, parts: list[Part]) -> _core._Found:
-        """Join the parts of all rounds."""
+        """Return the table of the search from the results of all rounds."""
         settings = self.settings.core_arguments(self.threads)
         return _core.search_join(self.orders, self.inputs, self.initial, settings, self.samples, parts)
 
 
 @dataclass(frozen=True)
 class CoupledProblem(SearchProblem["_core._FoundStage"]):
-    """Search problem of coupled equations: values of the free orders, order law, and a scale of each score."""
+    """Order search of coupled equations: grid values of the free orders, the order law, and a scale for each score."""
 
     axes: list[list[float]]
     laws: list[tuple[int, tuple[float, list[float]], list[tuple[int, tuple[float, list[float]]]]]]
@@ -134,7 +140,7 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
 
     @property
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core after the runs."""
+        """Arguments of the core that follow the records."""
         return (
             self.axes,
             self.laws,
@@ -146,11 +152,11 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
         )
 
     def search(self, progress: ProgressCallback | None) -> _core._FoundStage:
-        """Run the whole search in this process."""
+        """Run the whole search in this process, and return its table."""
         return _core.search_stage(*self.core(progress))
 
     def build_evaluator(self, *, keeps_course: bool = False) -> _core.StageSearch:
-        """Build the evaluator shared by all candidates, and optionally the state of the search."""
+        """Return the core's evaluator, which all candidates share; with `keeps_course` it stores the search state."""
         return _core.StageSearch(*self.core(keeps_course))
 
 
@@ -159,7 +165,7 @@ _lock = threading.Lock()
 
 
 def _new_lock() -> None:
-    """Replace the lock, which another thread may have held when this process was forked."""
+    """Replace the lock after a fork, because another thread may have held it in the parent process."""
     global _lock  # noqa: PLW0603
     _lock = threading.Lock()
 
@@ -177,7 +183,10 @@ def evaluate_rounds(
     start: Any,
     threads: int,
 ) -> tuple[float, Part] | None:
-    """Evaluate rounds in a worker: return seconds and part, or None if the search is neither cached nor given."""
+    """Evaluate rounds `first` to `last` in a worker, and return (seconds, result).
+
+    None if the worker has no search with this key in its cache and `work` is None.
+    """
     return _run_cached(
         key, work, lambda search: cast("Part", search.rounds(first, last, seed, start, threads, None, None))
     )
@@ -186,7 +195,10 @@ def evaluate_rounds(
 def evaluate_candidates(
     key: str, work: CoupledProblem | None, spans: list[Span], threads: int
 ) -> tuple[float, Outcomes] | None:
-    """Evaluate candidates in a worker: return seconds and verdicts, or None if the search is unavailable."""
+    """Evaluate candidates of a coupled search in a worker, and return (seconds, outcomes).
+
+    None if the worker has no search with this key in its cache and `work` is None.
+    """
     return _run_cached(key, work, lambda search: cast("Outcomes", search.follow(spans, threads, None)))
 
 
@@ -216,7 +228,7 @@ POLL_INTERVAL_S = 0.05
 
 @dataclass
 class CandidateBlock:
-    """Contiguous block of rounds or candidates to evaluate, from a checkpoint or from its start."""
+    """Contiguous block of rounds or candidates to evaluate, from its start or from a checkpoint within it."""
 
     first: int
     last: int
@@ -226,7 +238,7 @@ class CandidateBlock:
 
 
 def worker_count(executor: Executor) -> int:
-    """Number of tasks that an executor runs concurrently, as far as it is known."""
+    """Return the number of tasks that an executor runs concurrently, as far as its attributes reveal it."""
     count = getattr(executor, "_max_workers", None)
     client = getattr(executor, "_client", None)
     if count is None and client is not None:
@@ -237,17 +249,17 @@ def worker_count(executor: Executor) -> int:
 
 @dataclass
 class Throughput:
-    """Throughput: seconds per round or candidate, once known, and the minimum number in a task."""
+    """Evaluation time per round or candidate, as measured, from which the size of a task follows."""
 
     seconds_each: float = 0.0
     min_count: int = 1
 
     def count_for(self, seconds: float) -> int:
-        """Number of rounds or candidates that take about the given time."""
+        """Return the number of rounds or candidates that take about the given time."""
         return self.min_count if self.seconds_each == 0 else max(self.min_count, int(seconds / self.seconds_each))
 
     def update(self, seconds: float, count: int) -> None:
-        """Update the throughput by a measured time."""
+        """Update the throughput from the time that a number of rounds or candidates took."""
         each = max(seconds, 1e-9) / count
         self.seconds_each = each if self.seconds_each == 0 else 0.7 * self.seconds_each + 0.3 * each
 
@@ -258,7 +270,7 @@ def run_on_executor(
     executor: Executor,
     throughput: Throughput,
 ) -> Iterator[tuple[CandidateBlock, Any]]:
-    """Submit blocks in tasks of about :data:`TASK_DURATION_S` seconds each, and yield their results."""
+    """Submit blocks in tasks of about :data:`TASK_DURATION_S` seconds, and yield (block, result) pairs."""
     count = worker_count(executor)
     queue_size = TASKS_PER_WORKER * count + 2
     # In a small batch every worker gets a share.
@@ -293,7 +305,7 @@ def run_on_executor(
 
 
 def _result(future: Future[Any], block: CandidateBlock) -> tuple[float, Any] | None:
-    """Return seconds and result of a task, or None if it must be sent again."""
+    """Return (seconds, result) of a task, or None if the worker lacked the search and the task must be sent again."""
     try:
         timed = cast("tuple[float, Any] | None", future.result())
     except FtlmError:
@@ -332,7 +344,7 @@ Save = Callable[[int, int, Checkpoint | None], None]
 
 
 class SearchState(ABC, Generic[Frame, Table]):
-    """Search state: number of candidates done and in total, and the current batch."""
+    """State of an order search in progress: numbers of candidates done and in total, and the current batch."""
 
     #: Whether a search begun by an earlier version can be resumed.
     can_resume = True
@@ -350,18 +362,18 @@ class SearchState(ABC, Generic[Frame, Table]):
         return self.work.key
 
     def payload(self, block: CandidateBlock) -> SearchProblem[Table] | None:
-        """Search problem to send with a block, or None unless a worker reported that it lacks it."""
+        """Return the search problem if it must be sent with a block, because a worker reported that it lacks it."""
         return self.work if block.with_problem else None
 
     @abstractmethod
     def batches(self) -> Iterator[tuple[int, int]]:
-        """Yield first index and end of each batch; the next is constructed once the previous one is complete."""
+        """Yield (first index, end) of each batch; a batch is constructed when the previous one is complete."""
 
     @abstractmethod
     def evaluate_locally(
         self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Any]]:
-        """Evaluate blocks in this process."""
+        """Evaluate blocks in this process, and yield (block, result) pairs."""
 
     @abstractmethod
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
@@ -369,19 +381,22 @@ class SearchState(ABC, Generic[Frame, Table]):
 
     @abstractmethod
     def frame(self, number: int, block: CandidateBlock, piece: Any) -> Frame:
-        """Convert the result of a block to a frame of search ``number``."""
+        """Return the checkpoint record of a block's result; `number` is the index of the search in the file."""
 
     @abstractmethod
     def add_block(self, frame: Frame) -> int:
-        """Add a block to the current batch; return how many of its candidates were stopped early, if known."""
+        """Add a block to the current batch; return how many of its candidates need further evaluation, if known."""
 
     @abstractmethod
     def table(self) -> Table:
-        """Reduce all batches to the table."""
+        """Return the table of the search from all batches."""
 
 
 class EquationSearchState(SearchState[Rounds, "_core._Found"]):
-    """Search state of one equation; the rounds of a batch depend on the best rows of earlier batches."""
+    """State of the order search of one equation.
+
+    The rounds of a batch use the best rows of earlier batches as thresholds.
+    """
 
     core_reports_progress = True
     work: EquationProblem
@@ -398,7 +413,10 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         return self.work.build_evaluator()
 
     def batches(self) -> Iterator[tuple[int, int]]:
-        """Yield batches of rounds with the same rows, each with its own throughput: later ones exclude more."""
+        """Yield batches of rounds that use the same thresholds.
+
+        Each batch has its own throughput, because later ones exclude more candidates.
+        """
         first, keep = 0, self.work.settings.top
         for end in self._ends:
             ranked = sorted({(row[1], row[0]) for part in self._parts for row in part[0]})[:keep]
@@ -412,7 +430,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
     def evaluate_locally(
         self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Part]]:
-        """Evaluate each block in one call, from its checkpoint."""
+        """Evaluate each block in one call of the core, from its checkpoint, and yield (block, result) pairs."""
         for block in blocks:
             first, last = block.first, block.last
             listener = None if progress is None else partial(self._report_progress, progress, self.done)
@@ -426,33 +444,33 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         progress(min(count_before + count, self.total), self.total, pruned)
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
-        """Return the function and arguments that evaluate a block of rounds."""
+        """Return the function and its arguments that evaluate a block of rounds in a worker."""
         ranged = block.first, block.last, self._seed, block.start, self.threads
         return evaluate_rounds, self.key, self.payload(block), *ranged
 
     def frame(self, number: int, block: CandidateBlock, piece: Part) -> Rounds:
-        """Return the frame of a block of rounds."""
+        """Return the checkpoint record of a block of rounds."""
         return Rounds(number, block.first, block.last, piece)
 
     def add_block(self, frame: Rounds) -> int:
-        """Add a block of rounds."""
+        """Add a block of rounds to the current batch."""
         self._parts.append(frame.part)
         self.done += finished_count(frame.part[1])
         return 0
 
     def table(self) -> _core._Found:
-        """Join the parts of all rounds."""
+        """Return the table of the search from all rounds."""
         return self.work.join(self._parts)
 
 
 def _drop_beaten_rows(worst: tuple[float, int], part: Part) -> Part:
-    """Return a part without rows worse than the last ranked one."""
+    """Return a result without rows that are worse than `worst`, the last row of the current table."""
     rows, counts, failures = part
     return tuple(row for row in rows if (row[1], row[0]) <= worst), counts, failures
 
 
 class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
-    """Search state of coupled equations; the candidates of a batch depend on earlier batches."""
+    """State of a coupled order search; the candidates of a batch depend on the results of earlier batches."""
 
     work: CoupledProblem
 
@@ -464,7 +482,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         self._wave: list[Verdicts] = []
 
     def batches(self) -> Iterator[tuple[int, int]]:
-        """Yield batches of the candidates required next, numbered through all batches."""
+        """Yield batches of the candidates that are required next, numbered consecutively through all batches."""
         while spans := self.search.pending_spans():
             end = self._first + sum(last - first for _, first, last, _ in spans)
             self._spans, self._wave = spans, []
@@ -477,7 +495,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
     def evaluate_locally(
         self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Outcomes]]:
-        """Evaluate candidates in tasks of about :data:`CHECKPOINT_INTERVAL_S` seconds."""
+        """Evaluate candidates in steps of about :data:`CHECKPOINT_INTERVAL_S` seconds; yield (block, result) pairs."""
         for block in blocks:
             at = block.first
             while at < block.last:
@@ -489,11 +507,14 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
                 at = piece.last
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
-        """Return the function and arguments that evaluate a block of candidates."""
+        """Return the function and its arguments that evaluate a block of candidates in a worker."""
         return evaluate_candidates, self.key, self.payload(block), self._cut(block), self.threads
 
     def _cut(self, block: CandidateBlock) -> list[Span]:
-        """Return the candidates of a block as spans, counted through all spans of the batch."""
+        """Return the candidates of a block as spans (ranges) of candidate indices.
+
+        A block is counted through all spans of the batch.
+        """
         cut, at = [], self._first
         for equation, start, end, limit in self._spans:
             low, high = max(block.first - at, 0), min(block.last - at, end - start)
@@ -503,22 +524,22 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         return cut
 
     def frame(self, number: int, block: CandidateBlock, piece: Outcomes) -> Verdicts:
-        """Return the frame of a block of candidates."""
+        """Return the checkpoint record of a block of candidates."""
         return Verdicts(number, block.first, block.last, *piece)
 
     def add_block(self, frame: Verdicts) -> int:
-        """Add a block of verdicts."""
+        """Add a block of results to the current batch."""
         self._wave.append(frame)
         self.done += len(frame.kinds)
         return frame.kinds.count(1) + frame.kinds.count(2)
 
     def table(self) -> _core._FoundStage:
-        """Join the equations under their order law."""
+        """Return the table of the search, in which the equations are joined under their order law."""
         return self.search.outcome()
 
 
 def _join_verdicts(batch: list[Verdicts], first: int, end: int) -> Outcomes:
-    """Return the verdicts of a batch in order; raise ModelError if its blocks do not cover it."""
+    """Return the results of a batch in sequence; raise ModelError if its blocks do not cover the batch."""
     at, values, kinds = first, [], []
     for verdicts in sorted(batch, key=lambda v: v.first):
         if verdicts.first != at:
@@ -539,7 +560,11 @@ def search_equation(
     executor: Executor | None,
     progress: ProgressCallback | None,
 ) -> _core._Found:
-    """Search the orders of one equation: in one call here, or in rounds with a checkpoint file or executor."""
+    """Return the table of the order search of one equation.
+
+    Without a checkpoint file and an executor it takes one call of the core, otherwise it proceeds in batches. `number`
+    is the index of the search in the file.
+    """
     if store is None and executor is None:
         return work.search(progress)
     algorithm = None if store is None else store.contents.algorithm
@@ -554,7 +579,10 @@ def search_coupled(
     executor: Executor | None,
     progress: ProgressCallback | None,
 ) -> _core._FoundStage:
-    """Search coupled equations under an order law, like :func:`search_equation`; a finished search is only read."""
+    """Return the table of the order search of coupled equations, like :func:`search_equation`.
+
+    The table of a finished search is read from the checkpoint file.
+    """
     if store is None and executor is None:
         return work.search(progress)
     joined = None if store is None else store.contents.sections[number].table
@@ -573,7 +601,7 @@ def _run_batches(
     executor: Executor | None,
     progress: ProgressCallback | None,
 ) -> Table:
-    """Evaluate all blocks that a checkpoint file lacks, batch by batch, and join them."""
+    """Evaluate all blocks that the checkpoint file lacks, batch by batch, and return the table."""
     section = None if store is None else store.contents.sections[number]
     save = None if store is None else partial(store.save, number)
     pruned = 0
@@ -602,7 +630,7 @@ def _run_batches(
 
 
 def equation_state(work: EquationProblem, section: Section) -> tuple[int, float | None]:
-    """Number of candidates of one equation, and the best score so far."""
+    """Return the number of candidates of one equation, and the best score in a checkpoint file."""
     best = section.best
     if best is not None and work.settings.norm == "l2":
         best = math.sqrt(max(best, 0.0) / work.samples)
@@ -610,7 +638,7 @@ def equation_state(work: EquationProblem, section: Section) -> tuple[int, float 
 
 
 def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | None]:
-    """Number of candidates of a coupled search, as far as a checkpoint file determines it, and the best score."""
+    """Return the number of candidates of a coupled search, as far as known, and the best score in a checkpoint file."""
     if section.table is not None:
         return section.processed_count, _table(work, section.table)["rows"][0][1]
     state = CoupledSearchState(work)
@@ -623,7 +651,10 @@ def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | 
 
 
 def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
-    """Return the table of a finished search in the form of the core; raise ModelError for another search."""
+    """Return the stored table of a finished search in the form of the core.
+
+    Raise ModelError if it belongs to another search.
+    """
     widths = [len(terms) for _, _, terms in work.laws]
     dealt = sum(v for k, v in joined.counts.items() if k != "candidates")
     sound = (
@@ -641,12 +672,15 @@ def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
 
 
 def _stored_frames(section: Section | None, first: int, end: int) -> list[Any]:
-    """Return the stored frames of a batch."""
+    """Return the checkpoint records of complete blocks of a batch."""
     return [] if section is None else [frame for at, frame in section.frames.items() if first <= at < end]
 
 
 def _pending_blocks(section: Section | None, first: int, end: int) -> Iterator[CandidateBlock]:
-    """Yield the blocks of a batch to evaluate: partial ones from their checkpoint, and the gaps between."""
+    """Yield the blocks of a batch that remain to be evaluated.
+
+    They are partial blocks, from their checkpoint, and the gaps between stored blocks.
+    """
     blocks: list[CandidateBlock] = []
     if section is not None:
         blocks = [CandidateBlock(at, frame.last) for at, frame in section.frames.items()]

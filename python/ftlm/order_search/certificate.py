@@ -1,4 +1,4 @@
-"""Certificate of an order search: lower bound of the equation error over all orders of an interval."""
+"""Certificate of an order search: a lower bound of the equation error over intervals of orders."""
 
 from __future__ import annotations
 
@@ -46,40 +46,43 @@ def certify_orders(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
-    """Certify that no orders in the intervals of an order grid, on it or between, have a much smaller equation error.
+    """Compute a lower bound of the equation error over all orders in the intervals of a grid, on it or between.
 
-    Branch and bound halves boxes of orders until each has a lower bound of the RMS equation error, with the best
-    coefficients of each of its orders, of at least the best one found times ``1 - tolerance``. The certificate covers
-    squared equation errors, equations at rest, and free coefficients only. No such certificate is known for
-    simulations: a finding says where the simulation of the best orders grows or explains little of the output.
+    It certifies that no orders have an error much smaller than the best one found.
+
+    Branch and bound halves boxes of orders. It stops when the RMS equation error has a lower bound in every box, for
+    the best coefficients at all its orders, of at least ``1 - tolerance`` times the smallest error found. The
+    certificate covers only squared equation errors, equations at rest, and free coefficients. No such certificate is
+    known for simulations; a finding reports if the simulation at the best orders is unstable or explains little of the
+    output.
 
     Parameters
     ----------
     runs
-        One run or several with the same names and units; squares add up.
+        One run, or several with the same names and units, whose squared errors are added.
     equation
         One equation with free orders.
     order_grid
-        Order grid. Only the ends of its intervals are used.
+        Order grid, of which only the limits of the intervals are used.
     tolerance
-        Tolerance: how much smaller than the best error found that of other orders may be, as a fraction below 1.
+        Fraction (below 1) by which the error at other orders may be smaller than the smallest error found.
     start
-        Tuples of orders by name, such as those of another optimizer. The certificate has the error of each, and shows
-        which of them other orders may still beat.
+        Points to include, each with orders by name, such as results of another optimizer. The certificate has the error
+        of each point, and states whether other orders may be better than it.
     min_separation
-        Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.
-        At distance 0 every equation is trivially satisfied. Default: the increment of the order grid.
+        Minimum difference between alpha and the orders of output terms, and between the orders of one signal. Equations
+        with difference 0 are satisfied trivially. Default: the increment of the order grid.
     max_term_ratio
-        Maximum RMS size of all terms of an equation together, relative to that of the output. Larger terms that
-        cancel one another are not identifiable.
+        Maximum RMS of all terms of an equation together, relative to that of the output. Larger terms, which cancel one
+        another, are not identifiable.
     max_cells
-        Maximum number of boxes of orders; then the bound reached so far is returned.
+        Maximum number of boxes. When it is reached, the bound so far is returned.
     m
-        Block pulses per run; default 2 048, or as many as the runs support.
+        Number of block pulses per run; by default 2048, or fewer for shorter runs.
     threads
         Number of threads; default all cores.
     progress
-        Called about twenty times a second with (boxes done, boxes so far).
+        Callback with (boxes done, boxes so far), called about twenty times a second.
 
     Returns
     -------
@@ -89,12 +92,12 @@ def certify_orders(
     Raises
     ------
     DataError
-        Runs that do not fit.
+        If runs lack a signal of the equation.
     ModelError
-        A stage under its order law, initial terms, known coefficients, numbers out of range, intervals without orders
-        or with too many boxes.
+        If the structure is coupled under an order law, has initial terms or known coefficients, an option is out of
+        range, or the intervals contain no orders or require too many boxes.
     KeyboardInterrupt
-        Ctrl-C, within half a second.
+        On Ctrl-C, within half a second.
     """
     share = _check_tolerance(tolerance)
     most = check_integer("max_cells", max_cells, 1)
@@ -125,7 +128,10 @@ def certify_orders(
 
 
 def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: int) -> float:
-    """Return the least RMS equation error at a tuple of orders; infinite for linearly dependent terms."""
+    """Return the minimum RMS equation error at given orders; infinite for linearly dependent terms.
+
+    `index` and `count` number the point for messages.
+    """
     names = {name: (min(values), max(values)) for name, values in job.values.items()}
     numbers = {str(name): real_number("start", value) for name, value in orders.items()}
     if set(numbers) != set(names) or not all(low <= numbers[n] <= high for n, (low, high) in names.items()):
@@ -138,7 +144,7 @@ def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: in
 
 
 def _check_certifiable(job: Job) -> None:
-    """Raise ModelError if no certificate exists for a search."""
+    """Raise ModelError if no certificate can be computed for a search."""
     if job.structure.has_order_law:
         raise ModelError(
             "there is no certificate over all orders of a stage under its law; take its equations one by one"
@@ -176,7 +182,7 @@ def certify_job(
     max_cells: int = DEFAULT_MAX_CELLS,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
-    """Certify a prepared search; see :func:`certify_orders`."""
+    """Return the certificate of a prepared search; see :func:`certify_orders`."""
     _check_certifiable(job)
     record, item = job.records[0], job.structure.equations[0]
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
@@ -218,7 +224,7 @@ def certify_job(
 
 
 def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
-    """Return NR of the simulation of some orders, infinite if there is none, and the number of unstable poles."""
+    """Return the NR of the simulation at given orders (infinite if it fails), and the number of unstable poles."""
     settings = SearchSettings(**{**CERTIFIED_SETTINGS, "criterion": "output-error", "pruning": False})
     values = {name: (orders[name],) for name in job.values}
     try:
@@ -234,7 +240,7 @@ def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
 def _search_region(
     item: Equation, intervals: dict[str, tuple[float, float]], signals: Sequence[str]
 ) -> tuple[int, tuple[float, float], list[tuple[int, float, float]]]:
-    """Output, interval of its order, and signal and interval of each term, as arguments of the core."""
+    """Return (output index, interval of alpha, (signal index, low, high) of each term) for the core."""
 
     def interval(order: Any) -> tuple[float, float]:
         return intervals[order.names[0]] if order.names else (order.constant, order.constant)

@@ -1,4 +1,4 @@
-"""Records of an order search in its checkpoint file (:mod:`ftlm.utils.checkpoint_file`).
+"""Checkpoint file of an order search: its records, their validation, reading and writing.
 
 The first record is :class:`Requests`: all arguments and data of the searches, so that they can be resumed without the
 measured files. A search of one equation then appends :class:`PartialRounds` (a block of rounds with a resumption point)
@@ -43,7 +43,10 @@ Counts = Annotated[tuple[Natural, ...], msgspec.Meta(min_length=7, max_length=8)
 
 
 def finished_count(counts: Counts) -> int:
-    """Return the number of candidates that are kept or excluded; those excluded in boxes are among the bounded."""
+    """Return the number of candidates that are in the table or excluded.
+
+    Candidates excluded in boxes are already counted as excluded by a bound.
+    """
     return sum(counts[1:7])
 
 
@@ -65,7 +68,7 @@ MAX_FILTER_STATES = 10
 
 
 def check_record(record: Record) -> None:
-    """Raise ModelError for a record whose sizes are inconsistent."""
+    """Raise ModelError if the arrays of a record have inconsistent sizes."""
     sizes, sensor = (len(record.signals), len(record.inputs)), record.sensor
     shaped = record.means.ndim == 2 and (sensor is None or sensor.ndim == 1)
     if not shaped or sizes != record.means.shape[:1] * 2 or not record.means.size:
@@ -76,7 +79,7 @@ def check_record(record: Record) -> None:
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Definition of one search: its data and settings, and the name of its result."""
+    """Definition of one search: its data, its settings, and the name of its result."""
 
     name: str
     structure: Structure
@@ -87,7 +90,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     units: dict[str, str]
 
     def difference(self, other: Request) -> str | None:
-        """Describe the difference to another request, or return None."""
+        """Return text on the first difference from another request; None if both are equal."""
         if [r.offset for r in self.records] != [r.offset for r in other.records]:
             return "another offset"
         if RECORD_ENCODER.encode(self.records) != RECORD_ENCODER.encode(other.records):
@@ -103,7 +106,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="requests"):
-    """The first record."""
+    """First record of the file, with the definitions of all searches."""
 
     algorithm: int
     version: str
@@ -111,10 +114,12 @@ class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="req
 
 
 class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
-    """Partly evaluated block of rounds; rows are those found since the previous frame, failures None if unchanged.
+    """Record of a partly evaluated block of rounds, with the rows found since the block's previous record.
 
-    If the block was restarted, earlier frames are void. ``order`` is the digest of the visiting order; 0, in older
-    files, means none.
+    ``failures`` is None if unchanged.
+
+    If the block was restarted, its earlier records are void. ``order`` is the digest of the sequence in which
+    candidates are visited; 0 in older files, which have none.
     """
 
     search: Natural
@@ -129,7 +134,7 @@ class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
 
 class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rounds"):
-    """Block of rounds, complete."""
+    """Record of a completely evaluated block of rounds."""
 
     search: Natural
     first: Natural
@@ -138,10 +143,10 @@ class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="round
 
 
 class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="verdicts"):
-    """Block of candidates of a search under an order law, in its order, complete.
+    """Record of a completely evaluated block of candidates of a coupled search.
 
-    Values are raw sums as little-endian doubles. One byte each of kinds gives their meaning: 0 the whole record, 1 a
-    bound, 2 a partial sum, 3 singular, 4 diverged.
+    ``values`` are unscaled scores as little-endian doubles. ``kinds`` has one byte per value: 0 for a complete score, 1
+    for a lower bound, 2 for a partial sum, 3 for a singular candidate, 4 for a diverged one.
     """
 
     search: Natural
@@ -159,7 +164,7 @@ StageFailure = tuple[Natural, tuple[float, ...], Literal["singular", "diverged"]
 
 
 class CoupledTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joined"):
-    """Final table of a search under an order law: rows, counts by reason, first failures."""
+    """Record of the final table of a coupled search: rows, counts by reason, and first failures."""
 
     search: Natural
     rows: tuple[StageRow, ...]
@@ -173,7 +178,7 @@ FRAME_DECODER = msgspec.msgpack.Decoder(Requests | Frame, dec_hook=decode_array)
 
 @dataclass
 class PartialBlock:
-    """Partly evaluated block of rounds, with all rows found since its start."""
+    """Partly evaluated block of rounds, with all rows that were found in it so far."""
 
     last: int
     place: Place
@@ -184,15 +189,15 @@ class PartialBlock:
 
     @property
     def checkpoint(self) -> Checkpoint:
-        """Point of resumption, as an argument of the core."""
+        """Return the state from which the core resumes the block."""
         return (*self.place, self.order), False, (tuple(self.rows), self.counts, self.failures)
 
 
 @dataclass
 class Section:
-    """Progress of one search: blocks (of rounds, or of candidates under an order law), complete or partial.
+    """Progress of one search as stored: its complete and partial blocks.
 
-    Both are indexed by their first round or candidate.
+    Blocks are indexed by their first round, or candidate of a coupled search.
     """
 
     law: bool = False
@@ -202,7 +207,7 @@ class Section:
     _firsts: list[int] = field(default_factory=list)
 
     def add_frame(self, frame: Frame) -> None:
-        """Add a frame; raise ModelError for a duplicate, an empty block, or another kind of search."""
+        """Add a record; raise ModelError if it is a duplicate, has an empty block, or is of another kind of search."""
         if self.table is not None or (isinstance(frame, CoupledTable) and not self.law):
             raise ModelError("it has an unexpected final table")
         if isinstance(frame, CoupledTable):
@@ -244,14 +249,14 @@ class Section:
 
     @property
     def best(self) -> float | None:
-        """Smallest raw score so far, for the search of one equation."""
+        """Smallest unscaled score so far in the search of one equation; None for a coupled search."""
         rows = [row for frame in self.frames.values() if isinstance(frame, Rounds) for row in frame.part[0]]
         return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
 
 
 @dataclass
 class Contents:
-    """Contents of a checkpoint file."""
+    """Contents of a checkpoint file: definitions and progress of its searches."""
 
     requests: tuple[Request, ...]
     sections: list[Section]
@@ -262,13 +267,13 @@ class Contents:
 
 
 def read_store(path: str | os.PathLike[str]) -> Contents:
-    """Read the intact part of a checkpoint file, which may be in use."""
+    """Return the contents of the intact part of a checkpoint file, which may be in use."""
     with CheckpointFile(path, "search") as file:
         return contents_of(path, *file.read())
 
 
 def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corruption: str | None) -> Contents:
-    """Decode the records of a checkpoint file; raise DataError for none, or records of something else."""
+    """Return the contents that records of a checkpoint file encode; raise DataError if they are no order search."""
     if not payloads:
         why = (
             f"cannot be used: {corruption}" if corruption else "ends before its first record: its search had not begun"
@@ -305,10 +310,13 @@ FLUSH_INTERVAL_S = 0.3
 
 
 class Store:
-    """Checkpoint file opened for writing, locked until closed; results are on disk within :data:`FLUSH_INTERVAL_S`.
+    """Checkpoint file that is open for writing, and locked until it is closed.
 
-    The requests are the searches of a new file, or those that an existing file must contain; None accepts those of the
-    file. With `recover` the intact records of a corrupt file are kept, with a copy of the corrupt file beside it.
+    Results are on disk within :data:`FLUSH_INTERVAL_S`.
+
+    `requests` define the searches of a new file. An existing file must contain the same searches; with None, any
+    searches are accepted. With `recover` the intact records of a corrupt file are kept, and a copy of the corrupt file
+    is saved.
     """
 
     def __init__(
@@ -364,7 +372,7 @@ class Store:
                 )
 
     def outdated_error(self) -> DataError:
-        """Return the error of a search that another version began and this one cannot resume."""
+        """Return the error for a search that another version of ftlm began and this version cannot resume."""
         content = self.contents
         return DataError(
             f"store {self.path} is of ftlm {content.version}, whose rounds follow algorithm {content.algorithm}; this "
@@ -383,7 +391,7 @@ class Store:
             self.contents.sections[frame.search].add_frame(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
-        """Queue the progress of a block of rounds; write the queue if the flush interval has passed."""
+        """Queue the progress of a block of rounds for writing; write the queue if the flush interval has elapsed."""
         if checkpoint is not None:
             (*place, order), anew, (rows, counts, failures) = checkpoint
             rounds_before = self._waiting.get((search, first))
@@ -397,7 +405,7 @@ class Store:
             self.flush()
 
     def flush(self) -> None:
-        """Write all pending frames."""
+        """Write all queued records."""
         due = []
         for key, frame in self._waiting.items():
             same = not frame.anew and self._failures.get(key) == frame.failures
@@ -408,18 +416,18 @@ class Store:
             self._append(due)
 
     def append_block(self, frame: Rounds | Verdicts) -> None:
-        """Append a complete block."""
+        """Write a complete block."""
         self._waiting.pop((frame.search, frame.first), None)
         self._failures.pop((frame.search, frame.first), None)
         self._append([frame])
 
     def append_table(self, search: int, table: _core._FoundStage) -> None:
-        """Append the final table of a search under an order law."""
+        """Write the final table of a coupled search."""
         frame = {"type": "joined", "search": search, **{k: table[k] for k in ("rows", "counts", "failures")}}
         self._append([msgspec.convert(frame, CoupledTable)])
 
     def close(self) -> None:
-        """Write pending frames and release the lock."""
+        """Write queued records, close the file and release the lock."""
         try:
             self.flush()
         finally:

@@ -1,4 +1,4 @@
-"""Order grids, and settings of an order search and of the coefficients that it ranks by, validated."""
+"""Options of an order search: order grids, and validated settings of search and coefficient estimation."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ DEFAULT_ALPHA_RANGE = (1.05, 2.0)
 @check_arguments
 @dataclass(frozen=True)
 class OrderGrid:
-    """Intervals and step of an order search.
+    """Grid of an order search: intervals of the orders, and the increment within them.
 
     Parameters
     ----------
     increment
-        Increment of every order that has none of its own.
+        Increment of every order for which `orders` gives none.
     alpha
-        (low, high) of every highest order.
+        (low, high) of the order alpha of every equation.
     orders
         Other orders by name: a number, a tuple (low, high) or (low, high, step), ``"low:high:step"`` or a list of
-        values. The name ``alpha`` means every highest order and replaces the interval above.
+        values. The name ``alpha`` denotes the order of every equation and replaces the interval above.
     """
 
     increment: float = DEFAULT_INCREMENT
@@ -44,15 +44,15 @@ class OrderGrid:
 
     @check_arguments
     def values(self, structure: Structure) -> dict[str, tuple[float, ...]]:
-        """Return the grid values of each free order of a structure.
+        """Return the grid values of each free order of a structure, by name.
 
-        An order that neither the structure nor this grid names takes all multiples of the increment from 0 to the
-        largest alpha. The search restricts own-output orders to values below alpha and input orders to at most alpha.
+        An order without values in the structure and in this grid takes all multiples of the increment from 0 to the
+        largest alpha. The search uses only orders of output terms below alpha, and orders of other signals up to alpha.
 
         Raises
         ------
         ModelError
-            A name that is not a free order, or an interval out of range.
+            If a name is not a free order, or an interval is out of range.
         """
         free = structure.order_names
         check_order_grid_names(self, structure)
@@ -83,19 +83,20 @@ class OrderGrid:
 def order_grid(
     increment: float = DEFAULT_INCREMENT, alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE, **orders: Values
 ) -> OrderGrid:
-    """Intervals and step of an order search.
+    """Return the grid of an order search: intervals of the orders, and the increment within them.
 
-    Every own-output order takes all values 0 <= nu < alpha on the step (distinct, unordered within a signal), every
-    other signal's 0 <= nu <= alpha, unless named here.
+    Unless named here, the order nu of an output term takes all multiples of the increment with 0 <= nu < alpha, and the
+    order of another signal all with 0 <= nu <= alpha. Terms of the same signal have different orders, and their
+    permutations count once.
 
     Parameters
     ----------
     increment
-        Grid increment, positive; the paper uses 0.05.
+        Positive increment of the grid; the paper uses 0.05.
     alpha
-        (low, high) of the highest order, in (0, 10].
+        (low, high) of the order alpha of an equation, in (0, 10].
     **orders
-        Other orders by name, see :class:`OrderGrid`.
+        Other orders by name; see :class:`OrderGrid`.
 
     Returns
     -------
@@ -105,7 +106,7 @@ def order_grid(
     Raises
     ------
     ModelError
-        An increment that is not positive, or an interval that is empty or out of range.
+        If the increment is not positive, or an interval is empty or out of range.
     """
     if not (isinstance(alpha, (tuple, list)) and len(alpha) == 2):
         raise ModelError(f"alpha = {alpha!r} is not an interval; write (low, high), such as {DEFAULT_ALPHA_RANGE}")
@@ -117,18 +118,18 @@ def order_grid(
 
 
 def check_order_grid(order_grid: OrderGrid | None) -> None:
-    """Raise if an argument is not an order grid."""
+    """Raise ModelError if an argument is not an order grid."""
     if not (order_grid is None or isinstance(order_grid, OrderGrid)):
         raise ModelError(f"order_grid is {type(order_grid).__name__}, not an OrderGrid; use ftlm.order_grid(…)")
 
 
 def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:
-    """Return the grid values of an order that is a number or a single free order."""
+    """Return the grid values of an order, which must be a number or a single free order."""
     return list(values[order.names[0]]) if order.names else [order.constant]
 
 
 def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None:
-    """Raise if an order grid names an order that is not free."""
+    """Raise ModelError if an order grid names an order that is not free in the structure."""
     for name in grid.orders if grid is not None else ():
         if name not in structure.order_names and name != "alpha":
             free = ", ".join(structure.order_names) or "none"
@@ -136,7 +137,7 @@ def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None
 
 
 def restrict_order_grid(grid: OrderGrid | None, part: Structure) -> OrderGrid | None:
-    """Restrict an order grid to the free orders of a substructure."""
+    """Return an order grid restricted to the free orders of a part of the structure."""
     if grid is None:
         return None
     names = (*part.order_names, "alpha")
@@ -159,7 +160,7 @@ MULTI_INNOVATION_SETTINGS = ("innovation_length", "prior_covariance", "row_basis
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSettings:
-    """Settings that define the result of an order search.
+    """Options that determine the result of an order search.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ class SearchSettings:
     Raises
     ------
     ModelError
-        A value out of range, or a setting of multi-innovation with other coefficients.
+        If a value is out of range, or an option of multi-innovation is given for another coefficient estimator.
     """
 
     criterion: Criterion = "output-error"
@@ -211,16 +212,16 @@ class SearchSettings:
                 )
 
     def differs(self, name: str) -> bool:
-        """Whether a setting differs from its default."""
+        """Whether an option differs from its default."""
         return bool(getattr(self, name) != getattr(type(self), name))
 
     @property
     def needs_haar(self) -> bool:
-        """Whether m must be a power of two."""
+        """Whether Haar rows are used, so that the number of block pulses must be a power of two."""
         return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
     def core_arguments(self, threads: int) -> _core._Options:
-        """Return the settings as arguments of the core; the memory limit is that of this machine."""
+        """Return the settings in the form that the core takes, with the memory limit of this machine."""
         return {
             "criterion": self.criterion,
             "norm": self.norm,
@@ -235,6 +236,6 @@ class SearchSettings:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings that results and reports show."""
+        """Return the settings by name, as results and reports show them."""
         own = MULTI_INNOVATION_SETTINGS if self.coefficients == "multi-innovation" else ()
         return {name: getattr(self, name) for name in ("criterion", "norm", "coefficients", *own)}

@@ -26,29 +26,30 @@ SAME_MODEL_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class OrderCertificate:
-    """Lower bound of the equation error over all orders in some intervals.
+    """Lower bound of the equation error over intervals of orders; result of :func:`ftlm.certify_orders`.
 
     Parameters
     ----------
     lower_bound
-        No orders of the intervals have a smaller RMS equation error, with any coefficients whose terms do not exceed
-        `max_term_ratio`, in exact arithmetic on the pulse means; 0 if nothing is proved.
+        Lower bound of the RMS equation error for all orders in the intervals and all coefficients within
+        `max_term_ratio`, for exact arithmetic on the block-pulse means. 0 if nothing is proved.
     best
-        Smallest error found; infinite if none was found.
+        Smallest RMS equation error found; infinite if none was found.
     orders
-        Free orders of that error, by name.
+        Free orders with the smallest error, by name.
     requested_tolerance
-        Requested tolerance: by what fraction the error of other orders might be smaller.
+        Requested fraction by which the error at other orders may be smaller.
     intervals
         Lowest and highest value of each free order.
     min_separation
-        Minimum distance of orders of the output from its highest one, and of orders of one signal from one another.
+        Minimum difference between alpha and the orders of output terms, and between the orders of one signal.
     max_term_ratio
-        Maximum RMS size of all terms of an equation together, relative to that of the output.
+        Maximum RMS of all terms of an equation together, relative to that of the output.
     cells
-        Number of boxes of orders that were bounded.
+        Number of boxes of orders for which a bound was computed.
     open_cells
-        Number of boxes whose bound misses the requested tolerance, too small to be halved or beyond the maximum.
+        Number of boxes whose bound does not reach the requested tolerance, because they are too small to be halved or
+        the maximum number of boxes was reached.
     m
         Block pulses per run.
     free_run_nr
@@ -56,9 +57,9 @@ class OrderCertificate:
         with the coefficients of least equation error; infinite if the simulation overflows. The certificate
         bounds the equation error alone.
     unstable_poles
-        Number of poles of that model with a positive real part; NaN if it is not known.
+        Number of poles of that model with a positive real part; NaN if unknown.
     start_errors
-        Least RMS equation error of each tuple of orders that was given.
+        RMS equation error at each point given as `start`.
     """
 
     lower_bound: float
@@ -77,12 +78,12 @@ class OrderCertificate:
 
     @property
     def beatable(self) -> tuple[bool, ...]:
-        """Whether other orders may be better than each given tuple by more than the requested tolerance."""
+        """Whether each `start` point may be beaten by other orders by more than the requested tolerance."""
         return tuple(self.lower_bound < (1 - self.requested_tolerance) * error for error in self.start_errors)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the simulation of the best orders, which no certificate of the equation error bounds."""
+        """Findings on the simulation at the best orders, which the certificate of the equation error does not cover."""
         if self.unstable_poles > 0:
             return (make_finding("certified_run_grows", poles=int(self.unstable_poles), nr=self.free_run_nr),)
         if self.free_run_nr > MAX_FREE_RUN_NR:
@@ -95,7 +96,7 @@ class OrderCertificate:
         return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the certificate as a dictionary for JSON."""
         proof = ("lower_bound", "best", "proved_tolerance", "requested_tolerance", "orders", "intervals")
         options = ("min_separation", "max_term_ratio", "cells", "open_cells", "m")
         attributes_shown = attributes(self, (*proof, *options, "free_run_nr", "start_errors", "beatable", "findings"))
@@ -145,16 +146,16 @@ class SearchRow:
     Parameters
     ----------
     rank
-        From 1.
+        Rank in the table, from 1.
     index
-        Index of the candidate in the order grid; breaks ties.
+        Index of the candidate in the order grid, which decides ties.
     score
-        Its score: error (45) for norm l1, RMSE for l2; for a stage the sum of the equations' scores, each divided by
-        its scale.
+        Score: sum of absolute errors (45) for norm ``"l1"``, RMSE for ``"l2"``. For coupled equations it is the sum of
+        their scores, each divided by its scale.
     orders
-        Free orders by name.
+        Values of the free orders by name.
     coefficients
-        Coefficients by name.
+        Values of the coefficients by name.
     """
 
     rank: int
@@ -166,36 +167,37 @@ class SearchRow:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Table of an order search, best first, with its best model, and counts of the excluded candidates.
+    """Result of an order search: table of the best candidates, best model, and counts of excluded candidates.
 
     Parameters
     ----------
     table
-        Kept rows, best first.
+        Rows of the best candidates, best first.
     model
         Model of the first row.
     candidates
         Number of candidates.
     exclusion_counts
-        Number of candidates not in the table, by reason: "beaten" (fully evaluated), "bound" (excluded by a lower bound
-        of their score), "stopped early" (excluded by a partial sum), "singular", "diverged". With the rows of the table
-        they add up to all candidates. An excluded candidate might have diverged in a full evaluation.
+        Number of candidates that are not in the table, by reason: "beaten" (fully evaluated), "bound" (excluded by a
+        lower bound of the score), "stopped early" (excluded by a partial sum of the score), "singular", "diverged". The
+        counts and the rows of the table add up to all candidates. An excluded candidate might have diverged in a full
+        evaluation.
     failures
-        The first candidates without a score: (orders by name, reason).
+        First candidates without a score, each as (orders by name, reason).
     m
         Block pulses per run.
     settings
-        Criterion, norm, coefficients, innovation length, prior covariance, rows, initial terms.
+        Options by name: criterion, norm, coefficients, innovation length, prior covariance, row basis, initial terms.
     at_grid_edge
-        Orders of the first row at an end of their interval, by name.
+        Orders of the first row that are at a limit of their interval, by name.
     excluded_by_box
-        Number of candidates under "bound" that were excluded with a whole box of orders.
+        Number of candidates, counted as "bound", that were excluded together with a whole box of orders.
     free_runs
-        Number of candidates that got a free run, the best by equation error; 0 for linear equations, of which a bound
-        excludes every other one.
+        Number of candidates with nonlinear terms that were simulated, the best ones by equation error; 0 for linear
+        equations, for which the search is exhaustive.
     verdict, model_findings
-        Verdict and findings of :func:`ftlm.identify` at the orders of rank 1; None and empty for a search resumed from
-        a checkpoint file, which keeps no runs.
+        Verdict and findings of :func:`ftlm.identify` at the orders of rank 1. None and empty for a search resumed from
+        a checkpoint file, which does not contain the runs.
     """
 
     table: list[SearchRow]
@@ -223,7 +225,7 @@ class SearchResult:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Parameters of the best model by name; a search gives no standard errors."""
+        """Parameters of the best model by name, without standard errors, which a search does not give."""
         values = {**self.orders, **self.coefficients}
         return parameter_estimates(self.model, values, errors={}, intervals={}, free=values)
 
@@ -237,34 +239,35 @@ class SearchResult:
 
     @property
     def excluded_summary(self) -> str:
-        """Text with the counts of the excluded candidates, by reason."""
+        """Counts of the excluded candidates by reason, as text."""
         texts = {reason: f"{count} {reason}" for reason, count in self.exclusion_counts.items() if count}
         if self.excluded_by_box:
             texts["bound"] += f" ({self.excluded_by_box} of them in boxes excluded whole)"
         return "".join(f", {words}" for words in texts.values())
 
     def to_frame(self) -> Any:
-        """Return the ranked table as a pandas frame, by rank."""
+        """Return the ranked table as a pandas DataFrame, one row per rank."""
         rows = [{"rank": r.rank, "score": r.score, **r.orders, **r.coefficients} for r in self.table]
         return to_frame(rows, ["rank"])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the result as a dictionary for JSON."""
         names = ("candidates", "exclusion_counts", "excluded_by_box", "m", "settings", "table")
         failures = {"failures": [{"orders": o, "reason": reason} for o, reason in self.failures]}
         return attributes(self, names) | failures | {"at_grid_edge": self.at_grid_edge} | self._judgement_dict()
 
     def _judgement_dict(self) -> dict[str, Any]:
-        """Return verdict and findings for JSON; empty for a search without a verdict."""
+        """Return verdict and findings as a dictionary for JSON; empty for a search without a verdict."""
         if self.verdict is None:
             return {}
         return {"verdict": self.verdict.to_dict(), "findings": [f.to_dict() for f in self.findings]}
 
     @property
     def distinct_rows(self) -> list[tuple[SearchRow, int]]:
-        """Rows that are different models, each with the number of kept rows that are the same model.
+        """Return rows with different models, each with the number of table rows that are equivalent to it.
 
-        If all orders are free, adding one number to each leaves the equation of a run from rest as it is.
+        Rows are equivalent if all their orders differ by the same number, because a run from rest then satisfies both
+        equations.
         """
         distinct: list[tuple[SearchRow, int]] = []
         for row in self.table:
@@ -277,7 +280,7 @@ class SearchResult:
 
     @property
     def search_findings(self) -> tuple[Finding, ...]:
-        """Findings on the table: orders on the edge of their interval, and rows that are one model."""
+        """Findings on the table: orders at a limit of their interval, and equivalent rows."""
         edges = [make_finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
         if 0 < self.free_runs < self.candidates:
             edges.append(make_finding("free_runs_of_some", count=self.free_runs, candidates=self.candidates))
@@ -311,7 +314,7 @@ class SearchResult:
 
     @property
     def next_step(self) -> str:
-        """Call or remedy that follows the search."""
+        """Text that suggests the next call or a remedy after the search."""
         if self.verdict is None:
             return choose_text(
                 "search_orders(…) with the runs and this store, which judges rank 1",
@@ -327,7 +330,7 @@ class SearchResult:
 
 
 def _is_same_model(row: SearchRow, other: SearchRow) -> bool:
-    """Whether score and coefficients of two rows are the same to rounding."""
+    """Whether score and coefficients of two rows are equal up to rounding."""
     pairs = [(row.score, other.score), *((v, other.coefficients[n]) for n, v in row.coefficients.items())]
     return all(math.isclose(a, b, rel_tol=SAME_MODEL_TOLERANCE) for a, b in pairs)
 
@@ -339,16 +342,17 @@ class StoreStatus:
     Parameters
     ----------
     name
-        Output that was searched, or ``"stage"``.
+        Output of the searched equation, or ``"stage"`` for coupled equations.
     candidates
-        Total number of candidates. Under an order law those of the single equations, as far as known: one that was
-        stopped early may have to be evaluated further.
+        Total number of candidates. Under an order law it is the number of candidates of the separate equations that
+        must be evaluated, as far as known.
     done_count
         Number of candidates evaluated or excluded.
     best
-        Best score so far: error (45) for norm l1, RMSE for l2; None before the first.
+        Best score so far: sum of absolute errors (45) for norm ``"l1"``, RMSE for ``"l2"``. None before the first
+        score.
     settings
-        Criterion, norm, coefficients.
+        Criterion, norm and coefficient estimator by name.
     runs
         Names of the runs.
     version
@@ -372,7 +376,7 @@ class StoreStatus:
         return self.done_count == self.candidates
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the status as a dictionary for JSON."""
         return {**asdict(self), "complete": self.complete}
 
     def __str__(self) -> str:
@@ -386,7 +390,7 @@ class StoreStatus:
 
 
 def search_summary(searches: Mapping[str, SearchResult]) -> Table:
-    """Return a table of kept and excluded candidates, by reason; together they are all candidates."""
+    """Return a table with the numbers of candidates in the table and excluded, by reason, for each search."""
     reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.exclusion_counts))
     rows: list[list[Cell]] = [
         [
@@ -416,16 +420,16 @@ def search_summary(searches: Mapping[str, SearchResult]) -> Table:
 
 
 def search_top(name: str, search: SearchResult, *, rows: int = 10) -> Table:
-    """Return the first rows of an order search.
+    """Return a table of the first rows of an order search.
 
     Parameters
     ----------
     name
-        Output searched, or ``"stage"``.
+        Output of the searched equation, or ``"stage"``.
     search
-        The search.
+        Result of the search.
     rows
-        Most rows.
+        Maximum number of rows.
     """
     law = len(search.model.equations) > 1
     score = {"l1": "error (45)", "l2": "RMSE"}.get(search.settings["norm"], "score")
@@ -450,7 +454,7 @@ def _search_name(name: str) -> str:
 
 
 def search_html(result: SearchResult) -> str:
-    """Return the best rows of an order search and the counts of the excluded candidates."""
+    """Return HTML with the best rows of an order search and the counts of the excluded candidates."""
     rows: list[list[Cell]] = [["kept", len(result.table)]]
     for reason, count in result.exclusion_counts.items():
         rows.append([reason, count])

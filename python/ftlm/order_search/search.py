@@ -1,4 +1,4 @@
-"""Order search: jobs of one equation or of coupled ones, landscapes, ranking by free runs."""
+"""Order search of one equation or of coupled equations: preparation, run, resumption, and score surfaces."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ FREE_RUN_CANDIDATES = 300
 
 
 def record_run(rec: Record, structure: Structure) -> Run:
-    """Return a record as a run whose pulse means are those of the record; samples of outputs are means of neighbors."""
+    """Return a block-pulse record as a run whose pulse means equal those of the record.
+
+    Output samples are means of neighboring pulses.
+    """
     rows = {name: rec.of(name) for name in structure.signals}
     inputs = {
         name: np.append(row, row[-1])
@@ -71,14 +74,14 @@ def record_run(rec: Record, structure: Structure) -> Run:
 
 
 def record_structure(rec: Record, structure: Structure) -> Structure:
-    """Return a structure for the run of a record, whose inputs have passed delays and nonlinearities."""
+    """Return the structure for a run made from a record, without the delays and nonlinearities already applied."""
     return replace(
         structure, delay={}, free_delays={}, input_nonlinearities=UNSET, initial=rec.initial, offset=rec.offset
     )
 
 
 def free_run_errors(model: Model, rec: Record, run: Run) -> dict[str, Floats]:
-    """Return measured minus simulated pulse means by output; not finite where the free run diverges."""
+    """Return measured minus simulated block-pulse means by output; not finite if the simulation diverges."""
     simulated, _ = simulate_samples(replace(model, structure=record_structure(rec, model.structure)), run, 1, None)
     with np.errstate(over="ignore", invalid="ignore"):
         return {
@@ -89,9 +92,11 @@ def free_run_errors(model: Model, rec: Record, run: Run) -> dict[str, Floats]:
 def free_run_score(
     model: Model, records: Sequence[Record], runs: Sequence[Run], norm: Norm, scales: Sequence[float]
 ) -> float:
-    """Return the score of a model by its free runs: error (45), or RMSE, summed over outputs in units of their scales.
+    """Return the score of a model's simulations, summed over outputs.
 
-    Infinite where a free run diverges or a pulse has no solution.
+    The score of an output is the sum of absolute errors (45), or the RMSE, divided by the scale of the output.
+
+    The score is infinite if a simulation diverges or has no solution in a block pulse.
     """
     try:
         errors = [free_run_errors(model, rec, run) for rec, run in zip(records, runs, strict=True)]
@@ -109,12 +114,12 @@ def free_run_score(
 def rank_by_free_runs(
     table: Sequence[SearchRow], structure: Structure, records: Sequence[Record], norm: Norm, scales: Sequence[float]
 ) -> list[SearchRow]:
-    """Return the rows with a finite free run, by its score.
+    """Return the rows whose simulation is finite, sorted by its score.
 
     Raises
     ------
     ModelError
-        No row has a finite free run.
+        If no row has a finite simulation.
     """
     runs = [record_run(rec, structure) for rec in records]
     scored = []
@@ -137,7 +142,7 @@ Failures = list[tuple[dict[str, float], str]]
 
 @dataclass(frozen=True)
 class Job:
-    """Order search with checked arguments and records."""
+    """Order search that is ready to run: validated arguments and block-pulse records."""
 
     runs: tuple[str, ...]
     units: Mapping[str, str]
@@ -150,11 +155,11 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Name of the result: the output, or ``"stage"`` under an order law."""
+        """Name of the result: the output, or ``"stage"`` for coupled equations under an order law."""
         return "stage" if self.structure.has_order_law else self.structure.outputs[0]
 
     def request(self, name: str) -> Request:
-        """Return the definition that a checkpoint file stores."""
+        """Return the definition of the search that a checkpoint file stores under a name."""
         # Hints are not written: they tell a fit where to start and change no search.
         structure = replace(self.structure, hints=UNSET)
         # The records say it, where there is one: what has none is written as it always was.
@@ -165,7 +170,7 @@ class Job:
 
     @classmethod
     def of(cls, request: Request, threads: int, progress: ProgressCallback | None) -> Job:
-        """Restore a job from a checkpoint file; raise ModelError for an invalid request."""
+        """Return the job that a checkpoint file defines; raise ModelError if the definition is invalid."""
         try:
             settings: dict[str, Any] = {f.name: request.settings[f.name] for f in fields(SearchSettings)}
         except KeyError as error:
@@ -198,7 +203,7 @@ class Job:
         return runs, list(record.inputs), record.start, self.settings, self.threads
 
     def equation_problem(self) -> EquationProblem:
-        """Return the search problem of one equation."""
+        """Return the search problem of the job's single equation."""
         item, signals = self.structure.equations[0], self.records[0].signals
         axes = [
             (signals.index(t.column), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
@@ -211,7 +216,7 @@ class Job:
         )
 
     def coupled_problem(self) -> CoupledProblem:
-        """Return the search problem of coupled equations under their order law."""
+        """Return the search problem of the job's coupled equations under their order law."""
         structure, signals = self.structure, self.records[0].signals
         names = structure.order_names
 
@@ -239,7 +244,7 @@ class Job:
         return [s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()]
 
     def standard_deviations(self) -> list[float]:
-        """Standard deviation of each output, by which the scores of the equations are weighted."""
+        """Standard deviation of each output, by which the scores of coupled equations are divided."""
         points, spreads = sum(r.m for r in self.records), []
         for output in self.structure.outputs:
             with np.errstate(over="ignore", invalid="ignore"):
@@ -252,7 +257,7 @@ class Job:
 
 
 def check_executor(executor: object) -> None:
-    """Raise unless an argument is None or an executor of `concurrent.futures`."""
+    """Raise ModelError unless an argument is None or an executor of `concurrent.futures`."""
     if executor is not None and not isinstance(executor, Executor):
         raise ModelError(
             f"executor = {executor!r} is not an executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
@@ -261,14 +266,16 @@ def check_executor(executor: object) -> None:
 
 
 def threads_per_task(threads: int | None, executor: Executor | None) -> int:
-    """Return the number of threads of one task: with an executor one by default."""
+    """Return the number of threads of one task, by default all cores, or one with an executor."""
     return check_threads(1 if threads is None and executor is not None else threads)
 
 
 def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
-    """Run a search; with a checkpoint file, as search ``number`` of it.
+    """Run a search, and return its result.
 
-    Candidates with non-linear terms are ranked by equation error first, and the best of them by free runs.
+    `number` is the index of the search in the checkpoint file.
+
+    Candidates with nonlinear terms are ranked by equation error first, and the best of them by simulations.
     """
     settings = job.settings
     if job.structure.has_nonlinear_terms and settings.criterion == "output-error":
@@ -297,7 +304,7 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
 
 
 def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[SearchRow], Failures]:
-    """Return rows and failures of one equation, by names of orders and coefficients."""
+    """Return the rows and the failures of a search of one equation, with orders and coefficients by name."""
     item = structure.equations[0]
 
     def orders_by_name(alpha: float, orders: list[float]) -> dict[str, float]:
@@ -318,7 +325,7 @@ def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[Sea
 
 
 def _stage_rows(structure: Structure, answer: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
-    """Return rows and failures of a coupled search, by names of free orders and of all coefficients."""
+    """Return the rows and the failures of a coupled search, with free orders and all coefficients by name."""
     names, table = structure.order_names, []
     for rank, (index, score, free, parts) in enumerate(answer["rows"], 1):
         coefficients: dict[str, float] = {}
@@ -363,7 +370,7 @@ def rank_orders(
     executor: Executor | None = None,
     **settings: Any,
 ) -> SearchResult:
-    """Return the table of an order search without a verdict; see :func:`ftlm.search_orders`."""
+    """Return the result of an order search without a verdict; see :func:`ftlm.search_orders`."""
     search_settings = SearchSettings(**settings)
     check_executor(executor)
     job = make_job(
@@ -385,7 +392,7 @@ def make_job(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Job:
-    """Return an order search with checked arguments and records; see :func:`search_orders`."""
+    """Return an order search with validated arguments and records; see :func:`ftlm.search_orders`."""
     checked, workers = as_runs(runs), check_threads(threads)
     if not isinstance(equation, Structure):
         raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
@@ -418,34 +425,33 @@ def resume_search(
     executor: Executor | None = None,
     recover: bool = False,
 ) -> dict[str, SearchResult]:
-    """Resume the searches of a checkpoint file, which contains their data and settings.
+    """Resume the order searches of a checkpoint file, which contains their data and settings.
 
     Parameters
     ----------
     path
-        A file written with ``store=``.
-    threads, progress, executor
-        As for :func:`search_orders`.
+        Checkpoint file that :func:`search_orders` wrote with ``store=``. threads, progress, executor As for
+        :func:`search_orders`.
     recover
-        Whether to continue a damaged file: the part before the damage is kept, the rest is computed again, and the
+        Whether to continue a damaged file. The part before the damage is kept, the rest is computed again, and the
         damaged file is renamed to ``….damaged``.
 
     Returns
     -------
     dict of SearchResult
-        By output, or under ``"stage"`` for a search under an order law. The results equal those of uninterrupted
-        searches bit for bit. A complete file is only read.
+        Results by output, or by ``"stage"`` for a search under an order law. They equal those of uninterrupted searches
+        bit for bit. The results of a complete file are only read.
 
     Raises
     ------
     DataError
-        No store, one in use, damaged (with its offset), or one that cannot be written.
+        If the file is not a checkpoint file, is in use, is damaged (the message has the offset) or cannot be written.
     ModelError
-        Threads out of range.
+        If `threads` is out of range.
     ConvergenceError
-        An executor that has lost its workers.
+        If the executor has lost its workers.
     KeyboardInterrupt
-        Ctrl-C, within half a second; the store can be resumed.
+        On Ctrl-C, within half a second. The checkpoint file can be resumed.
     """
     with Store(path, recover=recover) as store:
         return {
@@ -462,7 +468,7 @@ def resume_job(
     progress: Callable[[int, int], None] | None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Resume one search of a checkpoint file."""
+    """Resume one search of a checkpoint file, and return its result; `number` is its index in the file."""
     check_executor(executor)
     job = replace(job_of(store, number, threads_per_task(threads, executor)), progress=_core_callback(progress))
     with _usable(store.path, store.contents.requests[number]):
@@ -470,7 +476,7 @@ def resume_job(
 
 
 def job_of(store: Store, number: int, threads: int | None) -> Job:
-    """Return one search of a checkpoint file as a job."""
+    """Return one search of a checkpoint file as a job; `number` is its index in the file."""
     request = store.contents.requests[number]
     with _usable(store.path, request):
         return Job.of(request, check_threads(threads), None)
@@ -478,7 +484,7 @@ def job_of(store: Store, number: int, threads: int | None) -> Job:
 
 @contextlib.contextmanager
 def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
-    """Raise DataError that names the search and the checkpoint file of an invalid request."""
+    """Convert the ModelError of an invalid request to a DataError that names search and checkpoint file."""
     try:
         yield
     except ModelError as error:
@@ -491,7 +497,7 @@ def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
 def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     """Return the progress of the searches of a checkpoint file, which may be in use.
 
-    For an unfinished search under an order law its tables are computed again, which takes seconds for a fine grid.
+    For an unfinished search under an order law, bounds are computed again, which takes seconds for a fine grid.
 
     Parameters
     ----------
@@ -501,12 +507,12 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     Returns
     -------
     dict of StoreStatus
-        By output, or under ``"stage"``.
+        Status by output, or by ``"stage"``.
 
     Raises
     ------
     DataError
-        No store.
+        If the file is not a checkpoint file.
     """
     contents = read_store(path)
     states = {}
@@ -531,7 +537,10 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
 
 
 def _core_callback(progress: Callable[[int, int], None] | None) -> ProgressCallback | None:
-    """Return the callback of the core: a progress bar gets the excluded fraction too, other callables do not."""
+    """Return a progress callback in the form of the core.
+
+    A progress bar also receives the fraction of excluded candidates; other callables do not.
+    """
     if progress is None or isinstance(progress, Progress):
         return progress
     return lambda count, total, _pruned: progress(count, total)
@@ -547,16 +556,16 @@ def landscape(
     orders: tuple[str, str] | None = None,
     threads: int | None = None,
 ) -> Landscape:
-    """Score every pair of values of two orders by the criterion of the search.
+    """Compute the score of the search for every pair of values of two orders.
 
     Parameters
     ----------
     runs, structure, order_grid
-        What was searched: an equation, or a stage under its order law.
+        Arguments of the order search.
     search
-        What was found.
+        Result of the order search.
     orders
-        Names of the two; by default the first two free orders with several values in the order grid.
+        Names of the two orders; by default the first two free orders with several values in the order grid.
     threads
         See :func:`ftlm.search_orders`.
 
@@ -567,7 +576,7 @@ def landscape(
     Raises
     ------
     ModelError
-        Fewer than two orders with several values, or a name that is none of them.
+        If fewer than two orders have several values, or a name is not one of them.
     """
     axes = {n: v for n, v in (order_grid or OrderGrid()).values(structure).items() if len(v) > 1}
     best = search.orders
@@ -607,7 +616,7 @@ BOX_EXCLUSION_CANDIDATES, BOX_TIME_EXPONENT = 1 << 25, 0.5
 
 
 def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = None) -> None:
-    """Report the expected time of all searches on a progress bar; with a checkpoint file, of the remaining work."""
+    """Show the expected time of all searches on a progress bar; with a checkpoint file, of the remaining work."""
     if not isinstance(progress, Progress) or progress.quiet:
         return
     least = most = 0.0
@@ -619,9 +628,9 @@ def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = N
 
 
 def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:
-    """Return lower and upper estimate of the time of a search here [s]; both 0 if its grid is too small.
+    """Return a lower and an upper estimate of the time of a search on this machine [s]; (0, 0) for a small grid.
 
-    Takes up to a tenth of the search or half a second, whichever is less.
+    The measurement takes at most a tenth of the search and half a second.
     """
     whole = _candidates(job)
     trials: list[tuple[float, float]] = []
@@ -659,14 +668,14 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
 
 
 def _candidates(job: Job) -> float:
-    """Number of candidates of a search; under an order law, points of the order grid."""
+    """Return the number of candidates of a search; under an order law the number of grid points."""
     if job.structure.has_order_law:
         return float(math.prod(len(axis) for axis in job.values.values()))
     return float(job.equation_problem().plan()[0])
 
 
 def _remaining_fraction(job: Job, store: Store, number: int) -> float:
-    """Fraction of a search that a checkpoint file does not contain."""
+    """Return the fraction of a search that a checkpoint file does not contain."""
     section = store.contents.sections[number]
     if job.structure.has_order_law:
         return 0.0 if section.table is not None else 1.0

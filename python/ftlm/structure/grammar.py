@@ -361,7 +361,7 @@ class EquationParser:
         return any(self._peek(k)[1] == "^" or self._peek(k)[1] in EXPRESSION_FUNCTIONS for k in range(end))
 
     def _is_plain_sum(self) -> bool:
-        """Whether parentheses hold a sum without powers and functions, and are no factor of a product."""
+        """Whether the next parentheses contain a sum without powers and functions that is not a factor of a product."""
         end, depth, signs = self._closing_distance(), 0, 0
         for k in range(end):
             value = self._peek(k)[1]

@@ -14,7 +14,7 @@ from ftlm.utils.validation import real_number
 
 
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Known transfer function (sensor filter) that some signals passed when they were measured.
+    """Sensor filter: a known transfer function that some signals passed when they were measured.
 
     The filter may apply to inputs and outputs, because it commutes with every linear equation. If a filtered signal is
     an input of an equation, all other signals, including the measured output, are filtered by software, and the

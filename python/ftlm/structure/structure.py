@@ -562,7 +562,10 @@ def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, .
 
 
 def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
-    """Exponents of t of the integrated offset, by name: c t^alpha / Gamma(alpha + 1)."""
+    """Return the exponents of t of an integrated offset by ``"constant"`` and ``"ramp"``.
+
+    A constant c gives c t^alpha / Gamma(alpha + 1).
+    """
     names = {"none": (), "level": (), "auto": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
     return {name: round(alpha + i, 9) for i, name in enumerate(names)}
 

@@ -460,7 +460,7 @@ def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -
 
 
 def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
-    """Return the frequency [rad/s] of the resonance of the form of order 2, or else of the pole of order 1."""
+    """Return the frequency [rad/s] of a resonance of order 2, or else of the pole of order 1; 1 if there is none."""
     for order in (2, 1):
         for item in fits:
             if item.form is not None and (item.form.order, item.form.offset, item.form.integrator) == (

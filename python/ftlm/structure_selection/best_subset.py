@@ -97,7 +97,10 @@ class BaseModel:
         return self.structure.equations[0].order.constant
 
     def grid_points(self) -> Iterator[tuple[float, ...]]:
-        """Yield grid points: ln(frequency) and ln(damping), one coordinate per free own coefficient."""
+        """Yield grid points, with coordinates ln(frequency) and ln(damping).
+
+        There is one coordinate for each free coefficient of an output term.
+        """
         if not self.own:
             yield ()
             return
