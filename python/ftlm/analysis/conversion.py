@@ -499,7 +499,10 @@ def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[
 
 
 def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
-    """Return signal names: given ones, or the labels of the system with u[0] as u0, or as u if it is the only one."""
+    """Return signal names from the argument, or else from the labels of the system.
+
+    The label u[0] becomes u0, or u if it is the only one.
+    """
     if names_argument is not None:
         names = [names_argument] if isinstance(names_argument, str) else list(names_argument)
         if len(names) != count:

@@ -329,7 +329,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     log_omega = np.linspace(math.log(low), math.log(high), 2001)
 
     def curve(logs: Floats) -> tuple[Complex, Floats]:
-        """Return D(jω) divided by the sum of the magnitudes of its terms, and the logarithm of that sum."""
+        """Return D(jω) divided by the sum of the magnitudes of its terms, and that sum relative to the largest term."""
         exponents = np.outer(powers, logs) + np.log(np.abs(values))[:, None]
         shift = exponents.max(axis=0)
         sizes = np.exp(exponents - shift)
@@ -571,7 +571,7 @@ def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
 
 
 def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]:
-    """Terms of the sum at each ln s, divided by the size of the largest, and the logarithm of that size."""
+    """Return the terms of the sum at each ln s divided by the largest one, and the logarithm of its magnitude."""
     exponents = np.outer(powers, w)
     largest = np.max(exponents.real + np.log(np.abs(values))[:, None], axis=0)
     return np.asarray(values[:, None] * np.exp(exponents - largest)), largest

@@ -90,7 +90,10 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
 
 
 def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
-    """Standard deviation from changes of one standard deviation along each direction of the covariance."""
+    """Return the standard deviation of a response to first order; None without a covariance.
+
+    The response is simulated for a change of one standard deviation along each eigenvector of the covariance.
+    """
     matrix, numbers = covariance_of(model), parameter_vector(model)
     if matrix is None or model.structure.has_friction:
         return None

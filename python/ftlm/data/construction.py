@@ -43,7 +43,7 @@ from ftlm.utils.validation import Floats, bad_rows, check_run_name, check_signal
 
 @dataclass(frozen=True)
 class RunArguments:
-    """Arguments of a run before validation; see :meth:`ftlm.Run.from_arrays`.
+    """Arguments from which a run is built, before validation; see :meth:`ftlm.Run.from_arrays`.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ class RunArguments:
         return self.labels.get(signal, f"signal {signal!r}")
 
     def checked_fields(self) -> dict[str, Any]:
-        """Return the fields of the run, checked in this order: names, numbers, time, window, values, spacing.
+        """Return the fields of the run after validation of names, numbers, time, window, values and spacing.
 
         Raises
         ------
         DataError
-            An argument or a sample that cannot be used as given.
+            If an argument or a sample is invalid.
         """
         self._check_names()
         units = check_units(self.units, (*self.inputs, *self.outputs))
@@ -149,7 +149,10 @@ class RunArguments:
     def _insert_missing_samples(
         self, times: Floats, data: dict[str, Floats], missing: MissingPolicy, first: int
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Insert rows at the missing positions of a regular time grid, if all existing rows lie on one."""
+        """Return times and data with rows inserted where a regular time grid has gaps.
+
+        They are returned unchanged if the existing rows do not lie on a regular grid.
+        """
         grid = grid_positions(times)
         if grid is None or grid[0].size == grid[0][-1] + 1:
             return times, data
@@ -173,7 +176,7 @@ class RunArguments:
     def _fill_input_gaps(
         self, data: dict[str, Floats], behaviour: Mapping[str, Intersample], missing: MissingPolicy
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-        """Fill missing input samples, and describe the missing samples of all signals."""
+        """Return data with missing input samples filled, and notes on the missing samples of all signals."""
         notes, out = [], dict(data)
         for name, values in data.items():
             is_missing = missing_mask(values)
@@ -221,7 +224,7 @@ class RunArguments:
             raise DataError(f"{parameter('step')} and {parameter('time')}: {reason}; pass exactly one of them")
 
     def _time_axis(self, vectors: Mapping[str, Floats]) -> _TimeAxis:
-        """Return the time axis; raise if the signals differ in length."""
+        """Return the time axis; raise DataError if the signals differ in length."""
         lengths = {self.label_of(s): vector.size for s, vector in vectors.items()}
         if self.time is None:
             if self.time_unit != "s":
@@ -253,7 +256,7 @@ class RunArguments:
         return clock
 
     def _rows(self, times: Floats) -> tuple[int, int]:
-        """Return the half-open range of rows inside the data window."""
+        """Return the (start, stop) rows inside the data window."""
         first, last = 0, times.size
         if self.window is not None:
             first, last = window_rows(times, self.window, "window", self.time_label)
@@ -268,7 +271,10 @@ class RunArguments:
     def _values(
         self, vectors: Mapping[str, Floats], units: Mapping[str, tuple[str, float]], first: int, missing: MissingPolicy
     ) -> dict[str, Floats]:
-        """Return finite values in SI units; NaN where samples may be missing."""
+        """Return the signals in SI units, with NaN at missing samples.
+
+        Raise DataError for missing samples that are not allowed, and for values that are not finite.
+        """
         data: dict[str, Floats] = {}
         for signal, vector in vectors.items():
             unit, scale = units[signal]
@@ -293,7 +299,7 @@ class RunArguments:
 
 @dataclass(frozen=True)
 class _TimeAxis:
-    """Sample times [s], the step if it was given, the resolution of the times [s], and notes."""
+    """Sample times [s], the step if the user gave it, the resolution of the times [s], and notes."""
 
     times: Floats
     step: float | None
@@ -302,7 +308,7 @@ class _TimeAxis:
 
 
 def describe_resampling(since: Floats, step: float, first: int, how: str) -> str:
-    """Describe a resampling: new step, old intervals, method."""
+    """Return a sentence on a resampling: new step, old intervals and method."""
     intervals = np.diff(since)
     return (
         f"resampled to {step:.12g} s from intervals of {intervals.min():.6g} to {intervals.max():.6g} s, the widest "
@@ -311,7 +317,7 @@ def describe_resampling(since: Floats, step: float, first: int, how: str) -> str
 
 
 def describe_nonuniform_resampling(behaviour: Mapping[str, Intersample]) -> str:
-    """Describe how nonuniformly sampled signals are used after resampling."""
+    """Return a sentence on how nonuniformly sampled signals are used after resampling."""
     held_inputs = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
     means = f"held: {', '.join(held_inputs)}, by means over the new intervals; " if held_inputs else ""
     return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"

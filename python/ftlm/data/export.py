@@ -39,7 +39,7 @@ def arguments_from_frame(
     window: Sequence[float | None] | None,
     **more: Any,
 ) -> RunArguments:
-    """Arguments of a run from the columns of a frame; see :meth:`ftlm.Run.from_frame`."""
+    """Return the arguments of a run from the columns of a frame; see :meth:`ftlm.Run.from_frame`."""
     columns, index = _columns_of(frame), _index_of(frame)
 
     def pick(column: Hashable, thing: str) -> object:
@@ -87,7 +87,7 @@ def arguments_from_frame(
 
 
 def _stated_units(frame: object, columns: Mapping[str, Hashable]) -> dict[str, str]:
-    """Return the units that attributes of a frame or of its columns state, by signal; unknown ones are left out."""
+    """Return the units by signal that the attributes of a frame or of its columns state; unknown units are omitted."""
     whole = getattr(frame, "attrs", {}).get("units")
     units_by_column = dict(whole) if isinstance(whole, Mapping) else {}
     for column in set(columns.values()).intersection(_columns_of(frame)):
@@ -117,7 +117,7 @@ def _columns_of(frame: object) -> list[Hashable]:
 
 
 def _index_of(frame: object) -> tuple[Hashable, object] | None:
-    """Name and values of the row index of a frame; None if there is none or several."""
+    """Return name and values of the row index of a frame; None unless there is exactly one index."""
     sizes = getattr(frame, "sizes", None)
     if isinstance(frame, Mapping) and isinstance(sizes, Mapping):
         only = next(iter(sizes), None)
@@ -129,12 +129,12 @@ def _index_of(frame: object) -> tuple[Hashable, object] | None:
 
 
 def _is_time_index(name: Hashable, values: object) -> bool:
-    """Whether an index is a time axis, by its name or because it holds dates."""
+    """Whether an index is a time axis, because of its name or because it contains dates."""
     return (isinstance(name, str) and is_time_name(name)) or as_seconds(values, "time (the index)") is not None
 
 
 def frame_of(run: Run) -> Any:
-    """Return a run as a pandas frame indexed by time."""
+    """Return a run as a pandas DataFrame indexed by time."""
     pandas = optional_module("pandas", "pandas", "pandas")
     index = pandas.Index(run.start + run.time, name=CSV_TIME)
     frame = pandas.DataFrame({name: run[name].copy() for name in run.signals}, index=index)
@@ -183,7 +183,10 @@ _OPTIONAL_DEFAULTS: dict[str, Any] = {"about": {}, "missing": []}
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a run: first line of a csv file or parquet metadata, ``VERSION JSON`` with these fields as keys."""
+    """Header that ftlm writes into run files, ``VERSION JSON`` with these fields as keys.
+
+    It is the first line of a csv file, or metadata of a parquet file.
+    """
 
     name: str
     step: float
@@ -198,7 +201,7 @@ class Header:
 
     @classmethod
     def of(cls, run: Run) -> Header:
-        """Return the header of a run."""
+        """Return the header that describes a run."""
         return cls(
             run.name,
             run.step,
@@ -224,7 +227,7 @@ class Header:
         return f"{CSV_VERSION} {words.encode('utf-8', 'backslashreplace').decode()}"
 
     def line(self) -> str:
-        """Return the header as the first line of a text file; raise if it is too long."""
+        """Return the header as the first line of a text file; raise DataError if it is too long."""
         line = f"{CSV_MARK}{self.text()}\n"
         size = len(line.encode())
         if size > MAX_HEADER_BYTES:
@@ -236,7 +239,7 @@ class Header:
 
     @classmethod
     def read(cls, path: Path, where: str, text: str) -> Header:
-        """Parse a header; raise if it is corrupt or of a later version."""
+        """Return the header from its text; raise DataError if it is corrupt or of a later version."""
         version, _, body = text.partition(" ")
         if version.strip() != str(CSV_VERSION):
             raise DataError(
@@ -277,7 +280,7 @@ def header_of_line(path: Path, line: bytes) -> Header | None:
 
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
-    """Write a run as text; see :meth:`ftlm.Run.to_csv`."""
+    """Write a run to a csv file; see :meth:`ftlm.Run.to_csv`."""
     check_new(path, force=force, words=RUN_MESSAGES)
     columns = _columns(run)
     rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
@@ -286,7 +289,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
 
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
-    """Write a run as a parquet file; see :meth:`ftlm.Run.to_parquet`."""
+    """Write a run to a parquet file; see :meth:`ftlm.Run.to_parquet`."""
     target = check_new(path, force=force, words=RUN_MESSAGES)
     try:
         pyarrow = importlib.import_module("pyarrow")
@@ -303,7 +306,7 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> Non
 
 
 def digest(columns: Mapping[str, Floats], header: str) -> str:
-    """SHA-256 of the columns of a run and of its header; the isolated reader computes the same digest."""
+    """Return the SHA-256 digest of the columns of a run and its header; the isolated reader computes the same."""
     digest = hashlib.sha256(header.encode())
     for name, values in columns.items():
         digest.update(f"\0{name}\0{len(values)}\0".encode())
@@ -316,7 +319,7 @@ def _columns(run: Run) -> dict[str, Floats]:
 
 
 def _source_time(run: Run) -> Floats:
-    """Source time of every sample [s], rounded to short decimals."""
+    """Return the source time of every sample [s], rounded to short decimals."""
     exact = run.start + uniform_times(run.length, run.step)
     # Nine digits below the step suffice; the header holds the exact step.
     digits = 9 - math.floor(math.log10(run.step))

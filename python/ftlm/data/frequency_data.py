@@ -1,4 +1,4 @@
-"""Frequency response data: measured gain and phase of one output from one input, or an impedance."""
+"""Frequency-response data: measured response of one output to one input, or an impedance."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FREQUENCY_UNITS: dict[str, float] = {
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class FrequencyData:
-    """Frequency response measured from one input to one output; built by :meth:`from_arrays`.
+    """Frequency response that was measured from one input to one output; :meth:`from_arrays` builds it.
 
     Parameters
     ----------
@@ -39,18 +39,18 @@ class FrequencyData:
         Standard deviation of the real part and of the imaginary part at each frequency, shape (N,), above 0; None if
         unknown.
     output, input
-        Names of the output and the input; "" for those of the only equation.
+        Names of the output and the input; "" stands for the only output or input of the structure.
     unit
         Unit of the response, such as "Ω".
     name
         Name of the data in reports.
     warnings
-        Assumptions made on reading the file.
+        Assumptions that were made when the file was read.
 
     Raises
     ------
     DataError
-        No frequency, shapes that differ, frequencies or deviations that are not finite and above 0, a response that is
+        If there is no frequency, shapes differ, a frequency or deviation is not finite and positive, or the response is
         not finite.
     """
 
@@ -100,14 +100,14 @@ class FrequencyData:
         unit: str = "",
         name: str = "data",
     ) -> FrequencyData:
-        """Build frequency data from arrays.
+        """Return frequency-response data built from arrays.
 
         Parameters
         ----------
         frequency
-            Shape (N,), above 0.
+            Frequencies in `frequency_unit`, shape (N,), positive.
         response
-            Complex, shape (N,).
+            Complex response, shape (N,).
         frequency_unit
             ``"rad/s"``, ``"Hz"``, ``"kHz"``, ``"MHz"`` or ``"mHz"``.
         deviation, output, input, unit, name
@@ -116,7 +116,7 @@ class FrequencyData:
         Raises
         ------
         DataError
-            See :class:`FrequencyData`, and a unit that is not known.
+            If a unit is unknown, or in the cases of :class:`FrequencyData`.
         """
         factor = frequency_factor(frequency_unit)
         omega = _column(f"{name}: frequency", frequency) * factor
@@ -125,13 +125,13 @@ class FrequencyData:
 
     @property
     def gain(self) -> Floats:
-        """Gain of the response [dB]."""
+        """Gain of the response [dB], shape (N,)."""
         with np.errstate(divide="ignore"):
             return np.asarray(20.0 * np.log10(np.abs(self.response)))
 
     @property
     def phase(self) -> Floats:
-        """Phase [degrees], unwrapped in the order of the frequencies."""
+        """Phase of the response [degrees], shape (N,), unwrapped in the order of the frequencies."""
         order = np.argsort(self.frequency, kind="stable")
         out = np.empty(order.size)
         out[order] = np.degrees(np.unwrap(np.angle(self.response[order])))
@@ -144,12 +144,12 @@ class FrequencyData:
         Parameters
         ----------
         low, high
-            Limits [rad/s]; default the whole range.
+            Limits [rad/s]; None for no limit.
 
         Raises
         ------
         DataError
-            A limit that is not a number, or no data between the limits.
+            If a limit is not a number, or there are no data between the limits.
         """
         ends = [
             default if end is None else real_number(name, end)
@@ -175,7 +175,7 @@ class FrequencyData:
 
     @property
     def pair(self) -> str:
-        """Output and input of the response as text, such as ``y from u``; else the name of the data."""
+        """Output and input as text, such as ``y from u``; the name of the data if they have none."""
         return f"{self.output} from {self.input}" if self.output and self.input else self.name
 
     def __str__(self) -> str:
@@ -195,7 +195,7 @@ class FrequencyData:
 
 
 def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
-    """Return one or several frequency responses as a tuple; raise for other types."""
+    """Return one or several frequency responses as a tuple; raise DataError for other types."""
     items = (data,) if isinstance(data, FrequencyData) else data
     if not isinstance(items, Sequence) or isinstance(items, str):
         raise DataError(
@@ -210,7 +210,7 @@ def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
 
 
 def frequency_factor(unit: str) -> float:
-    """Angular frequency [rad/s] of one unit of frequency."""
+    """Return the angular frequency [rad/s] that corresponds to one unit of frequency; raise DataError if unknown."""
     if unit not in FREQUENCY_UNITS:
         raise DataError(
             f"{parameter('frequency_unit', unit)} is unknown; the known ones are {', '.join(FREQUENCY_UNITS)}"

@@ -52,12 +52,11 @@ if TYPE_CHECKING:
 class Run:
     """One measured experiment: regular samples of named inputs and outputs in SI units.
 
-    A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create it and check the data once. Data
-    that cannot be used raise a `DataError` that names the signal, the first bad row (counted from 0), the number of
-    bad rows and the remedy. Data are repaired, resampled or clipped only on request, and `warnings` lists every such
-    change.
+    A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create it and check the data once. Invalid
+    data raise a `DataError` that names the signal, the first bad row (counted from 0), the number of bad rows and a
+    remedy. Data are repaired, resampled or cut only on request, and `warnings` lists every such change.
 
-    Sample j holds the outputs and inputs at t = j·step. Between samples `intersample` defines an input: ``"zoh"`` (a
+    Sample j has the outputs and inputs at t = j·step. Between samples, `intersample` defines an input: ``"zoh"`` (a
     command, held until the next sample) or ``"foh"`` (a measured signal, linear).
 
     Attributes
@@ -71,11 +70,11 @@ class Run:
     notes : tuple of str
         Notes on processing and, for a rig, on the recording.
     sample_times : NonuniformSamples or None
-        Nonuniform samples at their own times; None if the samples lie on the grid. The grid then holds interval means
-        of held inputs and linear interpolation of all other signals.
+        Original samples at nonuniform times; None if all samples lie on the uniform grid. With nonuniform samples, the
+        grid has interval means of zero-order-hold inputs and linear interpolations of all other signals.
     unmasked_run : Run or None
-        Original run before its outputs were masked; its first samples determine the initial state. None without a
-        mask; derived runs do not inherit it.
+        Original run, if outputs of this run are masked; its first samples determine the initial state. None without a
+        mask. Runs derived from this one do not inherit it.
     """
 
     name: str
@@ -105,7 +104,7 @@ class Run:
 
     @classmethod
     def _from_checked(cls, **values: Any) -> Run:
-        """Make a run from checked fields; arrays become read-only, data of signals that are not listed are left out."""
+        """Return a run from validated fields, with read-only arrays and without data of unlisted signals."""
         run = object.__new__(cls)
         vars(run).update(values)
         samples = run.sample_times
@@ -138,34 +137,34 @@ class Run:
         time_unit: str = "s",
         missing: str = "refuse",
     ) -> Run:
-        """Make a run from one-dimensional arrays.
+        """Return a run built from one-dimensional arrays.
 
         Parameters
         ----------
         step : float, optional
             Time between rows [s], > 0. Exactly one of `step` and `time` is given.
         time : array_like, shape (N,), optional
-            Time of every row in `time_unit`, or dates (datetime64, datetime), which count from the first row on;
-            increasing. It is regular when every row lies within 2 % of a step of its
-            place on a regular grid; a mean step that differs from a short decimal number by rounding alone is taken
-            as that number.
+            Increasing time of every row in `time_unit`, or dates (datetime64, datetime), from which the first is
+            subtracted. It is regular if every row lies within 2 % of a step of its position on a regular grid. A mean
+            step that differs from a short decimal number only by rounding is replaced by this number.
         inputs, outputs : mapping of str to array_like, shape (N,), N ≥ 3
             Signals by name: lists, NumPy arrays, pandas or polars series of real numbers up to 1e150 in size. `inputs`
-            may be empty; at least one output is needed. A name begins with a letter or an underscore and holds
+            may be empty; at least one output is required. A name begins with a letter or an underscore and consists of
             letters, digits, ``_ . [ ]``.
         units : mapping of str to str, optional
-            Unit of a signal's numbers, converted to SI here. A signal without a unit is taken as it is.
+            Unit of each signal, from which values are converted to SI. Signals without a unit are not converted.
         intersample : mapping of str to {"zoh", "foh"}, optional
             Intersample behavior of an input; default ``"zoh"``.
         name : str, default "run"
             Name of the run in reports.
         resample : float, optional
-            Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
-            Recorded in `warnings`. Unless every new row is an old one, the original samples are kept in `sample_times`:
-            the output error is simulated with the original inputs and evaluated at the original output times.
-            Equation-error methods use the resampled signals.
+            New step [s], to which the run is resampled: interval means of zero-order-hold inputs, linear interpolation
+            of all other signals. `warnings` lists it. Unless every new row is an original one, the original samples are
+            kept in `sample_times`: the output error is simulated with the original inputs and evaluated at the original
+            output times. Equation-error methods use the resampled signals.
         window : pair of float or None, optional
-            Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
+            Times (a, b) [s] since the first row: only rows with a ≤ t < b are used. The window is applied before any
+            other check of the rows.
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
             Unit of `time`.
         missing : {"refuse", "weight", "hold"}, default "refuse"
@@ -218,7 +217,7 @@ class Run:
         time_unit: str | None = None,
         missing: str = "refuse",
     ) -> Run:
-        """Make a run from a pandas or polars frame, an xarray dataset, a dict of arrays or a structured array.
+        """Return a run built from a pandas or polars frame, an xarray dataset, a dict of arrays or a structured array.
 
         Parameters
         ----------
@@ -232,8 +231,8 @@ class Run:
         inputs, outputs : mapping of str to column, or list of str
             Columns by signal name; a list names columns that keep their names.
         units
-            As in `Run.from_arrays`, in place of those in ``frame.attrs["units"]`` by column, or in the ``attrs`` of a
-            column (``units`` or ``unit``).
+            As in `Run.from_arrays`. By default the units in ``frame.attrs["units"]`` by column, or in the ``attrs`` of
+            a column (``units`` or ``unit``).
         intersample, name, resample, window, missing
             As in `Run.from_arrays`.
         time_unit : {"s", "ms", "us", "min", "h"}, optional
@@ -247,7 +246,7 @@ class Run:
         Raises
         ------
         DataError
-            If a column is unknown or there more than once, and for everything `Run.from_arrays` refuses.
+            If a column is unknown or occurs more than once, or in the cases of `Run.from_arrays`.
         """
         from ftlm.data.export import arguments_from_frame
 
@@ -274,12 +273,12 @@ class Run:
 
     @property
     def units(self) -> dict[str, str]:
-        """SI unit of every signal; "" where none was given. A copy."""
+        """SI unit of every signal by name; "" for unknown units. The dictionary is a copy."""
         return dict(self._units)
 
     @property
     def intersample(self) -> dict[str, Intersample]:
-        """Intersample behavior of every input, "zoh" or "foh". A copy."""
+        """Intersample behavior of every input, "zoh" or "foh". The dictionary is a copy."""
         return dict(self._intersample)
 
     @property
@@ -311,25 +310,31 @@ class Run:
 
     @property
     def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
-        """Mask of missing samples (of the run or of its `sample_times`) for every output with gaps."""
+        """Mask of missing samples by name, for every output that has any.
+
+        The samples are those of `sample_times` if these are nonuniform.
+        """
         data = self._data if self.sample_times is None else self.sample_times.data
         masks = {name: missing_mask(data[name]) for name in self.outputs}
         return {name: rows for name, rows in masks.items() if rows.any()}
 
     def with_interpolated_gaps(self) -> Run:
-        """Return a copy with linearly interpolated gaps, for plots and data checks; never used for estimation."""
+        """Return a copy with linearly interpolated missing samples, for plots and data checks.
+
+        Estimation never uses it.
+        """
         if not any(missing_mask(self._data[name]).any() for name in self.outputs):
             return self
         return self._with(_data={name: interpolate_gaps(values) for name, values in self._data.items()})
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Metadata for JSON, such as name, seed, input, parameters and faults of a rig. A copy."""
+        """Metadata of the run, such as name, seed, input, parameters and faults of a rig. The dictionary is a copy."""
         return copy.deepcopy(self._metadata)
 
     @check_arguments
     def __getitem__(self, name: str) -> Floats:
-        """Return a signal in SI units, shape (N,), read-only; `DataError` for an unknown name."""
+        """Return the samples of a signal in SI units, shape (N,), read-only; raise DataError for an unknown name."""
         try:
             return self._data[name]
         except (KeyError, TypeError):
@@ -369,13 +374,13 @@ class Run:
         Parameters
         ----------
         start, stop : float or None
-            [s] since this run's first row, 0 ≤ start < stop ≤ N·step; None for the first row or past the last one.
-            The row at `stop` is left out, so ``run.window(0, b)`` and ``run.window(b, None)`` share no row.
+            Times [s] since the first row, 0 ≤ start < stop ≤ N·step. None for the first row, or for the end of the run.
+            The row at `stop` is excluded, so ``run.window(0, b)`` and ``run.window(b, None)`` have no common row.
 
         Returns
         -------
         Run
-            Its `start` is the source time of its first row.
+            Run whose `start` is the source time of its first row.
 
         Raises
         ------
@@ -395,22 +400,23 @@ class Run:
 
     @check_arguments
     def split(self, duration: float) -> list[Run]:
-        """Return consecutive runs that together hold all rows, of equal length to within one row.
+        """Return consecutive runs that together have all rows, with equal lengths up to one row.
 
         Parameters
         ----------
         duration : float
-            Shortest piece [s], > 0, and at least three rows. A run shorter than two such pieces is returned whole.
+            Shortest duration of a piece [s], > 0; a piece has at least three rows. A run shorter than two such pieces
+            is returned whole.
 
         Returns
         -------
         list of Run
-            Each with the number of its piece in its name, and without the notes of the whole run.
+            Runs whose names contain the number of the piece, without the notes of the whole run.
 
         Raises
         ------
         DataError
-            A duration that is not positive.
+            If the duration is not positive.
         """
         if not duration > 0.0:
             raise DataError(f"duration = {duration:g}, which must be above 0; give the length of a piece in seconds")
@@ -425,10 +431,10 @@ class Run:
     def resample(self, step: float) -> Run:
         """Return this run resampled to another step.
 
-        Held inputs ("zoh") take their mean over each new interval, the exact integral of the hold. Inputs with "foh"
-        and all outputs are interpolated linearly. No anti-alias filter is applied. `warnings` records the resampling.
-        Unless every new row is an old one, output-error fits and comparisons use the outputs as they were sampled, at
-        their own times: interpolated values are not measurements.
+        Zero-order-hold inputs ("zoh") take their mean over each new interval, which is exact. Inputs with "foh" and all
+        outputs are interpolated linearly, without an anti-alias filter. `warnings` records the resampling. Unless every
+        new row is an original one, output-error fits and comparisons use the original outputs at their own times,
+        because interpolated values are not measurements.
 
         Parameters
         ----------
@@ -442,7 +448,7 @@ class Run:
         Raises
         ------
         DataError
-            If `step` is not positive, or leaves fewer than three rows or more than 50 million.
+            If `step` is not positive, or gives fewer than three rows or more than 50 million.
         """
         new_step = check_step(step, "resample")
         since, readings, how = (
@@ -465,7 +471,7 @@ class Run:
 
     @check_arguments
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
-        """Return this run with the mean or least-squares line of some signals subtracted.
+        """Return this run with the mean or the least-squares line of some signals subtracted.
 
         The mean of a run that does not end where it began contains part of the response. An offset in the structure
         (``+ c``) estimates a constant offset without this bias. `warnings` records what was subtracted.
@@ -484,7 +490,7 @@ class Run:
         Raises
         ------
         DataError
-            If the kind is neither, or a name is unknown or given twice.
+            If the kind is unknown, or a name is unknown or given twice.
         """
         if kind not in ("constant", "linear"):
             raise DataError(f"detrend: kind = {kind!r} is not known; use 'constant' or 'linear'")
@@ -503,7 +509,7 @@ class Run:
 
     @check_arguments
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
-        """Return this run with its inputs passed through known saturations and dead zones, sample by sample."""
+        """Return this run with known saturations and dead zones applied to its inputs."""
         data, readings = dict(self._data), self.sample_times
         for limit in limits:
             data[limit.signal] = limit.apply(data[limit.signal])
@@ -518,14 +524,14 @@ class Run:
         Parameters
         ----------
         samples : mapping of str to array
-            New samples by name, shape (N,), in SI units; missing (NaN or masked) ones of outputs alone.
+            New samples by name, shape (N,), in SI units. Only outputs may have missing (NaN or masked) samples.
         read : mapping of str to array, optional
             New samples at the original times, for a run with `sample_times`.
 
         Raises
         ------
         DataError
-            If a name is not a signal of this run, or its values are not N numbers, finite where it is an input.
+            If a name is not a signal of this run, its values are not N numbers, or values of an input are not finite.
         """
         checked = self._checked_samples("samples", samples, self.length)
         readings = self.sample_times
@@ -535,11 +541,11 @@ class Run:
         return self._with(_data={**self._data, **checked}, sample_times=readings)
 
     def with_unmasked_run(self, run: Run) -> Run:
-        """Return this run, a copy of another one with masked outputs, with the initial state of that one."""
+        """Return this run, whose outputs are masked, with the original run attached, which gives the initial state."""
         return self._with(unmasked_run=run)
 
     def _checked_samples(self, argument: str, values_by_name: object, length: int) -> dict[str, Floats]:
-        """Return new samples of some signals by name; raise if they do not fit this run."""
+        """Return validated new samples of some signals by name; raise DataError if they do not fit this run."""
         checked: dict[str, Floats] = {}
         for name, values in as_mapping(argument, values_by_name).items():
             if name not in self:
@@ -557,7 +563,7 @@ class Run:
         Parameters
         ----------
         mapping : mapping of str to str
-            New name by old name; two names may be exchanged.
+            New name by old name. Two names may be exchanged.
 
         Returns
         -------
@@ -566,7 +572,7 @@ class Run:
         Raises
         ------
         DataError
-            If an old name is unknown, a new name is not a name, or two signals would share one.
+            If an old name is unknown, a new name is invalid, or two signals would have the same name.
         """
         for old, new in mapping.items():
             if old not in self:
@@ -614,12 +620,12 @@ class Run:
 
     @check_arguments
     def with_outputs(self, values: Mapping[str, Floats]) -> Run:
-        """Return this run with additional or replaced outputs, given on its grid without missing samples.
+        """Return this run with additional or replaced outputs.
 
         Parameters
         ----------
         values : mapping of str to array, shape (N,)
-            Numbers by name, finite, in SI units.
+            Samples by name, finite, in SI units, on the uniform grid of the run.
 
         Returns
         -------
@@ -628,7 +634,7 @@ class Run:
         Raises
         ------
         DataError
-            If a name is an input of this run, is no name, or its values are not N finite numbers.
+            If a name is invalid or that of an input, or its values are not N finite numbers.
         """
         values_by_name = {n: as_vector(v, f"output {n!r}")[0] for n, v in as_mapping("values", values).items()}
         for name, numbers in values_by_name.items():
@@ -651,7 +657,7 @@ class Run:
 
     @check_arguments
     def select(self, names: Iterable[str]) -> Run:
-        """Return this run with some of its signals only.
+        """Return this run with only some of its signals.
 
         Parameters
         ----------
@@ -665,7 +671,7 @@ class Run:
         Raises
         ------
         DataError
-            If a name is unknown or given twice, or no output is left.
+            If a name is unknown or given twice, or no output remains.
         """
         signals = list(names_to_columns("names", names))
         for name in signals:
@@ -679,12 +685,12 @@ class Run:
 
     @check_arguments
     def require_outputs(self, names: Iterable[str]) -> None:
-        """Raise unless every name is an output of this run that an equation can be estimated from.
+        """Raise DataError unless every name is an output of this run that is not constant.
 
         Parameters
         ----------
         names : iterable of str
-            Outputs that are needed.
+            Names of the required outputs.
 
         Raises
         ------
@@ -713,12 +719,12 @@ class Run:
                 raise bad_rows(thing, what, 0, values.size, way_out)
 
     def plot(self, *signals: str) -> Figures:
-        """Plot signals over time, outputs first, for notebooks; for matplotlib see ``ftlm.plot.run``.
+        """Return plots of signals over time, outputs first, which notebooks show; see also ``ftlm.plot.run``.
 
         Raises
         ------
         DataError
-            A name that is not a signal of the run.
+            If a name is not a signal of the run.
         """
         from ftlm.plot.comparison_charts import run_charts
 
@@ -726,7 +732,7 @@ class Run:
 
     @check_arguments
     def advice(self, structure: Structure | None = None) -> Advice:
-        """Check this run for faults and poor excitation before estimation.
+        """Check this run for faults and poor excitation before estimation, and return the findings.
 
         The checks cover dead, constant and zeroed channels, saturation, spikes, encoder wraps, outputs that do not
         start at rest, unexplained drift, feedback from outputs to inputs, short runs and poor excitation. The data are
@@ -735,7 +741,8 @@ class Run:
         Parameters
         ----------
         structure : Structure, optional
-            Structure to identify: its free parameters are compared with the spectral lines of the inputs.
+            Structure to identify. The number of its free parameters is compared with the number of spectral lines of
+            the inputs.
 
         Returns
         -------
@@ -747,12 +754,12 @@ class Run:
         return advise(self, structure)
 
     def inspect(self) -> Inspection:
-        """Return range, noise, quantization and initial rest of every signal.
+        """Return range, noise, quantization and initial rest of every signal of this run.
 
         Returns
         -------
         Inspection
-            Prints as a table.
+            Statistics that print as a table.
         """
         from ftlm.validation.data_advice import inspect_run
 
@@ -777,7 +784,7 @@ class Run:
         Raises
         ------
         DataError
-            If the file exists and `force` is not set, or it cannot be written.
+            If the file exists and `force` is False, or it cannot be written.
         """
         from ftlm.data.export import write_csv
 
@@ -785,9 +792,9 @@ class Run:
 
     @check_arguments
     def to_parquet(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write this run to a parquet file that `ftlm.load` reads back bit for bit; needs pyarrow.
+        """Write this run to a parquet file that `ftlm.load` reads back bit for bit; requires pyarrow.
 
-        The table has float64 columns ``t_s`` and one per signal; the metadata ``ftlm-run`` are the `to_csv` header.
+        The table has float64 columns, ``t_s`` and one per signal. Its metadata ``ftlm-run`` is the header of `to_csv`.
 
         Parameters
         ----------
@@ -799,16 +806,16 @@ class Run:
         Raises
         ------
         DataError
-            If pyarrow is not installed, the file exists and `force` is not set, or it cannot be written.
+            If pyarrow is not installed, the file exists and `force` is False, or it cannot be written.
         """
         from ftlm.data.export import write_parquet
 
         write_parquet(self, path, force=force)
 
     def to_frame(self) -> Any:
-        """Return the run as a pandas frame: one column per signal in SI units, indexed by the source time ``t_s`` [s].
+        """Return the run as a pandas DataFrame: one column per signal in SI units, indexed by source time ``t_s`` [s].
 
-        `Run.from_frame` reads it back. Its ``attrs`` hold units, inputs, outputs, intersample and name.
+        `Run.from_frame` converts it back. Its ``attrs`` contain units, inputs, outputs, intersample and name.
 
         Returns
         -------
@@ -824,7 +831,7 @@ class Run:
         return frame_of(self)
 
     def to_xarray(self) -> Any:
-        """Return the run as an xarray dataset over ``t_s`` [s], attributes as of `to_frame`.
+        """Return the run as an xarray dataset over ``t_s`` [s], with the attributes of `to_frame`.
 
         Returns
         -------
@@ -868,7 +875,10 @@ MAX_CACHED_RESULTS = 8
 
 
 def check_compatible(runs: Iterable[Run]) -> None:
-    """Raise if runs differ in inputs, outputs or units; steps, lengths, holds and signal order may differ."""
+    """Raise DataError if runs differ in inputs, outputs or units.
+
+    Steps, lengths, intersample behavior and the sequence of signals may differ.
+    """
     every = list(runs)
     if not every:
         raise DataError("runs: there is none; pass at least one run")
@@ -892,12 +902,12 @@ def check_compatible(runs: Iterable[Run]) -> None:
 
 
 class Runs(tuple[Run, ...]):
-    """Compatible runs with a cache of derived results; see :func:`as_runs`."""
+    """Tuple of compatible runs with a cache of derived results; :func:`as_runs` creates it."""
 
     _cache: dict[str, tuple[Any, ...]]
 
     def __new__(cls, runs: Run | Iterable[Run]) -> Runs:
-        """Validate the runs."""
+        """Create the tuple after validation of the runs."""
         try:
             every = [runs] if isinstance(runs, Run) else list(runs)
         except TypeError:
@@ -918,7 +928,10 @@ class Runs(tuple[Run, ...]):
         return Runs, (tuple(self),)
 
     def get_or_compute(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
-        """Return the cached result of a key, or compute it; the oldest entry is evicted when the cache is full."""
+        """Return the cached result for a key, or compute and cache it.
+
+        The oldest entry is removed when the cache is full.
+        """
         entry = self._cache.get(key)
         if entry is None:
             entry = self._cache[key] = tuple(make())
@@ -933,6 +946,6 @@ def as_runs(runs: Run | Iterable[Run]) -> Runs:
     Raises
     ------
     DataError
-        No run, an object that is not a run, or runs with different signals or units.
+        If there is no run, an object is not a run, or runs have different signals or units.
     """
     return runs if isinstance(runs, Runs) else Runs(runs)

@@ -1,4 +1,4 @@
-"""Sampling: regular time grids, data windows, intersample behavior, resampling, missing and nonuniform samples."""
+"""Sampling of runs: regular time grids, data windows, intersample behavior, resampling, and missing samples."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ZERO_ORDER_HOLD: Intersample = "zoh"
 
 
 def uniform_times(rows: int, step: float) -> Floats:
-    """Uniform sample times from 0 [s], shape (rows,)."""
+    """Return uniform sample times from 0 [s], shape (rows,)."""
     return np.arange(rows, dtype=np.float64) * step
 
 
@@ -46,13 +46,13 @@ def make_read_only(values: Floats) -> Floats:
 
 
 def is_constant(values: Floats) -> bool:
-    """Whether all samples that are not missing are equal."""
+    """Whether all samples, except missing ones, are equal."""
     finite = values[~np.isnan(values)]
     return bool((finite == finite[:1]).all())
 
 
 def check_intersample(kinds: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
-    """Return the intersample behavior of inputs; raise for unknown inputs or words."""
+    """Return the intersample behavior of every input; raise DataError for an unknown input or value."""
     checked: dict[str, Intersample] = {}
     for signal, kind in as_mapping("intersample", {} if kinds is None else kinds).items():
         if signal not in inputs:
@@ -70,7 +70,7 @@ def check_intersample(kinds: Mapping[str, str] | None, inputs: tuple[str, ...]) 
 
 
 def check_step(step: object, argument: str) -> float:
-    """Return a sampling interval [s]; raise if it is not positive and finite."""
+    """Return a sampling interval [s]; raise DataError if it is not positive and finite."""
     value = as_number(step)
     if value is None:
         raise DataError(f"{parameter(argument, step)} is not a number; give the time between rows in s")
@@ -80,7 +80,7 @@ def check_step(step: object, argument: str) -> float:
 
 
 def as_number(value: object) -> float | None:
-    """Return a real number as a float: infinity on overflow, None if it is not a number."""
+    """Return a real number as a float, infinity on overflow, or None if the value is not a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         return None
     try:
@@ -90,7 +90,10 @@ def as_number(value: object) -> float | None:
 
 
 def as_vector(values: object, thing: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
-    """Return a float64 copy of a vector and its original dtype; with `gaps`, masked values and None become NaN."""
+    """Return a float64 copy of a vector and its original dtype; raise DataError if it is not a vector of numbers.
+
+    With `gaps`, masked values and None become NaN.
+    """
     if gaps and isinstance(values, (list, tuple)):
         values = [np.nan if value is None else value for value in values]
     array = as_array(thing, values, gaps=gaps)
@@ -116,7 +119,10 @@ def as_vector(values: object, thing: str, *, gaps: bool = False) -> tuple[Floats
 
 
 def as_seconds(values: object, thing: str) -> tuple[Floats, str] | None:
-    """Convert dates to seconds since the first (and a note), time differences to seconds; None for other types."""
+    """Return dates or time differences as seconds, and a note; None for other types.
+
+    The first date is subtracted from dates.
+    """
     try:
         array = as_array(thing, values)
         first = array.flat[0] if array.dtype.kind == "O" and array.size else None
@@ -142,7 +148,7 @@ def as_seconds(values: object, thing: str) -> tuple[Floats, str] | None:
 
 
 def _to_universal_time(moment: Any) -> Any:
-    """Convert a date with a time zone to UTC."""
+    """Return a date with a time zone converted to UTC; other values are returned unchanged."""
     zone = getattr(moment, "tzinfo", None)
     return moment if zone is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
@@ -168,7 +174,7 @@ def _short(value: object) -> str:
 
 
 def check_lengths(lengths: Mapping[str, int]) -> None:
-    """Raise if columns differ in length; the most frequent length is the expected one."""
+    """Raise DataError if columns differ in length; the message names those that deviate from the most frequent one."""
     counts = list(lengths.values())
     expected = max(set(counts), key=lambda count: (counts.count(count), count))
     wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
@@ -181,7 +187,7 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
 
 
 def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Floats], Floats], str]:
-    """Fit the mean or the least-squares line of a signal: a function of time [s] and its text."""
+    """Return the mean or the least-squares line of a signal as a function of time [s], and as text."""
     is_present = ~np.isnan(values)
     mean = float(np.mean(values[is_present]))
     if not linear:
@@ -195,9 +201,11 @@ def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[F
 
 
 def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str | None = None) -> None:
-    """Raise for values that are not finite or whose squares overflow; ``offset`` is the number of the first row.
+    """Raise DataError if values are not finite or their squares overflow.
 
-    With `gaps`, NaN is accepted. ``instead`` is the second remedy in the error message for NaN.
+    `thing` names the signal in the message, and ``offset`` is the number of the first row.
+
+    With `gaps`, NaN is accepted. ``instead`` is an additional remedy in the message on NaN.
     """
     with np.errstate(invalid="ignore"):
         if values.size == 0 or (values.min() >= -MAX_SAMPLE_VALUE and values.max() <= MAX_SAMPLE_VALUE):
@@ -224,7 +232,7 @@ def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False,
 
 
 def check_increasing(clock: Floats, thing: str, offset: int) -> None:
-    """Raise if the sample times are not strictly increasing."""
+    """Raise DataError if sample times are not strictly increasing."""
     steps = np.diff(clock)
     if (steps > 0).all():
         return
@@ -240,7 +248,10 @@ def check_increasing(clock: Floats, thing: str, offset: int) -> None:
 def regular_step(
     clock: Floats, thing: str, offset: int, resolution: float, stated_step: float | None
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the step [s] of a regular time axis, rounded to a short decimal, and a note on its jitter."""
+    """Return the step [s] of regular sample times, rounded to a short decimal, and notes on their jitter.
+
+    Raise DataError if the times are not regular.
+    """
     count = clock.size - 1
     since = clock - clock[0]
     mean = float(since[-1]) / count
@@ -293,7 +304,7 @@ def _short_decimal(mean: float, count: int, rounding: float, observed: float) ->
 
 
 def window_rows(clock: Floats, window: object, argument: str, thing: str = "time") -> tuple[int, int]:
-    """Return the half-open range of rows with start ≤ t < stop."""
+    """Return the (start, stop) rows of a data window; raise DataError if the window is invalid."""
     if not isinstance(window, Sequence) or isinstance(window, str) or len(window) != 2:
         raise DataError(
             f"{parameter(argument, window)} is not a pair (start, stop) of seconds; use None for an open end"
@@ -337,7 +348,7 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
 
 
 def check_rows(since: Floats, step: float) -> int:
-    """Return the number of samples at a new step; raise if there are too many or too few."""
+    """Return the number of samples at a new step [s]; raise DataError if there are too many or too few."""
     spans = float(since[-1]) / step
     if spans + 1 > _MAX_RUN_SAMPLES:
         raise DataError(f"{parameter('resample', step)} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
@@ -350,7 +361,7 @@ def check_rows(since: Floats, step: float) -> int:
 
 
 def rows_coincide(since: Floats, step: float) -> bool:
-    """Whether every row at the new step is a sample of a regular grid, so that nothing is interpolated."""
+    """Whether every row at a new step is an original sample on a regular grid, so that nothing is interpolated."""
     own = float(since[-1]) / (since.size - 1)
     regular = np.abs(since - uniform_times(since.size, own)).max() <= _MAX_JITTER_SHARE * own
     return bool(regular) and abs(step / own - round(step / own)) * since.size <= _MAX_JITTER_SHARE and step > 0.5 * own
@@ -359,7 +370,10 @@ def rows_coincide(since: Floats, step: float) -> bool:
 def resample_uniform(
     since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
 ) -> dict[str, Floats]:
-    """Resample to another step: interval means of held inputs, linear interpolation of other signals."""
+    """Return signals resampled to another step [s].
+
+    Zero-order-hold inputs take interval means, and other signals are interpolated linearly.
+    """
     rows = check_rows(since, step)
     grid = uniform_times(rows, step)
     return {
@@ -371,7 +385,7 @@ def resample_uniform(
 
 
 def describe_interpolation(behaviour: Mapping[str, Intersample]) -> str:
-    """Describe how :func:`resample_uniform` treats each signal."""
+    """Return text on how :func:`resample_uniform` treats each signal."""
     signals = [signal for signal, kind in behaviour.items() if kind == "zoh"]
     means = f"held: {', '.join(signals)}, by means over the new intervals; " if signals else ""
     return f"{means}others linear; no anti-alias filter"
@@ -387,7 +401,7 @@ _RELATIVE_TIME_TOLERANCE = 1e-12
 
 
 def check_missing_policy(policy: object) -> MissingPolicy:
-    """Return the treatment of missing samples; raise for an unknown word."""
+    """Return the option for missing samples; raise DataError for an unknown value."""
     for choice in MISSING_POLICIES:
         if policy == choice:
             return choice
@@ -398,7 +412,7 @@ def check_missing_policy(policy: object) -> MissingPolicy:
 
 
 def missing_mask(values: Floats) -> NDArray[np.bool_]:
-    """Boolean mask of missing samples (NaN)."""
+    """Return a boolean mask of missing samples (NaN)."""
     return np.asarray(np.isnan(values))
 
 
@@ -408,7 +422,7 @@ def drop_missing(values: Floats) -> Floats:
 
 
 def interpolate_gaps(values: Floats) -> Floats:
-    """Interpolate missing samples linearly; use the nearest value at the ends."""
+    """Return values with missing samples interpolated linearly, and set to the nearest value at the ends."""
     is_missing = np.isnan(values)
     if not is_missing.any() or is_missing.all():
         return values
@@ -417,7 +431,7 @@ def interpolate_gaps(values: Floats) -> Floats:
 
 
 def fill_input_gaps(values: Floats, kind: Intersample) -> Floats:
-    """Fill missing input samples: last value for a zero-order hold, else linear interpolation."""
+    """Return an input with missing samples filled: by the last value for "zoh", by interpolation for "foh"."""
     if kind != ZERO_ORDER_HOLD:
         return interpolate_gaps(values)
     is_missing = np.isnan(values)
@@ -426,7 +440,7 @@ def fill_input_gaps(values: Floats, kind: Intersample) -> Floats:
 
 
 def grid_positions(times: Floats) -> tuple[NDArray[np.intp], float] | None:
-    """Fit a regular grid with gaps: index of each sample and the step [s]; None if there is no such grid."""
+    """Return the index of each sample on a regular grid with gaps, and the step [s]; None if there is no such grid."""
     since = times - times[0]
     usual = float(np.median(np.diff(since)))
     step = usual
@@ -444,7 +458,7 @@ def grid_positions(times: Floats) -> tuple[NDArray[np.intp], float] | None:
 
 @dataclass(frozen=True, eq=False)
 class NonuniformSamples:
-    """Nonuniform samples: inputs and outputs at the times at which they were recorded.
+    """Samples of inputs and outputs at the nonuniform times at which they were recorded.
 
     Parameters
     ----------
@@ -458,11 +472,14 @@ class NonuniformSamples:
     data: dict[str, Floats]
 
     def indices_within(self, duration: float) -> NDArray[np.intp]:
-        """Indices of the samples within a duration [s]."""
+        """Return the indices of the samples within a duration [s] from the start."""
         return np.flatnonzero(self.times <= duration * (1.0 + _RELATIVE_TIME_TOLERANCE))
 
     def resample(self, behaviour: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
-        """Resample to a regular grid: interval means of held inputs, linear interpolation of other signals."""
+        """Return the signals resampled to a regular grid with the given step [s].
+
+        Zero-order-hold inputs take interval means, and other signals are interpolated linearly.
+        """
         rows = int(np.floor(float(self.times[-1]) / step + 1e-6)) + 1
         grid = uniform_times(rows, step)
         return {
@@ -475,7 +492,7 @@ class NonuniformSamples:
     def cut_window(
         self, behaviour: Mapping[str, Intersample], start: float, stop: float, step: float
     ) -> NonuniformSamples:
-        """Return the samples between two times [s], with the input values at the start."""
+        """Return the samples between two times [s], with an additional sample of the inputs at the start."""
         tiny = 1e-9 * step
         rows = np.flatnonzero((self.times >= start - tiny) & (self.times <= stop + step))
         times, data = np.maximum(self.times[rows] - start, 0.0), {n: v[rows] for n, v in self.data.items()}
@@ -497,12 +514,12 @@ class NonuniformSamples:
 
 
 def has_too_few_values(values: Floats) -> bool:
-    """Whether fewer than the required number of samples are present."""
+    """Whether fewer samples than the required number are not missing."""
     return int(np.sum(~np.isnan(values))) < MIN_RUN_SAMPLES
 
 
 def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> str:
-    """Describe the missing samples of a signal and their treatment, as one sentence."""
+    """Return a sentence on the missing samples of a signal and on their treatment."""
     first, count = int(np.flatnonzero(is_missing)[0]), int(is_missing.sum())
     rows = "row holds" if count == 1 else "rows hold"
     return f"{thing}: {count} of {is_missing.size} {rows} no value, the first is row {first}; {what}"
@@ -513,6 +530,6 @@ MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
 
 
 def longest_delay(length: int, step: float) -> float:
-    """Return the largest delay [s] that is searched by default in a run: 60 samples or a twelfth of its length."""
+    """Return the default upper limit of a delay search [s]: 60 samples, or a twelfth of the run if that is less."""
     # Three digits, since the range is a part of a structure's name.
     return float(f"{min(MAX_DELAY_SAMPLES, length * MAX_DELAY_SHARE) * step:.3g}")

@@ -1,4 +1,4 @@
-"""Units of signals and of time, with SI conversion factors."""
+"""Units of signals and of time, with their conversion factors to SI."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from ftlm.utils.validation import as_mapping, join_names, nearest
 
 
 def _read_units(kind: str) -> list[tuple[str, str, float, list[str]]]:
-    """Return the units of signals or of time in ``units.csv``: name, SI unit, conversion factor and spellings."""
+    """Return entries of ``units.csv``, each as name, SI unit, conversion factor and spellings.
+
+    `kind` selects units of signals or of time.
+    """
     with Path(__file__).with_name("units.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["kind"] == kind]
     return [(row["unit"], row["si"], float(row["factor"]), row["spellings"].split()) for row in rows]
@@ -37,7 +40,7 @@ _TIME_NAMES = frozenset(("t", "time", "seconds"))
 
 
 def split_time_header(name: str) -> tuple[str, str | None]:
-    """Split the header of a time column into its case-folded name and its unit.
+    """Return the case-folded name and the unit of a time column from its header.
 
     The unit is a key of :data:`TIME_UNITS`, None if there is none, or the literal text of square brackets with another
     unit. Accepted forms: ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms``, ``time in ms``, ``time_ms``.
@@ -53,7 +56,9 @@ def split_time_header(name: str) -> tuple[str, str | None]:
 
 
 def parse_unit(word: str) -> str | None:
-    """Return the key of :data:`SIGNAL_UNITS` for a unit in a file: "" if it has no conversion, None if unknown.
+    """Return the key of :data:`SIGNAL_UNITS` for a unit in a file.
+
+    It is "" for a unit without conversion, and None for an unknown one.
 
     Short symbols are case-sensitive (m and M differ), words are not. ``deg.``, ``N m`` and ``º`` are normalized.
     """
@@ -74,7 +79,7 @@ def is_time_name(name: str) -> bool:
 
 
 def time_unit_of(name: str, label: str, choice: str | None) -> tuple[str, tuple[str, ...]]:
-    """Return the unit of a time column, and a note for the run.
+    """Return the unit of a time column, and notes for the run.
 
     Parameters
     ----------
@@ -86,7 +91,7 @@ def time_unit_of(name: str, label: str, choice: str | None) -> tuple[str, tuple[
     Raises
     ------
     DataError
-        Two units that contradict each other, or a unit in the header that is not known where none is given.
+        If two units contradict each other, or the header has an unknown unit and the user gives none.
     """
     if choice is not None and (not isinstance(choice, str) or choice not in TIME_UNITS):
         raise DataError(f"{parameter('time_unit', choice)} is unknown; the known ones are {join_names(TIME_UNITS)}")
@@ -111,7 +116,7 @@ def time_unit_of(name: str, label: str, choice: str | None) -> tuple[str, tuple[
 
 
 def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> dict[str, tuple[str, float]]:
-    """Return SI unit and conversion factor of every signal; a signal without a unit is not converted."""
+    """Return the SI unit and the conversion factor of every signal; raise DataError for an unknown signal or unit."""
     units_by_signal = as_mapping("units", {} if units is None else units)
     for signal, unit in units_by_signal.items():
         if signal not in signals:
@@ -128,7 +133,9 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
 
 
 def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
-    """Unit of the coefficient of D^order of a signal in the equation of D^alpha of an output, ``s^-1.8 rad/A``.
+    """Return the unit of the coefficient of a term D^order signal, such as ``s^-1.8 rad/A``.
+
+    The equation is that of D^alpha of the output.
 
     Empty if the unit of a signal is unknown or the coefficient is dimensionless.
     """
@@ -145,9 +152,9 @@ def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal
 
 
 def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[str, float] | None:
-    """Return the powers of units and of s of an expression; None if the unit of a signal is unknown.
+    """Return the powers of SI units and of seconds of an expression; None if the unit of a signal is unknown.
 
-    A sum has the unit of its first term with a signal. Functions other than abs and sqrt have none.
+    A sum has the unit of its first term with a signal. Functions other than abs and sqrt are dimensionless.
     """
     match expression.operation:
         case "constant":
@@ -172,7 +179,7 @@ def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[st
 
 
 def _multiply_units(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
-    """Return the product of two units as powers."""
+    """Return the product of two units, each as powers by name."""
     powers = {unit: first.get(unit, 0.0) + second.get(unit, 0.0) for unit in dict.fromkeys([*first, *second])}
     return {unit: power for unit, power in powers.items() if round(power, 9)}
 
@@ -180,7 +187,9 @@ def _multiply_units(first: Mapping[str, float], second: Mapping[str, float]) -> 
 def nonlinear_coefficient_unit(
     units: Mapping[str, str], output: str, alpha: float, expression: Expression, order: float
 ) -> str:
-    """Unit of the coefficient of D^order of an expression in the equation of D^alpha of an output, ``s^-2 rad^-2``.
+    """Return the unit of the coefficient of a nonlinear term, such as ``s^-2 rad^-2``.
+
+    The term is D^order of an expression, in the equation of D^alpha of the output.
 
     Empty if the unit of a signal is unknown or the coefficient is dimensionless.
     """
@@ -202,7 +211,7 @@ def nonlinear_coefficient_unit(
 
 
 def _unit_power(unit: str, power: float) -> str:
-    """Return a unit to a power as text."""
+    """Return a power of a unit as text."""
     compound = "/" in unit or "·" in unit
     if power == 1:
         return f"({unit})" if compound else unit

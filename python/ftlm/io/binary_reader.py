@@ -1,8 +1,8 @@
-"""Binary reader, run in a separate process because a damaged file can crash the libraries.
+"""Reader of binary data files that runs in a separate process, because a damaged file can crash the libraries.
 
-Run by path (`ftlm.utils.resources.python_child`), never imported by the parent, with the arguments KIND OPTIONS FILE…:
-KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIONS a JSON object with the requested sheet. For every file
-the reader writes one line of JSON to standard output, followed by the numbers:
+`ftlm.utils.resources.python_child` runs this file by its path with the arguments KIND OPTIONS FILE…; the parent process
+never imports it. KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIONS is a JSON object with the requested
+sheet. For every file the reader writes one line of JSON to standard output, followed by the numbers:
 
 ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays as
 little-endian float64, column after column; or only ``{"error": reason, "way_out": remedy}``. An array may
@@ -41,7 +41,7 @@ NUMERIC_MATLAB_CLASSES = frozenset(
 
 
 class UnreadableError(Exception):
-    """File that cannot be read: reason and remedy; no remedy if it is damaged."""
+    """Error for a file that cannot be read, with the reason and a remedy; a damaged file has no remedy."""
 
     def __init__(self, why: str, way_out: str = "") -> None:
         super().__init__(why)
@@ -49,7 +49,7 @@ class UnreadableError(Exception):
 
 
 def limit_resources(memory: int, seconds: int | None = None) -> None:
-    """Limit memory [bytes] and CPU time of this process, and let it leave no core file, if the system supports it."""
+    """Limit memory [bytes] and CPU time [s] of this process, and disable core files, if the system supports it."""
     try:
         resource: Any = importlib.import_module("resource")
     except ImportError:
@@ -67,7 +67,7 @@ def limit_resources(memory: int, seconds: int | None = None) -> None:
 
 
 def check_version(path: str) -> None:
-    """Raise unless the first bytes are those of a file of version 4 or 5."""
+    """Raise UnreadableError unless the first bytes are those of a MATLAB file of version 4 or 5."""
     with open(path, "rb") as stream:
         head = stream.read(520)
     # Version 4 begins with the type of its first matrix, a number below 5000: zeros among four bytes, as in no text.
@@ -81,7 +81,7 @@ def check_version(path: str) -> None:
 
 
 def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header of a .mat file and its matrices, of at most `budget` bytes as float64."""
+    """Return the header of a .mat file and its matrices; at most `budget` bytes are read as float64."""
     numpy: Any = importlib.import_module("numpy")
     matlab: Any = importlib.import_module("scipy.io")
     # SciPy only warns when it skips data; turn such warnings into errors.
@@ -130,10 +130,10 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def list_variables(matlab: Any, path: str) -> list[tuple[str, tuple[int, ...], str]]:
-    """Return name, shape and class of every variable of a .mat file.
+    """Return (name, shape, class) of every variable of a .mat file.
 
-    SciPy cannot list a file that holds an object, such as a datetime or a table, but can load it: it is loaded here
-    under the memory limit of this process, and the object, which has no name for SciPy, is listed as "object".
+    SciPy cannot list a file that contains an object, such as a datetime or a table, but it can load the file. The file
+    is then loaded under the memory limit of this process, and the object is listed as "object".
     """
     try:
         return list(matlab.whosmat(path))
@@ -152,7 +152,7 @@ def list_variables(matlab: Any, path: str) -> list[tuple[str, tuple[int, ...], s
 
 
 def check_size(rows: int, columns: int) -> None:
-    """Raise if a table declares too many columns or bytes."""
+    """Raise UnreadableError if a table declares too many columns or bytes."""
     if columns > MAX_ARRAYS or 8 * rows * columns > SIZE_LIMIT:
         raise UnreadableError(
             f"it declares {rows} rows of {columns} columns, more than {SIZE_LIMIT} bytes or {MAX_ARRAYS} columns",
@@ -161,7 +161,7 @@ def check_size(rows: int, columns: int) -> None:
 
 
 def timestamp_array(nanoseconds: Any, is_missing: Any) -> tuple[dict[str, Any], Any]:
-    """Encode a column of timestamps: header entry, and nanoseconds since the first valid one."""
+    """Return the header entry of a column of timestamps, and its values in nanoseconds since the first valid one."""
     numpy: Any = importlib.import_module("numpy")
     rows = numpy.flatnonzero(~is_missing)
     since = int(nanoseconds[rows[0]]) if rows.size else 0
@@ -171,7 +171,7 @@ def timestamp_array(nanoseconds: Any, is_missing: Any) -> tuple[dict[str, Any], 
 
 
 def read_feather(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header of a feather file (version 2, Arrow's own format) and its columns."""
+    """Return the header of a feather file (version 2, Arrow's IPC format) and its columns."""
     arrow: Any = importlib.import_module("pyarrow")
     ipc: Any = importlib.import_module("pyarrow.ipc")
     with open(path, "rb") as stream:
@@ -239,7 +239,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
 
 
 def _arrow_units(schema: Any) -> dict[str, dict[str, str]]:
-    """Return the units of columns, as fields or the attributes of a pandas frame state them."""
+    """Return the units by column that fields, or the attributes of a pandas frame, state."""
     try:
         whole = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
         units = {str(name): str(unit) for name, unit in whole.items()}
@@ -254,7 +254,7 @@ def _arrow_units(schema: Any) -> dict[str, dict[str, str]]:
 
 
 class Arrays:
-    """Collector of arrays within a byte budget."""
+    """List of arrays whose total size is limited in bytes."""
 
     def __init__(self, budget: int) -> None:
         self.header: dict[str, Any] = {"arrays": [], "skipped": {}}
@@ -262,7 +262,7 @@ class Arrays:
         self.left = budget
 
     def fits(self, name: str, shape: tuple[int, ...], kind: Any) -> bool:
-        """Whether an array of this shape and type is read; others are recorded as skipped."""
+        """Whether an array of this shape and type is read; any other is recorded as skipped."""
         why = None
         if kind.hasobject:
             why = "pickled objects, which are not read"
@@ -284,7 +284,7 @@ class Arrays:
         return True
 
     def add(self, name: str, values: Any, unit: str = "") -> None:
-        """Add an array; each field of a structured array becomes a column."""
+        """Append an array; each field of a structured array becomes a column."""
         numpy: Any = importlib.import_module("numpy")
         if values.dtype.names:
             for field in values.dtype.names:
@@ -337,7 +337,7 @@ def read_numpy(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def numpy_array(stream: Any, name: str, arrays: Arrays) -> Any:
-    """Read one NumPy array; None if it is skipped. The size is checked before the data are read."""
+    """Return one NumPy array, or None if it is skipped; its size is checked before the data are read."""
     form: Any = importlib.import_module("numpy.lib.format")
     version = form.read_magic(stream)
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
@@ -367,7 +367,7 @@ def read_hdf5(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def _gather(hdf5: Any, group: Any, prefix: str, arrays: Arrays, depth: int) -> None:
-    """Collect the arrays of an HDF5 group recursively."""
+    """Append the arrays of an HDF5 group and its subgroups to `arrays`."""
     for key in group:
         name, link = f"{prefix}{key}", group.get(key, getlink=True)
         if not isinstance(link, hdf5.HardLink):
@@ -457,7 +457,7 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
 
 
 def cell_text(cell: Any) -> str:
-    """Text of a spreadsheet cell; numbers keep all digits."""
+    """Return the text of a spreadsheet cell; numbers keep all digits."""
     if isinstance(cell, bool):
         return str(cell)
     if isinstance(cell, int | float):
@@ -483,7 +483,7 @@ READERS_BY_FORMAT = {
 
 
 def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) -> int:
-    """Write the arrays or cells of one file, or the error; return their number of bytes."""
+    """Write the arrays or cells of one file, or an error, to `out`; return the number of bytes of numbers."""
     matlab = path.lower().endswith(".mat")
     damaged = f"the file is damaged; get an intact copy or {SAVE_AGAIN if matlab else 'save it again'}"
     cells, payload = b"", []
@@ -509,7 +509,7 @@ def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) 
 
 
 def main(arguments: list[str]) -> None:
-    """Read the files of the command line and write one answer each."""
+    """Read the files that the arguments name, and write one answer for each to standard output."""
     # One thread and no memory pool: both would reserve memory that counts against the limit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"

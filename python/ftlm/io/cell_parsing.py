@@ -31,7 +31,7 @@ _MISSING_VALUE_TEXTS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", 
 
 @functools.cache
 def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
-    """Pattern of a number with grouped thousands; its decimals are the first group."""
+    """Return the regular expression of a number with grouped thousands; its first group is the decimals."""
     point = "," if comma else "[.]"
     return re.compile(
         rf"\s*[+-]?[1-9]\d{{0,2}}(?:{THOUSANDS_SEPARATORS[mark]}\d{{3}})+({point}\d*)?(?:[eE][+-]?\d{{1,3}})?\s*",
@@ -40,7 +40,7 @@ def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
 
 
 def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
-    """Return the thousands separator of a number if decimals make it unambiguous; else None."""
+    """Return the thousands separator of a number if decimals make it unambiguous, otherwise None."""
     if len(cell) < len("1.234,"):
         return None
     for mark in THOUSANDS_SEPARATORS:
@@ -51,15 +51,15 @@ def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
 
 
 def may_group(cell: str, mark: str, *, comma: bool) -> bool:
-    """Whether a cell is a number with thousands grouped by a given separator."""
+    """Whether a cell may be a number whose thousands a given separator groups."""
     return _grouped_number_pattern(mark, comma).fullmatch(cell) is not None
 
 
 def parse_number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
-    """Parse the number in a cell; raise `ValueError` if there is none.
+    """Return the number in a cell; raise ValueError if there is none.
 
-    Underscores between digits, which Python accepts, are rejected. With decimal commas a point is rejected, too, unless
-    `mark` declares it a thousands separator.
+    Underscores between digits, which Python accepts, are rejected. With decimal commas, a point is also rejected unless
+    `mark` is a point, as thousands separator.
     """
     if mark is not None and may_group(cell, mark, comma=comma):
         cell = re.sub(THOUSANDS_SEPARATORS[mark], "", cell)
@@ -84,12 +84,12 @@ def is_number(cell: str, *, comma: bool = False, mark: str | None = None) -> boo
 
 
 def is_gap(cell: str) -> bool:
-    """Whether a cell means a missing value."""
+    """Whether a cell represents a missing value."""
     return cell.strip().casefold() in _MISSING_VALUE_TEXTS
 
 
 def split_cells(lines: list[str], separator: str | None, source: str, first: int) -> list[list[str]]:
-    """Split lines into cells; quoted cells stay whole."""
+    """Return the cells of each line; separators within quotes do not split a cell."""
     if separator is None:
         return [line.split() for line in lines]
     if not any('"' in line for line in lines):
@@ -104,7 +104,7 @@ def split_cells(lines: list[str], separator: str | None, source: str, first: int
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Split a column name into its bare name and the unit in it; "" if there is no unit.
+    """Split a column name into the name without unit and the unit; the unit is "" if there is none.
 
     Any text in brackets counts as a unit; without brackets only known units, as in ``Strom / A`` or ``Current, A``.
     """
@@ -123,21 +123,21 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def split_slash_unit(name: str) -> tuple[str, str]:
-    """Split a name such as ``I/A`` into bare name and known unit after the slash; "" if there is no unit."""
+    """Split a name such as ``I/A`` into name and known unit; the unit is "" if there is none."""
     bare, stroke, unit = (part.strip() for part in name.partition("/"))
     is_unit = stroke and bare and unit and parse_unit(unit) is not None
     return (bare, unit) if is_unit and parse_unit(name) is None and not is_gap(name) and unit != "1" else (name, "")
 
 
 def _bracket_content(cell: str) -> str | None:
-    """Return the content of a cell in brackets; None if the cell is not in brackets."""
+    """Return the content of a cell that is in brackets, otherwise None."""
     text = cell.strip()
     whole = len(text) > 1 and text[0] in "[(" and text[-1] in "])" and not any(c in "[]()" for c in text[1:-1])
     return text[1:-1].strip() if whole else None
 
 
 def is_unit(cell: str) -> bool:
-    """Whether a cell may belong to a row of units."""
+    """Whether a cell may be part of a row of units."""
     bracketed = _bracket_content(cell)
     word = cell.strip() if bracketed is None else bracketed
     short = bracketed is not None and len(word) <= 12
@@ -150,7 +150,7 @@ def is_time_unit(word: str) -> bool:
 
 
 def unit_of(cell: str) -> str:
-    """Return the unit in a cell of a row of units, without brackets."""
+    """Return the unit in a cell of a row of units, without its brackets."""
     bracketed = _bracket_content(cell)
     return cell.strip() if bracketed is None else bracketed
 
@@ -175,7 +175,7 @@ def is_timestamp(cell: str) -> bool:
 
 
 def _match_timestamp(cell: str) -> re.Match[str] | None:
-    """Match a timestamp; None for an invalid one such as 13:00 AM or 24:30."""
+    """Return the match of a timestamp; None for other text and for invalid times such as 13:00 AM or 24:30."""
     text = cell.strip()
     match = _TIMESTAMP_PATTERN.fullmatch(text) if len(text) <= _MAX_TIMESTAMP_CHARACTERS else None
     if match is None:
@@ -188,20 +188,20 @@ def _match_timestamp(cell: str) -> re.Match[str] | None:
 
 @dataclass(frozen=True)
 class Timestamps:
-    """Timestamps of a column, as parsed numbers.
+    """Column of timestamps, as numbers parsed from text.
 
     Parameters
     ----------
     parts
-        Three numbers of each date in the order of the text, shape (N, 3); zeros for a time of day alone.
+        Three numbers of each date in the sequence of the text, shape (N, 3); zeros if the text is only a time of day.
     mark
         Separator of the date; "" without a date.
     clock
-        Time of day [ns] in UTC if it has a time zone, shape (N,).
+        Time of day [ns], shape (N,); in UTC if the text has a time zone.
     first
         Text of the first cell.
     notation
-        Notation: separator of the date, whether with time zone, whether with AM/PM.
+        Notation of the text: separator of the date, whether it has a time zone, and whether it has AM/PM.
     """
 
     parts: npt.NDArray[np.int64]
@@ -233,7 +233,7 @@ class Timestamps:
 
     @classmethod
     def concatenate(cls, pieces: Sequence[Timestamps]) -> Timestamps | None:
-        """Concatenate the blocks of one column; None if they differ in notation."""
+        """Return the blocks of one column as one; None if they differ in notation."""
         if len({piece.notation for piece in pieces}) > 1:
             return None
         return cls(
@@ -245,19 +245,19 @@ class Timestamps:
         )
 
     def seconds(self, thing: str, dates: str | None) -> Floats:
-        """Seconds since the first row, exact to the nanosecond.
+        """Return the times in seconds since the first row, exact to the nanosecond.
 
         Parameters
         ----------
         thing
             Label of the column in error messages.
         dates
-            Order of day and month given by the user, or None.
+            Order of year, month and day given by the user ("ymd", "dmy" or "mdy"), or None.
 
         Raises
         ------
         DataError
-            An invalid date, or an ambiguous order of day and month.
+            If a date is invalid, or the order of day and month is ambiguous.
         """
         since = self.clock
         if not self.mark:
@@ -278,14 +278,14 @@ class Timestamps:
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
     def inferred_date_order(self, dates: str | None) -> str:
-        """Return the inferred order of day and month if values depend on it; else ""."""
+        """Return the inferred order of day and month if the times depend on it, otherwise ""."""
         if not self.mark or dates is not None or (self.parts == self.parts[0]).all():
             return ""
         order = self._detect_date_order()
         return "" if order == "ymd" else order
 
     def _detect_date_order(self) -> str:
-        """Detect the order of the dates from their numbers; "" if it is ambiguous."""
+        """Return the order of day and month that the numbers of the dates imply; "" if it is ambiguous."""
         first, second, last = self.parts.max(axis=0)
         if first > 31:
             return "ymd"
@@ -296,7 +296,7 @@ class Timestamps:
         return "dmy" if is_day_first else ""
 
     def _order(self, thing: str, dates: str | None) -> tuple[int, int, int]:
-        """Return the positions of year, month and day."""
+        """Return the positions of year, month and day in a date; raise DataError if they are ambiguous."""
         first, likely = self.parts[:, 0].max(), self._detect_date_order()
         order = likely if likely == "ymd" or dates is None else dates
         if order:
@@ -313,7 +313,7 @@ class Timestamps:
 
 
 def _time_of_day_ns(hour: str, minute: str, second: str, fraction: str, half: str, zone: str) -> int:
-    """Time of day [ns], in UTC if it has a time zone."""
+    """Return the time of day [ns]; in UTC if it has a time zone."""
     hours, offset = int(hour or 0), 0
     if half:
         hours = hours % 12 + (12 if half in "Pp" else 0)
@@ -325,13 +325,13 @@ def _time_of_day_ns(hour: str, minute: str, second: str, fraction: str, half: st
 
 
 def _duration_ns(sign: str, whole: str, fraction: str) -> int:
-    """Duration [ns]."""
+    """Return a duration [ns]."""
     nanoseconds = int(whole) * _NANOSECONDS_PER_SECOND + int(fraction.ljust(9, "0") or 0)
     return -nanoseconds if sign else nanoseconds
 
 
 def _days_in_month(year: npt.NDArray[np.int64], month: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Number of days of each month."""
+    """Return the number of days of each month."""
     leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
     days = np.array([31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])[month - 1]
     return np.asarray(days + (leap & (month == 2)))

@@ -1,4 +1,4 @@
-"""Roles of columns by their names: inputs, outputs and signal names."""
+"""Roles of columns (input or output) and signal names, inferred from column names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ftlm.utils.validation import CSV_TIME, join_names
 
 @dataclass
 class ColumnSelection:
-    """Selection of columns and layout, from the arguments, the columns file and the ftlm header."""
+    """Selection of columns, with units and layout, from arguments, a columns file and the ftlm header."""
 
     time: Hashable | None
     step: float | None
@@ -49,16 +49,18 @@ _WORDS_BY_ROLE = {
 
 
 def words_of(column: str) -> set[str]:
-    """Case-folded words of a column name, without unit and digits."""
+    """Return the case-folded words of a column name, without unit and digits."""
     bare = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])", " ", split_unit(column)[0])
     return set(re.split(r"[\W\d_]+", bare.casefold())) - {""}
 
 
 def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Guess inputs and outputs from column names; both are empty if the names are ambiguous.
+    """Return the columns that are probably inputs, and those that are probably outputs, by their names.
 
-    References are left out, and a command beside its own measurement, if the other columns have both roles. A single
-    column is an output, unless it has the name of an input.
+    Both lists are empty if the names are ambiguous.
+
+    If the other columns have both roles, references are omitted, and so are commands whose quantity is also measured. A
+    single column is an output, unless it has the name of an input.
     """
     if len(columns) == 1 and not words_of(columns[0]) & _WORDS_BY_ROLE["input"]:
         return [], list(columns)
@@ -114,13 +116,13 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def known_unit(text: str, column: str = "") -> str:
-    """Return the ftlm unit of a unit in a file; "" if unknown, or if degrees may mean a temperature."""
+    """Return the ftlm unit for a unit in a file; "" if it is unknown, or if degrees may mean a temperature."""
     unit = parse_unit(text) or ""
     return "" if unit in ("deg", "°") and words_of(column) & _WORDS_BY_ROLE["temperature"] else unit
 
 
 def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
-    """Return valid, unique signal names by column; fallback names are "u" for inputs and "y" for outputs."""
+    """Return valid, unique signal names by column; `columns` has a fallback name for each, "u" or "y"."""
     names: dict[str, str] = {}
     for column, role in columns.items():
         bare = re.sub(r"\W+", "_", split_unit(column)[0].rpartition("/")[2]).strip("_")
@@ -139,14 +141,14 @@ _RESERVED_NAMES = frozenset(("d", "sign", "sat", "dead", "delay", "alpha", "a0",
 
 
 def has_numbers(column: Column) -> bool:
-    """Whether a column has numbers, possibly with gaps."""
+    """Whether a column consists of numbers, possibly with gaps."""
     return column.problem is None or column.blank
 
 
 def assume_roles(
     selection: ColumnSelection, columns: Sequence[Column], signals: tuple[Sequence[str], Sequence[str]] | None = None
 ) -> tuple[Assumption, ...]:
-    """Fill `wanted.inputs` and `wanted.outputs` in place if both are empty, and return the assumptions.
+    """Set inputs and outputs of a selection in place if it has neither, and return the assumptions made.
 
     Parameters
     ----------
@@ -155,9 +157,9 @@ def assume_roles(
     columns
         Columns of the file without its time.
     signals
-        Inputs and outputs of an equation. If the file has all of them, they are taken, without an assumption.
-        Otherwise roles are guessed from words in the column names, such as input or torque, output or angle; both stay
-        empty if these are ambiguous.
+        Inputs and outputs of an equation. If the file has all of them, they are selected without an assumption.
+        Otherwise roles are guessed from words in the column names, such as input or torque, output or angle. Inputs and
+        outputs stay empty if these words are ambiguous.
     """
     if selection.inputs or selection.outputs:
         return ()
@@ -189,7 +191,7 @@ def assume_roles(
 
 
 def add_file_units(selection: ColumnSelection, pool: Pool) -> None:
-    """Add the units that a file states for the selected columns to `wanted.units`, unless others are given."""
+    """Add the units that a file states for the selected columns to the selection, unless it has other units."""
     for name, spec in (selection.inputs | selection.outputs).items():
         column = pool.find(spec, f"signal {name!r}")
         unit = known_unit(column.file_unit, column.name_with_unit)

@@ -1,4 +1,4 @@
-"""Text files with separated columns: encoding, rows, columns of numbers, and errors with line and column."""
+"""Reader of text files with separated columns; its errors name line and column."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MAX_UNPACKED_BYTES = 1 << 30
 
 
 def _fill_hint() -> str:
-    """Remedy for cells without a number."""
+    """Return the remedy for cells without a number, for messages."""
     return (
         f"fill or remove these rows yourself, or let them be missing with {parameter('missing', 'weight')} or "
         f"{parameter('missing', 'hold')}"
@@ -105,7 +105,7 @@ class _BadCells:
 
 @dataclass
 class _Rows:
-    """Rows parsed so far, with invalid cells and timestamps by column."""
+    """Rows of a table that were read so far, with invalid cells and timestamps by column."""
 
     dialect: TableDialect
     sheet: bool = False
@@ -121,7 +121,7 @@ class _Rows:
 
 
 def read_text(path: Path, layout: Layout) -> FileTable:
-    """Read the columns of one text file, optionally compressed by gzip."""
+    """Read one text file, optionally compressed by gzip, and return its columns as a table."""
     try:
         with open(path, "rb") as stream:
             if path.suffix.lower() != ".gz" and stream.read(2) != b"\x1f\x8b":
@@ -145,7 +145,7 @@ def _read_gzip(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
 
 
 class _SizeLimitedStream:
-    """Stream that raises when it exceeds the size limit."""
+    """Stream that raises DataError when more bytes are read than the size limit."""
 
     def __init__(self, path: Path, stream: gzip.GzipFile) -> None:
         self._path, self._stream = path, stream
@@ -168,7 +168,7 @@ class _SizeLimitedStream:
 def parse_text(
     path: Path, stream: BinaryIO | _SizeLimitedStream, layout: Layout, sheet: str | None = None
 ) -> FileTable:
-    """Parse the columns of a text file, or of a sheet given as tab-separated lines."""
+    """Return the columns in a text stream, or in a sheet given as tab-separated lines, as a table."""
     source = path.name if sheet is None else f"{path.name}, sheet {sheet!r}"
     header = header_of_line(path, stream.readline(MAX_HEADER_BYTES)) if sheet is None else None
     stream.seek(0)
@@ -209,7 +209,10 @@ def _with_gaps(
     *,
     sheet: bool,
 ) -> TableDialect:
-    """Account for empty rows right below the header: kept in text, skipped with a note in sheets."""
+    """Return the dialect adjusted for empty rows directly below the header.
+
+    In text they are kept as rows; in a sheet they are skipped with a note.
+    """
     if dialect.separator != "\t" or dialect.names is None:
         return dialect
     above = max((at for at, _ in sample if at < dialect.begin), default=0)
@@ -230,7 +233,7 @@ def _with_gaps(
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
-    """Extend the assumption on missing names if a comment above the rows has as many words as columns."""
+    """Return the assumption on missing names, extended if a comment above the rows has as many words as columns."""
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
         return assumption
@@ -240,7 +243,10 @@ def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
 def _sample(
     blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
 ) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
-    """Return the blocks read so far, the first lines with content, and the comment above them."""
+    """Return the blocks read so far, the first lines with content, and the comment above them.
+
+    The lines are those from which the layout is detected.
+    """
     head: list[tuple[int, list[str]]] = []
     sample: list[tuple[int, str]] = []
     size, remark = 0, ""
@@ -265,7 +271,7 @@ def _has_content(line: str, mark: str) -> bool:
 
 
 def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
-    """Parse the rows of one block."""
+    """Parse the lines of one block, and append their rows."""
     dialect = rows.dialect
     content = []
     for at, line in enumerate(lines, first):
@@ -298,14 +304,14 @@ def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: st
 
 
 def _is_footer(line: str, dialect: TableDialect, source: str, at: int) -> bool:
-    """Whether a line after an empty one is text below the table: it begins with a word and is no row."""
+    """Whether a line after an empty one is a footer: it begins with a word and is not a row."""
     cells = split_cells([line], dialect.separator, source, at)[0]
     numbers = [is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells]
     return bool(cells[0].strip()) and not numbers[0] and (len(cells) != dialect.width or not any(numbers))
 
 
 def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
-    """Raise if a line below the table is a row again."""
+    """Raise DataError if a line below a footer is a row again."""
     dialect = rows.dialect
     cells = split_cells([line], dialect.separator, source, at)[0]
     if len(cells) == dialect.width and all(is_number(c, comma=dialect.comma, mark=dialect.mark) for c in cells):
@@ -316,7 +322,7 @@ def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
 
 
 def _check_remark(line: str, at: int, dialect: TableDialect, source: str) -> None:
-    """Raise if a line among the rows may be a comment as well as a row that begins with #N/A."""
+    """Raise DataError if a line may be a comment or a row that begins with #N/A."""
     cells = line.split(dialect.separator)
     numbers = any(is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells)
     error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
@@ -385,7 +391,10 @@ def _ragged_rows_error(rows: _Rows, source: str) -> DataError:
 
 
 def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path) -> tuple[str, tuple[Assumption, ...]]:
-    """Return the encoding of a text: given, by byte-order mark, by zero bytes, UTF-8, else cp1252 or latin-1."""
+    """Return the encoding of a text, and assumptions about it.
+
+    It is the given one, or that of a byte-order mark or of zero bytes, or UTF-8, else cp1252 or latin-1.
+    """
     if layout.encoding is not None:
         return layout.encoding, ()
     head = stream.read(MAX_HEADER_BYTES)
@@ -422,7 +431,7 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
 
 
 def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield blocks of lines, a few megabytes each, with the number of their first line."""
+    """Yield (number of the first line, lines) for blocks of a few megabytes."""
     decoder = codecs.getincrementaldecoder("utf-8-sig" if encoding == "utf-8" else encoding)()
     carry, number_, newline = "", 1, ""
     while True:
@@ -487,7 +496,7 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
 
 
 def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
-    """Store a column of timestamps, or its cells that are neither numbers nor timestamps."""
+    """Store a column whose cells are not all numbers: as timestamps, or its invalid cells for the error message."""
     comma, mark = rows.dialect.comma, rows.dialect.mark
     if is_timestamp(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
         moments = Timestamps.read(column)

@@ -1,4 +1,4 @@
-"""Layout of text files: detection of separator, decimal mark and header, and the user's `Layout`."""
+"""Layout of text files: the user's options, and detection of separator, decimal mark and header."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MAX_SKIPPED_LINES = 1 << 40
 @check_arguments
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a text file or sheet; options that are None are detected and reported as assumptions.
+    """Layout options of a text file or sheet; options that are None are detected and reported as assumptions.
 
     Parameters
     ----------
@@ -50,20 +50,20 @@ class Layout:
     decimal : {"point", "comma"}, optional
         Decimal mark in text.
     thousands : {"none", "point", "comma", "space", "apostrophe"}, optional
-        Thousands separator in text; detected only if decimals make it unambiguous, as in ``1.234,5``.
+        Thousands separator in text. It is detected only if decimals make it unambiguous, as in ``1.234,5``.
     skip : int, optional
         Number of lines (rows of a sheet) above the table, without its header.
     header : {0, 1, 2}, optional
         Number of header lines: none, names, names and units.
     dates : {"ymd", "dmy", "mdy"}, optional
-        Order of day and month if the dates are ambiguous.
+        Order of year, month and day in dates that are ambiguous.
     sheet : str, optional
-        Sheet of a workbook.
+        Name of the sheet in a workbook.
 
     Raises
     ------
     DataError
-        An option with an invalid value.
+        If an option has an invalid value.
     """
 
     encoding: str | None = None
@@ -113,7 +113,7 @@ class Layout:
     @classmethod
     @check_arguments
     def of(cls, layout: object) -> Layout:
-        """Build a layout from an argument: None, a layout, or a mapping of its fields."""
+        """Return the layout that an argument denotes: None, a layout, or a mapping of its fields."""
         if layout is None:
             return cls()
         if isinstance(layout, Layout):
@@ -133,7 +133,7 @@ class Layout:
 
     @check_arguments
     def under(self, other: Layout) -> Layout:
-        """Merge two layouts; options of the other one take precedence."""
+        """Return the merged options of two layouts; those of the other layout take precedence."""
         return replace(self, **other.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
@@ -142,7 +142,10 @@ class Layout:
 
     @check_arguments
     def check_used(self, path: str, kind: str, names: tuple[str, ...]) -> None:
-        """Raise if an option is set that this file format does not use."""
+        """Raise DataError if an option is set that a file format does not use.
+
+        `names` are the options that the format uses.
+        """
         unused = [option for option in self.to_dict() if option not in names]
         if unused:
             raise DataError(f"{path}: {layout_fields(unused[0])} is not used with {kind}; leave it out")
@@ -150,7 +153,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Assumption:
-    """Assumption made on reading a file that does not state an option itself.
+    """Assumption that was made when a file was read, because the file does not state an option.
 
     Parameters
     ----------
@@ -161,9 +164,9 @@ class Assumption:
     words : str
         Evidence in the file, as text.
     otherwise : str
-        How to override the assumption.
+        Text on how to override the assumption.
     counts : bool
-        Whether values or rows depend on it; the warnings of the run then list it.
+        Whether values or rows depend on the assumption, so that the warnings of the run list it.
     """
 
     option: str
@@ -177,7 +180,10 @@ class Assumption:
 
 
 def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
-    """Return the name of an option value given by name or as the character itself."""
+    """Return the name of an option value that is given by name or as the character itself.
+
+    Raise DataError for an unknown value.
+    """
     if isinstance(value, str):
         if value in words:
             return value
@@ -188,7 +194,7 @@ def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
 
 
 def _encoding(value: object) -> str:
-    """Return Python's canonical name of a text encoding."""
+    """Return Python's canonical name of a text encoding; raise DataError for an unknown one."""
     try:
         if not isinstance(value, str):
             raise LookupError
@@ -217,7 +223,7 @@ _ROW_INDEX_UNIT = "sequence"
 
 @dataclass(frozen=True)
 class TableDialect:
-    """Dialect and position of a table in a text: separators, header, first row and assumptions.
+    """Detected layout and position of a table in a text.
 
     Parameters
     ----------
@@ -230,9 +236,9 @@ class TableDialect:
     width
         Number of cells per row.
     layout
-        The same as a :class:`Layout`.
+        Detected options as a :class:`Layout`.
     assumed
-        Assumptions made on detection.
+        Assumptions of the detection.
     """
 
     separator: str | None
@@ -248,7 +254,7 @@ class TableDialect:
 
 @dataclass(frozen=True)
 class _Line:
-    """Line of the sample, split by one candidate dialect."""
+    """Line of the sample, split into cells by one candidate for the separators."""
 
     at: int
     cells: list[str]
@@ -261,7 +267,7 @@ class _Line:
 
     @property
     def count(self) -> int:
-        """Number of cells with a number or a timestamp."""
+        """Number of cells that are a number or a timestamp."""
         return sum(self.numbers)
 
     @property
@@ -270,7 +276,7 @@ class _Line:
 
     @property
     def is_row_candidate(self) -> bool:
-        """Whether the line may be a row: it has numbers, and no more words than numbers."""
+        """Whether the line may be a row: it has numbers, and at most as many words as numbers."""
         return self.count > 0 and self.count >= self.words
 
     @property
@@ -281,25 +287,25 @@ class _Line:
 def find_table(
     lines: Sequence[tuple[int, str]], layout_options: Layout, source: str, *, own: bool, sheet: bool
 ) -> TableDialect:
-    """Detect the table in the first lines of a text.
+    """Return the layout and position of the table in the first lines of a text.
 
     Parameters
     ----------
     lines
-        Pairs of line number and line, without blank lines and comments; at least one.
+        (line number, line) pairs without blank lines and comments; at least one.
     layout_options
-        Layout given by the user; other options are detected.
+        Options given by the user; the others are detected.
     source
         Name of the file in error messages.
     own
-        Whether ftlm wrote the file: commas, decimal points, one line of names.
+        Whether ftlm wrote the file, so that it has commas, decimal points and one line of names.
     sheet
         Whether the lines are rows of a sheet, with tabs between cells.
 
     Raises
     ------
     DataError
-        No row of numbers, or an ambiguous layout.
+        If there is no row of numbers, or the layout is ambiguous.
     """
     if own:
         layout_options = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(
@@ -335,7 +341,7 @@ def find_table(
 
 
 def _check_width(rows: Sequence[tuple[int, str]], source: str) -> None:
-    """Raise for lines with too many columns, whatever separates them."""
+    """Raise DataError if a line has too many columns for any separator."""
     for at, line in rows:
         count = max(len(line.split()), *(line.count(mark) + 1 for mark in _SEPARATOR_CANDIDATES if mark is not None))
         if count > MAX_COLUMNS:
@@ -348,9 +354,9 @@ def _check_width(rows: Sequence[tuple[int, str]], source: str) -> None:
 def _split_lines(
     rows: Sequence[tuple[int, str]], separator: str | None, source: str, layout: Layout, *, comma: bool
 ) -> tuple[list[_Line], str | None]:
-    """Split lines into cells, and detect the thousands separator.
+    """Return the lines split into cells, and the thousands separator.
 
-    Quotes are ignored in a line with unbalanced quotes; reading its row raises later.
+    In a line with unbalanced quotes, the quotes are ignored; an error is raised later when its row is read.
     """
     cut, parted = [], []
     for at, line in rows:
@@ -374,7 +380,7 @@ def _split_lines(
 
 
 def _dialect_candidates(text: str, layout: Layout) -> Iterator[tuple[str | None, bool]]:
-    """Yield candidate pairs of separator and decimal mark."""
+    """Yield (separator, whether the decimal mark is a comma) for all candidates."""
     for separator in _SEPARATOR_CANDIDATES if layout.separator is None else (SEPARATOR_CHARACTERS[layout.separator],):
         if layout.separator is None and separator is not None and separator not in text:
             continue
@@ -416,7 +422,10 @@ def _decimal_comma(cut: list[_Line]) -> str | None:
 
 
 def _width(cut: list[_Line]) -> int:
-    """Most frequent number of cells: of lines with only numbers, else of lines with numbers, else of the first."""
+    """Return the most frequent number of cells of the lines that are most likely rows.
+
+    These are lines with only numbers, else lines with numbers, else the first line.
+    """
     for rows in ([line for line in cut if line.has_only_numbers], [line for line in cut if line.is_row_candidate]):
         counts = Counter(line.width for line in rows)
         if counts:
@@ -427,7 +436,7 @@ def _width(cut: list[_Line]) -> int:
 
 
 def _first_row(cut: list[_Line], width: int) -> int:
-    """Index of the first row: the first typical line, preceded by damaged lines of the same width."""
+    """Return the index of the first row: the first typical line, or a damaged line of the same width before it."""
     rows = [line for line in cut if line.width == width and line.is_row_candidate]
     if not rows:
         return 1 if cut[0].has_only_words else 0
@@ -456,7 +465,7 @@ def _is_above_units(cut: list[_Line], first: int) -> bool:
 
 
 def _is_settings_line(cut: list[_Line], at: int) -> bool:
-    """Whether a line below the names holds units and settings, such as start and increment of oscilloscopes."""
+    """Whether a line below the names has units and settings, such as start and increment of an oscilloscope."""
     line = cut[at]
     words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
     units = [word for word in words if is_unit(word)]
@@ -480,19 +489,22 @@ def _is_unit_line(line: _Line) -> bool:
 
 
 def _has_unit(units: Sequence[str]) -> bool:
-    """Whether one of the texts is a unit that is not also a mark for missing values."""
+    """Whether one of the texts is a unit and not also a symbol for missing values."""
     return any(unit.strip().casefold() not in ("-", "none", "%") for unit in units)
 
 
 def _header(
     cut: list[_Line], top: int, width: int, layout: Layout, source: str, *, own: bool
 ) -> tuple[list[str] | None, list[str] | None, int]:
-    """Return names and units of the header, and the index of the first row."""
+    """Return names and units in the header, and the index of the first row."""
     rows = [line for line in cut[top:] if line.width == width]
     spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)
 
     def fit_names(line: _Line) -> list[str]:
-        """Return the names, without a comment column that rows lack, or with an empty name for an empty last cell."""
+        """Return the names for the width of the rows.
+
+        A column of comments that rows lack is dropped, and an empty last cell of rows gets an empty name.
+        """
         names = [cell.strip() for cell in line.cells]
         if len(names) == width + 1 and names[-1].casefold() in ("", _COMMENT_COLUMN_NAME):
             return names[:-1]
@@ -539,7 +551,7 @@ def _header(
 
 
 def check_distinct(names: list[str], at: int, source: str) -> None:
-    """Raise if a column name is repeated."""
+    """Raise DataError if a column name is repeated."""
     times = Counter(names)
     for name in names:
         if name and times[name] > 1:
@@ -549,13 +561,13 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
 
 
 def _check_headless(line: _Line, source: str, layout: Layout) -> None:
-    """Raise if the first row mixes words and numbers and could be a header."""
+    """Raise DataError if the first row mixes words and numbers, so that it could be a header."""
     if line.words and layout.header is None:
         raise _mixed_line(line, source)
 
 
 def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool, str | None]) -> None:
-    """Raise if lines of numbers above the table would be skipped."""
+    """Raise DataError if lines of numbers above the table would be skipped."""
     comma, mark = marks
     rows = [
         line
@@ -586,7 +598,7 @@ def _mixed_line(line: _Line, source: str) -> DataError:
 
 
 def _check_commas(rows_of_text: Sequence[tuple[int, str]], cut: list[_Line], source: str) -> None:
-    """Raise if commas may be separators as well as decimal marks."""
+    """Raise DataError if commas may be both separators and decimal marks."""
     rows = [(line, text) for line, (_, text) in zip(cut, rows_of_text, strict=True) if line.has_only_numbers]
     if not rows:
         return
@@ -603,7 +615,7 @@ def _check_commas(rows_of_text: Sequence[tuple[int, str]], cut: list[_Line], sou
 
 
 def _check_thousands(cut: list[_Line], source: str) -> None:
-    """Raise if every comma is followed by three digits and may be a thousands separator."""
+    """Raise DataError if three digits follow every comma, so that it may be a thousands separator."""
     cells = [
         (line.at, cell.strip())
         for line in cut
@@ -619,7 +631,7 @@ def _check_thousands(cut: list[_Line], source: str) -> None:
 
 
 def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool, source: str) -> None:
-    """Raise if header and rows share commas as a second separator, which decimal commas would not explain."""
+    """Raise DataError if header and rows contain commas besides the separator that are not decimal commas."""
     if not comma or separator is None:
         return
     header = cut[top - 1]
@@ -643,7 +655,7 @@ def _summarize_layout(
     top: int,
     first: int,
 ) -> tuple[Layout, tuple[Assumption, ...]]:
-    """Return the detected layout and the assumptions in it."""
+    """Return the detected layout, and the assumptions in it."""
     header = 0 if names is None else 2 if units is not None else 1
     start = top - header
     skip = (

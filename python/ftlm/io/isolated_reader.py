@@ -1,4 +1,7 @@
-"""Parent side of the isolated binary reader: runs the binary reader in a separate process and parses its output."""
+"""Reading of binary files in a separate process, from the side of the parent process.
+
+See :mod:`ftlm.io.binary_reader` for the side of the child process.
+"""
 
 from __future__ import annotations
 
@@ -37,13 +40,13 @@ class BinaryFormat:
     Parameters
     ----------
     kind
-        Name of the format in the reader.
+        Name of the format in :mod:`ftlm.io.binary_reader`.
     suffixes
         File name extensions.
     package, extra
-        Python package that reads the format, and the extra of ftlm that installs it; "" if NumPy suffices.
+        Python package that reads the format, and the extra of ftlm that installs it; "" if NumPy is sufficient.
     label, repair_hint
-        Name of the format in error messages, and how to save such a file again.
+        Name of the format, and text on how to save such a file again, for error messages.
     has_sheets
         Whether the file consists of sheets, whose cells are parsed like delimited text.
     """
@@ -100,7 +103,10 @@ def _is_hdf5(path: Path) -> bool:
 
 
 def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list[FileTable]:
-    """Read files of one format in a separate process; a crash is attributed to the first unanswered file."""
+    """Read files of one format in a separate process, and return their tables.
+
+    A crash is reported as an error of the first file without an answer.
+    """
     if importlib.util.find_spec(kind.package) is None:
         raise DataError(
             f"{str(paths[0])!r}: reading {kind.label} files needs {kind.package.replace('_', '-')}; run: pip install "
@@ -135,7 +141,7 @@ def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list
 
 
 def describe_crash(code: int) -> str:
-    """Describe the signal that ended a process."""
+    """Return text on the signal that ended a process."""
     try:
         return f"signal {-code}, {signal.Signals(-code).name}"
     except ValueError:
@@ -143,7 +149,7 @@ def describe_crash(code: int) -> str:
 
 
 def _describe_exit(code: int) -> str:
-    """Describe the exit of the reader process."""
+    """Return text on the exit of the reader process."""
     if code >= 0:
         return "ended too early" if code == 0 else f"ended with code {code}"
     return f"crashed ({describe_crash(code)})"
@@ -157,7 +163,7 @@ Size = Annotated[int, msgspec.Meta(ge=0)]
 
 
 class _Array(msgspec.Struct):
-    """Array of a file: numbers in columns, or nanoseconds since a reference time."""
+    """Description of an array in the reader's output: numbers in columns, or timestamps."""
 
     name: str
     rows: Size
@@ -168,7 +174,7 @@ class _Array(msgspec.Struct):
 
 
 class _Answer(msgspec.Struct):
-    """Answer for one file, ahead of its numbers and cells; see :mod:`ftlm.io.binary_reader`."""
+    """Header of the reader's answer for one file, which precedes its numbers and cells."""
 
     arrays: list[_Array] = []
     skipped: dict[str, str] = {}
@@ -192,7 +198,7 @@ class _ReaderOutput:
         self._at = 0
 
     def count_complete(self, most: int) -> int:
-        """Count the files with a complete answer."""
+        """Return the number of files with a complete answer, at most `most`."""
         count = 0
         while count < most and self._next() is not None:
             count += 1
@@ -238,7 +244,7 @@ class _ReaderOutput:
 
 
 def _sheet(path: Path, sheet: str, others: list[str], cells: bytes, layout: Layout) -> FileTable:
-    """Parse the cells of a sheet, sent as tab-separated text."""
+    """Return the table in the cells of a sheet, which the reader sends as tab-separated text."""
     table = parse_text(path, io.BytesIO(cells), layout, sheet)
     if layout.sheet is None and others:
         words = f"sheet {sheet!r}, the only one that is not empty"
@@ -248,7 +254,7 @@ def _sheet(path: Path, sheet: str, others: list[str], cells: bytes, layout: Layo
 
 
 def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
-    """Return the columns of an array: a vector under its name, a matrix under its name and column numbers."""
+    """Return the columns of an array, named like a vector, or by matrix name and column number."""
     name = array.name
     # Keep single precision: the step detection needs the true resolution of the times.
     with np.errstate(over="ignore"):  # what overflows is no single; it is refused as infinite
@@ -268,7 +274,7 @@ def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
 
 
 def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Column:
-    """Build the column of an array of dates."""
+    """Return the column of an array of timestamps."""
     values = matrix.ravel(order="F")
     thing, is_missing = f"{path.name}: column {name!r}", np.isnan(values)
     if is_missing.any():

@@ -1,4 +1,4 @@
-"""Loading of runs from files, with column selection; ambiguous files raise an error."""
+"""Loading of runs from files, with selection of columns."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MAX_FILE_BYTES = 1 << 30
 
 
 class _ColumnsFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a columns file."""
+    """Content of a columns file (TOML), with the keys of ``columns=``."""
 
     time: str | int | None = None
     step: float | None = None
@@ -66,7 +66,7 @@ def load(
     missing: str | None = None,
     layout: Layout | Mapping[str, object] | None = None,
 ) -> Run:
-    """Load one run from a text, spreadsheet or array file, or from several files with its columns.
+    """Load one run from a text, spreadsheet or array file, or from several files that each have some of its columns.
 
     Parameters
     ----------
@@ -75,44 +75,44 @@ def load(
         ``.parquet``, ``.feather``. A group of an HDF5 file is named in the path, ``runs.h5/run1``. The layout of text
         and sheets is given by `layout` or detected: comma, semicolon, tab or white space between cells, decimal points
         or commas, a line of names, a line of units, dates. Ambiguous files raise an error. Assumptions that affect
-        values are listed in the `warnings` of the run, with the option that overrides them. Lines that begin with
-        ``#`` are skipped. Without a header the columns are c1, c2, … The columns of a matrix V are V.1, V.2, … (or
-        ``V(:,1)``), a vector keeps its name; samples are in rows. Columns of several files are pooled; a name in two
-        files is prefixed by its file, ``STEM/V.3``.
+        values are listed in the `warnings` of the run, with the option that overrides them. Lines that begin with ``#``
+        are skipped. Without a header the columns are named c1, c2, … The columns of a matrix V are named V.1, V.2, …
+        (or ``V(:,1)``), and a vector keeps its name; samples are in rows. If two files have the same column name, the
+        file name is put in front of it, as in ``STEM/V.3``.
     time : str or int, optional
-        Time column, by name or, in a single text file, by position from 0. Without `time` and `step`, the column
-        called t, time or seconds is used (any case, alone or with a unit as in ``time [ms]`` or ``t_ms``). Otherwise,
-        with a warning: a column with a name such as Timestamp or Zeit, the only column of dates, or a first column
-        with a unit of time. Otherwise the first column of every matrix in use; these must be equal. Dates and times of
+        Time column, by name or, in a single text file, by position from 0. Without `time` and `step`, the column called
+        t, time or seconds is used (any case, alone or with a unit as in ``time [ms]`` or ``t_ms``). Otherwise, with a
+        warning: a column with a name such as Timestamp or Zeit, the only column of dates, or a first column with a unit
+        of time. Otherwise the first column of every selected matrix is used; these must be equal. Dates and times of
         day are converted to seconds since the first row.
     inputs, outputs : mapping of str to column, or list of str, optional
-        Columns by signal name; a list names columns that keep their names; at least one output. The unit in a name
-        such as ``I (A)`` may be omitted. If neither is given here, by `columns` or by an ftlm header, both are guessed
-        from words in the column names as by :func:`ftlm.open_file`; the guess is listed in
-        the `warnings` of the run, and ambiguous names raise an error.
+        Column by signal name, or a list of columns that keep their names; at least one output. The unit in a name such
+        as ``I (A)`` may be omitted. If neither is given here, by `columns` or by an ftlm header, both are guessed from
+        words in the column names as by :func:`ftlm.open_file`; the guess is listed in the `warnings` of the run, and
+        ambiguous names raise an error.
     units : mapping of str to str, optional
-        Units of signals, converted to SI, in place of those that the file states in names such as ``y [deg]``, a line
-        of units or attributes; "" takes numbers as they are. Signals without a unit are taken as they are, too.
+        Units of signals, from which values are converted to SI. They replace units that the file states in names such
+        as ``y [deg]``, in a line of units or in attributes. With "" or without a unit, values are not converted.
     columns : mapping or path of a TOML file, optional
-        Keys ``time`` or ``step``, tables ``inputs``, ``outputs``, ``units``, ``intersample``, ``layout``; the arguments
-        of the same name override or extend it.
+        Arguments in a mapping or file: keys ``time`` or ``step``, and tables ``inputs``, ``outputs``, ``units``,
+        ``intersample`` and ``layout``. Arguments of the same name override or extend them.
     intersample : mapping of str to {"zoh", "foh"}, optional
         Intersample behavior of an input; default ``"zoh"``.
     step : float, optional
         Time between rows [s], > 0, in place of `time`.
     window : pair of float or None, optional
-        Use the rows with a ≤ t < b only, [s] since the first row.
+        Times (a, b) [s] since the first row: only rows with a ≤ t < b are used.
     resample : float, optional
-        Resample to this step [s]: interval means of held inputs, linear interpolation of all other signals.
-        Nonuniform outputs keep their own times for the output error, see `Run.from_arrays`. Recorded in the warnings.
+        New step [s], to which the run is resampled; see `Run.from_arrays`. Nonuniform outputs keep their own times for
+        the output error. The warnings list the resampling.
     name : str, optional
         Name of the run in reports; default the name of the first file.
     time_unit : {"s", "ms", "us", "min", "h"}, optional
         Unit of the time column; default the unit in its header (with a warning), else s. A contradicting header
         raises an error. The unit is never guessed from the spacing of the samples.
     missing : {"refuse", "weight", "hold"}, optional
-        Treatment of NaN, empty cells and missing rows, see `Run.from_arrays`. Default ``"refuse"``, or ``"weight"``
-        for a file written by ftlm with missing outputs.
+        Treatment of NaN, empty cells and missing rows; see `Run.from_arrays`. The default is ``"refuse"``, or
+        ``"weight"`` for a file that ftlm wrote with missing outputs.
     layout : Layout or dict, optional
         Layout of text or sheets, as far as it cannot be detected; see :class:`ftlm.Layout`.
 
@@ -123,9 +123,9 @@ def load(
     Raises
     ------
     DataError
-        If a file is missing, too large (more than 1 GiB), damaged or of another kind; if a line is ragged, or a column
-        in use is unknown, empty somewhere or holds text (line, row and column are named); and for everything
-        `Run.from_arrays` refuses.
+        If a file is missing, larger than 1 GiB, damaged or of an unknown format; if a line has too few or too many
+        cells; if a selected column is unknown, has empty cells or contains text (the message names line, row and
+        column); and in the cases of `Run.from_arrays`.
 
     Examples
     --------
@@ -142,7 +142,10 @@ def load_selection(
     options: LoadOptions,
     signals: Signals | None = None,
 ) -> Run:
-    """Load a run; `signals` are the inputs and outputs of an equation, for columns that are not selected."""
+    """Load the run of a column selection.
+
+    `signals` are the inputs and outputs of an equation, for columns that are not selected.
+    """
     run = run_from_tables(read_tables(path, selection.layout), selection, options, signals)
     PACKAGE_LOGGER.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
     return run
@@ -150,7 +153,7 @@ def load_selection(
 
 @dataclass(frozen=True)
 class LoadOptions:
-    """Further arguments of :func:`load`; validates `missing`."""
+    """Further arguments of :func:`load`, of which `missing` is validated."""
 
     window: Sequence[float | None] | None = None
     resample: float | None = None
@@ -162,7 +165,7 @@ class LoadOptions:
         check_missing_policy(self.missing or "refuse")
 
     def missing_policy(self, header: Header | None) -> MissingPolicy:
-        """Return the treatment of missing samples: as given, else as the ftlm header implies."""
+        """Return the treatment of missing samples: the given one, otherwise that which the ftlm header implies."""
         if self.missing is None and header is not None and header.missing:
             return "weight"
         return check_missing_policy(self.missing or "refuse")
@@ -175,7 +178,10 @@ Signals = tuple[Sequence[str], Sequence[str]]
 def run_from_tables(
     tables: list[FileTable], selection: ColumnSelection, options: LoadOptions, signals: Signals | None = None
 ) -> Run:
-    """Build the run of selected columns from file tables; see :func:`load` for columns that are not selected."""
+    """Return the run of the selected columns of file tables.
+
+    Columns that are not selected are chosen as in :func:`load`.
+    """
     header = tables[0].header
     policy = options.missing_policy(header)
     if header is not None and len(tables) > 1:
@@ -278,7 +284,7 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
 
 
 def _assume_roles(selection: ColumnSelection, pool: Pool, signals: Signals | None) -> tuple[Assumption, ...]:
-    """Choose inputs and outputs by column names if none are named."""
+    """Choose inputs and outputs by column names if the selection has none, and return the assumptions."""
     if selection.inputs or selection.outputs:
         return ()
     matrices = list(dict.fromkeys(c.matrix for c in pool.columns if c.matrix is not None))
@@ -289,12 +295,12 @@ def _assume_roles(selection: ColumnSelection, pool: Pool, signals: Signals | Non
 
 
 def base_name(path: Path) -> str:
-    """Return the file name without its extensions, including ``.gz``."""
+    """Return a file name without its extensions, including ``.gz``."""
     return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
 
 
 def _check_disjoint_roles(selection: ColumnSelection, pool: Pool) -> None:
-    """Raise if a column is both an input and an output; its model would be trivial."""
+    """Raise DataError if a column is both an input and an output, because its model would be trivial."""
     driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in selection.inputs.items()}
     twice = [
         (driven[id(column)], name)
@@ -310,7 +316,7 @@ def _check_disjoint_roles(selection: ColumnSelection, pool: Pool) -> None:
 
 
 def time_header(clock: Column) -> str:
-    """Return the header of a time column, with its unit; ``time`` for the first column of a matrix."""
+    """Return the header of a time column with its unit, or ``time`` for the first column of a matrix."""
     if clock.matrix is not None:
         return "time"
     below = clock.file_unit and split_time_header(clock.variable)[1] is None and not split_unit(clock.variable)[1]
@@ -318,7 +324,7 @@ def time_header(clock: Column) -> str:
 
 
 def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
-    """Return files, each with the group of an HDF5 file that the path goes on to; "" for the whole file."""
+    """Return (file, group) for each path; the group is that of an HDF5 file, "" for the whole file."""
     entries = [argument] if isinstance(argument, (str, os.PathLike)) else argument
     if not isinstance(entries, Sequence) or not all(isinstance(entry, (str, os.PathLike)) for entry in entries):
         raise DataError(f"path is a {type(argument).__name__}; pass the path of a file, or a list of paths")
@@ -339,7 +345,7 @@ def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
 
 
 def _split_group(path: Path) -> tuple[Path, str]:
-    """Split a path that goes on into an HDF5 file, such as ``runs.h5/run1``, into the file and the group."""
+    """Split a path such as ``runs.h5/run1`` into the HDF5 file and the group in it."""
     for parent in path.parents:
         if parent.suffix.lower() in HDF5_FORMAT.suffixes and parent.is_file():
             return parent, path.relative_to(parent).as_posix()
@@ -347,7 +353,10 @@ def _split_group(path: Path) -> tuple[Path, str]:
 
 
 def run_paths(path: str) -> list[str]:
-    """Return the paths of the runs in a file: those of its groups if several groups of an HDF5 file have a time."""
+    """Return the paths of the runs in a file.
+
+    If several groups of an HDF5 file have a time column, each of them is a run.
+    """
     if Path(path).suffix.lower() not in HDF5_FORMAT.suffixes or not Path(path).is_file():
         return [path]
     (table,) = read_tables(path, Layout())
@@ -371,7 +380,7 @@ def _size(path: Path) -> int:
 
 
 def read_tables(path: PathLike | Sequence[PathLike], layout: Layout) -> list[FileTable]:
-    """Read the tables of files, independent of the column selection."""
+    """Return the tables of files, with all their columns."""
     places = _paths(path)
     read: dict[Path, FileTable] = {}
     kinds = {file: binary_format_of(file) for file, _ in places}
@@ -394,7 +403,7 @@ def column_names(path: PathLike) -> tuple[str, ...] | None:
     Raises
     ------
     DataError
-        As :func:`load`.
+        In the cases of :func:`load`.
     """
     (table,) = read_tables(path, Layout())
     return None if table.header is not None else Pool([table]).names
@@ -410,7 +419,7 @@ def select_columns(
     intersample: object,
     layout: object,
 ) -> ColumnSelection:
-    """Merge the column selection of the arguments and of a columns file; arguments take precedence."""
+    """Return the column selection from arguments and a columns file; arguments take precedence."""
     specification = _columns_file(columns)
     if time is not None and step is not None:
         raise DataError(f"{parameter('time')} and {parameter('step')}: both are given; pass one of them")
@@ -453,7 +462,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
 
 
 def _apply_header(selection: ColumnSelection, header: Header) -> None:
-    """Complete the column selection by the ftlm header of a file."""
+    """Complete a column selection in place by the ftlm header of a file."""
     if selection.time is None and selection.step is None:
         selection.time = CSV_TIME
     if not selection.inputs and not selection.outputs:

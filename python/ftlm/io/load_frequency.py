@@ -69,7 +69,7 @@ HEADERLESS_PARTS = ("frequency", "real", "imag")
 
 @dataclass(frozen=True)
 class _ResponseColumn:
-    """Column of a frequency response: part, unit in the file, and whether its name inverts the sign."""
+    """Column of a frequency response: which part it is, its unit, and whether its name inverts the sign."""
 
     column: Column
     part: str
@@ -92,12 +92,12 @@ def load_frequency(
     name: str | None = None,
     layout: Layout | Mapping[str, object] | None = None,
 ) -> FrequencyData:
-    """Load a frequency response or an impedance spectrum from a file of text or a sheet.
+    """Load a frequency response or an impedance spectrum from a text file or a sheet.
 
     Parameters
     ----------
     path
-        Any file that :func:`ftlm.load` reads.
+        File of any format that :func:`ftlm.load` reads.
     columns
         Column by part: ``frequency``; ``real`` and ``imag``, or ``magnitude`` and ``phase``; ``deviation``, the
         standard deviation of the real and of the imaginary part. By default columns are recognized by their names:
@@ -105,16 +105,18 @@ def load_frequency(
         sign inverted); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``; ``sigma``. Three columns without
         names are ``frequency``, ``real`` and ``imag``, with a warning.
     frequency_unit
-        ``"Hz"``, ``"kHz"``, ``"MHz"``, ``"mHz"`` or ``"rad/s"``. Default the unit in the column name, ``freq/Hz``,
-        ``f [Hz]``, ``f_Hz``; else, with a warning, rad/s for a column called omega and Hz for others.
+        ``"Hz"``, ``"kHz"``, ``"MHz"``, ``"mHz"`` or ``"rad/s"``. By default the unit in the column name, such as
+        ``freq/Hz``, ``f [Hz]`` or ``f_Hz``; without one, rad/s for a column called omega and Hz for others, with a
+        warning.
     magnitude_unit
-        ``"dB"`` or ``"abs"``; default the unit of the column, else abs with a warning.
+        ``"dB"`` or ``"abs"``; by default the unit of the column, or ``"abs"`` with a warning.
     phase_unit
-        ``"deg"`` or ``"rad"``; default the unit of the column, else deg with a warning.
+        ``"deg"`` or ``"rad"``; by default the unit of the column, or ``"deg"`` with a warning.
     negated
-        Whether the imaginary part (or the phase) is negated; default if its name begins with a minus.
+        Whether the file has the negative imaginary part (or phase); by default if its column name begins with a minus
+        sign.
     output, input
-        Names of the output and the input; default those of the only equation that is identified.
+        Names of the output and the input; "" (default) stands for the only ones of the structure.
     name
         Name of the data in reports; default the name of the file.
     layout
@@ -123,13 +125,13 @@ def load_frequency(
     Returns
     -------
     FrequencyData
-        Frequencies in rad/s, impedances in Ω; `warnings` lists the assumptions.
+        Data with frequencies in rad/s and impedances in Ω; `warnings` lists the assumptions.
 
     Raises
     ------
     DataError
-        A file that cannot be read, columns that are not recognized or have no numbers, unknown units, or frequencies
-        that are not above 0.
+        If the file cannot be read, columns are not recognized or have no numbers, a unit is unknown, or a frequency is
+        not positive.
     """
     (table,) = read_tables(path, Layout.of(layout))
     pool = Pool([table])
@@ -176,7 +178,7 @@ def is_response(pool: Pool) -> bool:
 
 
 def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
-    """Find the parts of a frequency response by column names; raise if a part is ambiguous."""
+    """Return the columns of a frequency response by part; raise DataError if a part is ambiguous."""
     parts: dict[str, _ResponseColumn] = {}
     for column in pool.columns:
         item = _recognize_column(column)
@@ -224,7 +226,7 @@ def _check_parts(parts: Mapping[str, _ResponseColumn], pool: Pool) -> None:
 
 
 def _split_name_and_unit(column: Column) -> tuple[str, str]:
-    """Split a column name such as ``freq/Hz``, ``f_Hz`` or ``f (Hz)`` into bare name and unit."""
+    """Split a column name such as ``freq/Hz``, ``f_Hz`` or ``f (Hz)`` into name and unit."""
     bare, unit = split_unit(column.name_with_unit)
     if unit:
         return bare, unit
@@ -241,7 +243,7 @@ def _split_name_and_unit(column: Column) -> tuple[str, str]:
 
 
 def _unit_kind(unit: str) -> str | None:
-    """Return the quantity of a unit: ``frequency``, ``phase`` or ``size``; None if unknown."""
+    """Return the quantity that a unit measures: ``frequency``, ``phase`` or ``size``; None if unknown."""
     if unit in FREQUENCY_UNITS or unit.casefold() in ("hz", "rad/s", "khz", "rad/sec", "1/s"):
         return "frequency"
     if _phase_unit(unit) is not None:
@@ -252,13 +254,13 @@ def _unit_kind(unit: str) -> str | None:
 
 
 def _phase_unit(unit: str) -> str | None:
-    """Return the unit of a phase; None for other units."""
+    """Return ``"deg"`` or ``"rad"`` for the unit of a phase; None for other units."""
     unit_name = parse_unit(unit.casefold())
     return "deg" if unit_name == "°" else unit_name if unit_name in _PHASE_UNITS else None
 
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
-    """Recognize a column by its name, with or without unit, such as ``Re(Z)`` or ``dB``; None if unknown."""
+    """Return what a column is by its name, such as ``Re(Z)`` or ``dB`` with or without unit; None if unknown."""
     whole, file_unit = column.name.strip(), column.file_unit
     own = whole if _unit_kind(whole) else file_unit if _unit_kind(file_unit) else ""
     for text, unit in ((whole, own), _split_name_and_unit(column)):
@@ -300,7 +302,7 @@ def _frequencies(item: _ResponseColumn, option: str | None, notes: list[str]) ->
 
 
 def _ohms(unit: str) -> float | None:
-    """Conversion factor of an impedance unit to ohm, such as mΩ; None for other units."""
+    """Return the conversion factor of an impedance unit, such as mΩ, to ohm; None for other units."""
     text = unit.replace(_OHM_SIGN, "Ω")
     for ending in ("ohm", "Ohm", "OHM", "ohms", "Ohms", "Ω", "ω"):
         if text.endswith(ending) and text[: -len(ending)] in _SI_PREFIX_FACTORS:
@@ -309,7 +311,7 @@ def _ohms(unit: str) -> float | None:
 
 
 def _magnitude_scale(item: _ResponseColumn) -> tuple[float, str]:
-    """Return the SI factor and unit of a magnitude."""
+    """Return the conversion factor to SI and the SI unit of a magnitude."""
     if not item.unit or item.unit.casefold() in _DIMENSIONLESS_UNITS:
         return 1.0, ""
     factor = _ohms(item.unit)
@@ -390,7 +392,7 @@ def _polar(
 def _resolve_unit(
     what: str, item: _ResponseColumn, option: str | None, choices: tuple[str, ...], unit: str | None, notes: list[str]
 ) -> str:
-    """Return the unit: given by the user, stated by the file, or assumed with a note."""
+    """Return the unit of a column: given by the user, stated by the file, or assumed, with a note added to `notes`."""
     if option is not None:
         if option not in choices:
             hint = nearest(option, choices)
@@ -419,7 +421,7 @@ def _truth(name: str, value: object) -> bool:
 
 
 def _compare(parts: Mapping[str, _ResponseColumn], response: Complex, notes: list[str]) -> None:
-    """Compare a redundant magnitude column with real and imaginary part; note a mismatch."""
+    """Add a note if a redundant magnitude column disagrees with real and imaginary part."""
     item = parts["magnitude"]
     if item.unit.casefold() == "db" or item.column.problem is not None:
         return

@@ -1,4 +1,4 @@
-"""Preview of unknown files: columns, units, roles, assumptions and the next command."""
+"""Preview of an unknown file: columns, units, roles, assumptions and a command for the next step."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class FileColumn:
     first, low, high : float or None
         First, lowest and highest value; None if the column has no numbers.
     words : str
-        Description of the content if the column has no numbers.
+        Description of the content if the column has no numbers; otherwise "".
     """
 
     name: str
@@ -77,7 +77,7 @@ class FileColumn:
 
 @dataclass(frozen=True)
 class OpenedFile:
-    """Preview of a file by :func:`ftlm.open_file`: columns, roles, layout and assumptions.
+    """Result of :func:`ftlm.open_file`: columns of a file, their roles, layout and assumptions.
 
     Parameters
     ----------
@@ -90,15 +90,15 @@ class OpenedFile:
     columns : tuple of FileColumn
         Summaries of the columns.
     layout : Layout
-        Complete layout.
+        Layout with all options.
     assumed : tuple of Assumption
         Assumptions, each with the option that sets it explicitly.
     options : dict
-        Arguments of :func:`ftlm.load` that give the same run without assumptions.
+        Arguments of :func:`ftlm.load` that give the same run explicitly, without assumptions.
     step : float or None
         Sampling interval [s]; None if `problem` is set.
     problem : str
-        Reason why the file is not a run yet, and remedy; "" for a run.
+        Reason why the file cannot be loaded as a run yet, with a remedy; "" if it can.
     notes : tuple of str
         Warnings of the run.
     """
@@ -115,17 +115,17 @@ class OpenedFile:
     notes: tuple[str, ...] = ()
 
     def load(self) -> Run:
-        """Load the file as a run, with all assumptions as explicit arguments."""
+        """Load the file as a run, with all assumptions as explicit arguments, and return the run."""
         return load(self.path, **self.options)
 
     def command(self, verb: str = "identify") -> str:
-        """Return the next shell command; "" if inputs or outputs are still unknown.
+        """Return a shell command for the next step; "" if inputs or outputs are unknown.
 
         Parameters
         ----------
         verb
-            Command of `ftlm`: ``identify``, ``inspect``, ``select``. The structure is chosen automatically; of several
-            outputs, that of the first.
+            Command of `ftlm`: ``identify``, ``inspect`` or ``select``. The structure in it is chosen automatically, for
+            the first output if there are several.
         """
         if self.problem:
             return ""
@@ -149,7 +149,7 @@ class OpenedFile:
         Raises
         ------
         DataError
-            Inputs or outputs are still unknown; the file exists and ``force`` is not set, or cannot be written.
+            If inputs or outputs are unknown, the file exists and ``force`` is False, or it cannot be written.
         """
         if self.problem:
             raise DataError(f"{self.path} is not a run yet, so there are no columns to write: {self.problem}")
@@ -188,7 +188,7 @@ class OpenedFile:
         return [] if self.problem else [self.command("inspect"), self.command("identify")]
 
     def _flags(self) -> list[str]:
-        """Return the options of the command line that correspond to `options`."""
+        """Return the command-line options that correspond to `options`."""
         options = self.options
         # Options that are detected reliably or equal the default are omitted.
         plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
@@ -226,15 +226,15 @@ def open_file(
     missing: str | None = None,
     layout: Layout | Mapping[str, object] | None = None,
 ) -> OpenedFile:
-    """Preview a file: columns, units, roles, assumptions and the next command.
+    """Return a preview of a file: columns, units, roles, assumptions and a command for the next step.
 
-    Time and roles are taken from column names, units from names or a line of units, unless given. The result lists
-    them with the corresponding arguments of :func:`ftlm.load`. Nothing is guessed from the values.
+    Unless given, time column and roles are inferred from column names, and units from names or a line of units. The
+    result lists them with the corresponding arguments of :func:`ftlm.load`. Nothing is inferred from the values.
 
     Parameters
     ----------
     path : path
-        One file of any kind that :func:`ftlm.load` reads.
+        File of any format that :func:`ftlm.load` reads.
     time, inputs, outputs, units, columns, intersample, step, window, resample, time_unit, missing, layout
         As in :func:`ftlm.load`.
 
@@ -246,7 +246,7 @@ def open_file(
     Raises
     ------
     DataError
-        The file is missing, damaged or ambiguous. Anything else that prevents a run is reported in `problem`.
+        If the file is missing, damaged or ambiguous. Other reasons why it cannot be loaded are in `problem`.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
@@ -255,7 +255,7 @@ def open_file(
 
 
 def preview_selection(path: PathLike, selection: ColumnSelection, options: LoadOptions) -> OpenedFile:
-    """Preview a file with a selection of its columns."""
+    """Return a preview of a file with a selection of its columns."""
     (table,) = read_tables(path, selection.layout)
     return _FilePreview(table, Pool([table]), selection, options).result(os.fspath(path))
 
@@ -291,7 +291,7 @@ class _FilePreview:
         return OpenedFile(path, table.kind, rows, columns, table.layout, assumed, options, step, problem, notes)
 
     def _named_signals(self) -> set[str]:
-        """Return the columns that the user names as inputs or outputs and that exist."""
+        """Return the existing columns that the user names as inputs or outputs."""
         names = set[str]()
         for spec in (*self.selection.inputs.values(), *self.selection.outputs.values()):
             with contextlib.suppress(DataError):
@@ -299,7 +299,7 @@ class _FilePreview:
         return names
 
     def _time(self, every: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
-        """Return the time column, assumptions about it, and the problem if there is none."""
+        """Return the time column, assumptions about it, and a problem if there is none."""
         selection, header = self.selection, self.table.header
         if header is not None and selection.time is None and selection.step is None:
             selection.time = CSV_TIME
@@ -332,7 +332,7 @@ class _FilePreview:
     def _roles(
         self, every: list[Column], clock: Column | None
     ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
-        """Return role and signal by column, assumptions, and the problem if roles are unknown."""
+        """Return (role, signal) by column, assumptions, and a problem if the roles are unknown."""
         selection, header = self.selection, self.table.header
         assumptions = tuple[Assumption, ...]()
         if header is not None and not selection.inputs and not selection.outputs:
@@ -361,7 +361,7 @@ class _FilePreview:
         return roles, assumptions, open_roles
 
     def _time_assumptions(self, clock: Column) -> tuple[Assumption, ...]:
-        """Return the assumptions about unit or date order of the time column."""
+        """Return the assumptions on unit and date order of the time column."""
         if self.table.header is not None:
             return ()
         if clock.timestamps is not None:
@@ -375,7 +375,7 @@ class _FilePreview:
         return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
-        """Return the arguments of `load` that give the same run."""
+        """Return the arguments of `load` that give the same run explicitly."""
         selection = self.selection
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
         if clock is not None and self.table.header is None:
@@ -402,7 +402,7 @@ class _FilePreview:
 
 
 def _first_bad_cell(column: Column) -> str:
-    """Return the first cell that is not a number, with its line."""
+    """Return the first cell of a column that is not a number, with its line, as text."""
     match = _IN_LINE.search(str(column.problem))
     return "" if match is None else match[0]
 
@@ -423,7 +423,7 @@ def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> F
 
 
 def _toml(value: object) -> str:
-    """Return a text or a number as TOML, whose basic strings are those of JSON."""
+    """Return a text or a number in TOML syntax."""
     return json.dumps(value, ensure_ascii=False)
 
 
@@ -438,7 +438,7 @@ def _figures(column: FileColumn) -> tuple[str, str, str]:
 
 
 def _truncate_text(text: str) -> str:
-    """Truncate a text and escape its control characters."""
+    """Return a text with a limited length and with escaped control characters."""
     return _escape_nonprintable(text[:60]) + ("…" if len(text) > 60 else "")
 
 

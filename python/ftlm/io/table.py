@@ -49,9 +49,10 @@ _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 
 @dataclass(frozen=True)
 class Column:
-    """Column of numbers, or the reason why it cannot be used as one.
+    """Column of a file: its numbers, or the reason why it is not a column of numbers.
 
-    `blank`: all problems are empty cells (NaN); `timestamps`: dates of the column; `file_unit`: its unit in the file.
+    `blank` is True if all invalid cells are empty (NaN), `timestamps` are the dates of the column, and `file_unit` is
+    its unit in the file.
     """
 
     variable: str
@@ -66,12 +67,12 @@ class Column:
 
     @property
     def name_with_unit(self) -> str:
-        """Name with the unit after a slash, as in ``I/A``, rewritten in brackets."""
+        """Name of the column, with a unit after a slash, as in ``I/A``, rewritten in brackets."""
         bare, unit = split_slash_unit(self.name)
         return f"{bare} [{unit}]" if unit and unit == self.file_unit else self.name
 
     def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
-        """Return the numbers, or raise the problem of the column; `blank` accepts empty cells."""
+        """Return the numbers of the column; raise its error if it has none. With `blank`, empty cells are allowed."""
         if blank and self.blank and self.values is not None:
             return self.values
         if self.problem is not None or self.values is None:
@@ -81,7 +82,7 @@ class Column:
 
 @dataclass(frozen=True)
 class FileTable:
-    """Columns of one file, with file format, layout and the assumptions made."""
+    """Columns of one file, with its format, layout and the assumptions made."""
 
     path: Path
     columns: list[Column]
@@ -94,18 +95,18 @@ class FileTable:
 
     @property
     def runs(self) -> tuple[str, ...]:
-        """Groups of an HDF5 file that have a time each, and so are runs of their own; empty if it holds one run."""
+        """Names of the groups of an HDF5 file that each have a time column; empty if the file contains one run."""
         places = [c.variable.rpartition("/") for c in self.columns if c.matrix is None]
         groups = tuple(dict.fromkeys(group for group, _, name in places if group and is_time_name(name)))
         return groups if len(groups) > 1 else ()
 
     def in_group(self, group: str) -> FileTable:
-        """Return the columns of a group under their names in it.
+        """Return the columns of an HDF5 group, with their names within the group.
 
         Raises
         ------
         DataError
-            No column is in the group.
+            If there is no column in the group.
         """
         path, prefix = self.path / group, f"{group}/"
         columns = [
@@ -123,7 +124,7 @@ class FileTable:
 
 
 class Pool:
-    """Columns of all files under unique names."""
+    """Columns of all files, with unique names."""
 
     def __init__(self, tables: list[FileTable]) -> None:
         self._tables = tables
@@ -155,7 +156,7 @@ class Pool:
         return tuple(name for name in self._columns if name)
 
     def describe(self) -> str:
-        """Describe the available columns for error messages."""
+        """Return text on the available columns, for error messages."""
         skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
         text = f"the columns are {join_names(self.names)}"
         if skipped:
@@ -163,7 +164,7 @@ class Pool:
         return text
 
     def find(self, spec: object, thing: str) -> Column:
-        """Return the column of a name or position given by the user."""
+        """Return the column with a given name or position; raise DataError if there is none."""
         if isinstance(spec, int) and not isinstance(spec, bool):
             return self._at(spec, thing)
         if not isinstance(spec, str):
@@ -198,16 +199,16 @@ class Pool:
         return columns[position]
 
     def time(self, spec: object, matrices: Iterable[str], signals: Collection[str]) -> tuple[Column, Assumption | None]:
-        """Return the time column, given by the user or detected by name and position, and the assumption made.
+        """Return the time column, given or detected by name and position, and an assumption if it was detected.
 
         Parameters
         ----------
         spec
-            Name or position of the column; None: detect it.
+            Name or position of the column; None to detect it.
         matrices
-            Matrices in use, whose first columns may be the time.
+            Names of the selected matrices, whose first columns may be the time.
         signals
-            Names of the columns used as signals, which are not the time unless `spec` names one.
+            Names of the columns used as signals, which can be the time only if `spec` names them.
         """
         if spec is not None:
             return self.find(spec, "time"), None

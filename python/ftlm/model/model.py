@@ -1,4 +1,4 @@
-"""Identified model: structure with fixed parameters, and details of its estimation."""
+"""Model: structure with fixed parameters, and details of its estimation."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ class Model:
 
     @check_arguments
     def poles(self, *, coupling: str = "simulated") -> Complex:
-        """Return the poles on the principal sheet [rad/s]; see :func:`ftlm.analysis.poles`."""
+        """Return the poles [rad/s] of a model of any orders; see :func:`ftlm.analysis.poles`."""
         from ftlm.analysis.poles import poles
 
         return poles(self, coupling=coupling)
@@ -271,7 +271,7 @@ class Model:
 
     @check_arguments
     def modes(self, *, coupling: str = "simulated") -> tuple[Mode, ...]:
-        """Frequency, damping and time constant of every pole, for any orders; see :func:`ftlm.analysis.modes`."""
+        """Return frequency, damping and time constant of every mode; see :func:`ftlm.analysis.modes`."""
         from ftlm.analysis.poles import modes
 
         return modes(self, coupling=coupling)
@@ -438,14 +438,17 @@ class Model:
         return inverse(self)
 
     def to_tf(self) -> Any:
-        """Convert a model of integer orders to python-control, exactly; see :func:`ftlm.analysis.to_tf`."""
+        """Return an exact python-control TransferFunction of a model of integer orders.
+
+        See :func:`ftlm.analysis.to_tf`.
+        """
         from ftlm.analysis.conversion import to_tf
 
         return to_tf(self)
 
     @check_arguments
     def to_ss(self, *, step: float | None = None) -> Any:
-        """Return a model of integer orders as an exact python-control StateSpace; see :func:`ftlm.analysis.to_ss`."""
+        """Return an exact python-control StateSpace of a model of integer orders; see :func:`ftlm.analysis.to_ss`."""
         from ftlm.analysis.conversion import to_ss
 
         return to_ss(self, step=step)

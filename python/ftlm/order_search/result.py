@@ -92,7 +92,7 @@ class OrderCertificate:
 
     @property
     def proved_tolerance(self) -> float:
-        """Tolerance achieved: by what fraction other orders may be better; 1 if nothing is proved."""
+        """Fraction by which other orders may at most be better, as proved; 1 if nothing is proved."""
         return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:
