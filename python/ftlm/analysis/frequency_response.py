@@ -111,7 +111,9 @@ class TransferFunctions:
     Parameters
     ----------
     outputs, inputs
-        Signal names. denominator Denominator of each output as (coefficient, power) pairs, highest power first. Coupled
+        Signal names.
+    denominator
+         Denominator of each output as (coefficient, power) pairs, highest power first. Coupled
         outputs have the same denominator.
     numerators
         Numerator by output and input as such pairs; empty if an input has no effect on an output.
@@ -364,7 +366,9 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
     Parameters
     ----------
     model
-        The model; its equations are coupled. time Uniform time points from 0 [s], shape (N,), N >= 3.
+        The model; its equations are coupled.
+    time
+        Uniform time points from 0 [s], shape (N,), N >= 3.
     tolerance
         Tolerance of the simulation; see :func:`ftlm.simulate`.
 

@@ -50,7 +50,9 @@ class Approximation:
     a, b, c, d
         State-space matrices. Rows and columns follow the sequence of `outputs` and `inputs`.
     outputs, inputs
-        Signal names. band Frequency band of the approximation [rad/s].
+        Signal names.
+    band
+         Frequency band of the approximation [rad/s].
     order
         Order of Oustaloup's filter; each fractional operator has 2 order + 1 poles.
     gain_error, phase_error

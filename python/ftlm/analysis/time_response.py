@@ -37,7 +37,9 @@ class Response:
     kind
         ``"step"`` or ``"impulse"``.
     outputs, inputs
-        Signal names. time Time points [s], shape (N,). For an impulse they are centers of sampling intervals, and the
+        Signal names.
+    time
+         Time points [s], shape (N,). For an impulse they are centers of sampling intervals, and the
         values are means over the intervals. The means are finite even if orders below 1 make the response infinite at
         0.
     values

@@ -1,1 +1,1 @@
-"""Physics of the flexible two-link arm."""
+"""Physics of the flexible two-link arm: structures, models and energies."""

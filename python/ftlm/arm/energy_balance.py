@@ -1,4 +1,4 @@
-"""Energies (7)-(9), generalized forces (10)-(11) and the power balance of a run of one joint of the arm."""
+"""Energies, generalized forces and power balance of one joint of the arm: equations (7)-(11) of the paper."""
 
 from __future__ import annotations
 
@@ -31,14 +31,16 @@ MIN_SAMPLES = 4
 
 @dataclass(frozen=True)
 class Power:
-    """Power of a force c D^nu theta on its own angle, and its stored and dissipated parts, each of shape (N,).
+    """Power of a force c D^nu theta along its own angle theta, split into stored and dissipated parts.
+
+    Every field has shape (N,).
 
     Parameters
     ----------
     supplied
-        c D^nu theta times the rate of theta [W].
+        Supplied power [W]: c D^nu theta times the rate of theta.
     stored
-        Recoverable energy [J]: all of it for a spring (nu = 0), 0 for a dashpot (nu = 1).
+        Recoverable energy [J]: all supplied energy for a spring (nu = 0), 0 for a dashpot (nu = 1).
     lost
         Dissipated power [W], never negative.
     """
@@ -55,17 +57,18 @@ class Energies:
     Parameters
     ----------
     time
-        [s].
+        Sample times [s].
     potential
-        Viscoelastic potential energy of the link as (7) has it: with K_s in N m/rad and beta_2 = 0 in J.
+        Viscoelastic potential energy of the link by equation (7); in J if beta_2 = 0 and K_s is in N m/rad.
     hub_kinetic, link_kinetic
-        Kinetic energies (8); with gamma_1 = mu_2 = 1 in J.
+        Kinetic energies by equation (8); in J if gamma_1 = mu_2 = 1.
     hub_force, link_force
-        Non-conservative generalized forces (10), (11) [N m].
+        Nonconservative generalized forces by equations (10) and (11) [N m].
     motor
         Power of the motor torque on the hub [W].
     inertia
-        Power of the inertial terms of (14) and (15) [W]. For integer orders it is the time derivative of (9).
+        Power of the inertial terms of equations (14) and (15) [W]. For integer orders it is the time derivative of the
+        kinetic energy (9).
     elastic, hub_friction, link_friction
         Powers of the elasticity K_s D^beta_2 of the link, of the friction B_1 D^gamma_1 of the hub, and of the friction
         B_2 D^mu_2 of the link.
@@ -85,12 +88,12 @@ class Energies:
 
     @property
     def kinetic(self) -> Floats:
-        """Total kinetic energy (9)."""
+        """Total kinetic energy, equation (9)."""
         return self.hub_kinetic + self.link_kinetic
 
     @property
     def lagrangian(self) -> Floats:
-        """Lagrangian L = Tr - V of (12) and (13)."""
+        """Lagrangian, equations (12) and (13): kinetic energy minus potential energy."""
         return self.kinetic - self.potential
 
 
@@ -98,25 +101,25 @@ class Energies:
 def energies(
     run: Run, *, stage: int = 1, parameters: LinkParameters | None = None, orders: Mapping[str, float] | None = None
 ) -> Energies:
-    """Return energies and generalized forces of one joint, and their power balance.
+    """Return energies and generalized forces of one joint of the arm during a run, with their power balance.
 
-    Energies and forces are those of equations (7)-(11) of the paper. Its equations (14) and (15), multiplied by the
-    rates of their angles, split the power of the motor into inertia, elasticity of the link, and both frictions. A
-    force c D^nu theta of fractional order stores a part of the power and dissipates the rest. Its diffusive
-    representation is a sum of springs with dampers in series, whose energies are added.
+    Energies and forces are those of equations (7)-(11) of the paper. Equations (14) and (15), multiplied by the rates
+    of their angles, split the power of the motor into inertia, elasticity of the link, and both frictions. A force c
+    D^nu theta of fractional order stores a part of the power and dissipates the rest. Its diffusive representation is a
+    sum of springs in series with dampers, whose energies are added.
 
     Parameters
     ----------
     run
-        I1, theta11, theta12 or I2, theta21, theta22, in A and rad, from rest, at least 4 rows. The angles are
-        differentiated, so use a simulated run without noise (:func:`ftlm.simulate`).
+        Run with I1, theta11, theta12 or I2, theta21, theta22 in A and rad, from rest, with at least 4 rows. The angles
+        are differentiated, so use a simulated run without noise (:func:`ftlm.simulate`).
     stage
-        1 or 2.
+        Joint, 1 or 2.
     parameters
         Parameters of the stage; by default the manufacturer's effective ones.
     orders
-        alpha, gamma of the hub and alpha, beta, mu of the link by name. Orders that are not given have the integer
-        values of the manufacturer's manual.
+        Orders by name: alpha, gamma of the hub and alpha, beta, mu of the link. Orders that are not given have the
+        integer values of the manufacturer's manual.
 
     Returns
     -------
@@ -126,9 +129,9 @@ def energies(
     Raises
     ------
     ModelError
-        A stage or an order that is not known, an order of a force outside [0, 1].
+        If the stage or the name of an order is unknown, or the order of a force is outside [0, 1].
     DataError
-        A run that lacks one of the three signals, has fewer than 4 rows, or an angle that does not start at rest at 0.
+        If the run lacks one of the three signals or has fewer than 4 rows, or an angle does not start at rest at 0.
     """
     law = order_law(stage)
     h, d = 2 * stage - 1, 2 * stage
@@ -181,7 +184,10 @@ def energies(
 
 
 def _check_rest(run: str, name: str, angle: Floats) -> None:
-    """Raise DataError unless an angle starts at rest; prior motion would act as an impulse at the first sample."""
+    """Raise DataError unless an angle starts at rest at 0.
+
+    Prior motion would act as an impulse at the first sample.
+    """
     moves = np.diff(angle)
     way_out = (
         "energies are those of a run from rest, with angles from 0: slice it where it rests, and take that angle off"
@@ -193,7 +199,9 @@ def _check_rest(run: str, name: str, angle: Floats) -> None:
 
 
 def power(angle: Floats, coefficient: float, order: float, step: float) -> Power:
-    """Return the power of c D^nu theta on theta from rest, split into stored energy and dissipated power.
+    """Return the power of a force c D^nu theta along theta, split into stored energy and dissipated power.
+
+    The motion starts from rest.
 
     D^nu theta = sin(pi nu)/pi times the integral over w from 0 of w^(nu-1) z_w, where z_w' = -w z_w + theta'. Every z_w
     is a spring in series with a dashpot: it stores z_w^2/2 and dissipates w z_w^2.
@@ -201,18 +209,18 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
     Parameters
     ----------
     angle
-        theta [rad], shape (N,), N at least 2; starts at rest at 0.
+        Angle theta [rad], shape (N,), N at least 2; it starts at rest at 0.
     coefficient
-        c [N m s^nu/rad].
+        Coefficient c [N m s^nu/rad].
     order
-        nu, from 0 (a spring) to 1 (a dashpot).
+        Order nu, from 0 (a spring) to 1 (a dashpot).
     step
-        [s].
+        Sampling interval [s].
 
     Returns
     -------
     Power
-        At the N samples.
+        Powers and energy at the N samples.
     """
     start = np.concatenate([[0.0], np.diff(angle)])
     rate = np.gradient(angle, step)

@@ -1,4 +1,4 @@
-"""Physical parameters of the two-link arm: named sets."""
+"""Structures and models of the flexible two-link arm, and its physical parameters."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class LinkParameters:
     stiffness
         Viscoelastic coefficient of the link, K_s [N m/rad] (for integer orders).
     hub_inertia, link_inertia
-        J_j1 and J_j2 [kg m^2].
+        Inertias J_j1 and J_j2 of joint j [kg m^2].
     hub_friction, link_friction
-        B_j1 and B_j2 [N m s/rad].
+        Viscous frictions B_j1 and B_j2 of joint j [N m s/rad].
     torque_constant
         Torque at the hub per ampere of motor current [N m/A].
     """
@@ -45,12 +45,15 @@ class LinkParameters:
 
     @property
     def inertia_ratio(self) -> float:
-        """Inertia ratio r = (J_1 + J_2) / J_2, by which the coefficients of the deflection exceed those of the hub."""
+        """Inertia ratio r = (J_1 + J_2) / J_2, by which coefficients of the deflection exceed those of the hub."""
         return (self.hub_inertia + self.link_inertia) / self.link_inertia
 
     @check_arguments
     def coefficients(self, stage: int) -> dict[str, float]:
-        """Coefficients a, b, d, g of both equations of a stage, by name (paper, after (21))."""
+        """Return the coefficients a, b, d, g of both equations of a stage in the published form, by name.
+
+        The paper defines them after equation (21).
+        """
         hub, deflection = 2 * stage - 1, 2 * stage
         a, b = self.stiffness / self.hub_inertia, -self.hub_friction / self.hub_inertia
         d, g = self.link_friction / self.hub_inertia, self.torque_constant / self.hub_inertia
@@ -68,7 +71,10 @@ class LinkParameters:
 
     @check_arguments
     def lagrange_coefficients(self, stage: int) -> dict[str, float]:
-        """Coefficients a, b, d, g of the hub's equation and a, b, d of the deflection's as (15) has them."""
+        """Return the coefficients of both equations of a stage in the Lagrange form, by name.
+
+        They are a, b, d, g of the hub's equation and a, b, d of the deflection's equation (15).
+        """
         hub, deflection = 2 * stage - 1, 2 * stage
         own = {n: v for n, v in self.coefficients(stage).items() if n.endswith(str(hub))}
         stiffness, friction = self.stiffness / self.link_inertia, self.link_friction / self.link_inertia
@@ -117,7 +123,7 @@ LAW_NAMES = ("orders", "coefficients", "velocities")
 
 
 def _hints(form: Form) -> Hints:
-    """Hints for estimation: ranges and names of the orders, and lower bounds of the inertia ratios."""
+    """Return hints for initial guesses: ranges and names of the orders, and lower bounds of the inertia ratios."""
     return Hints(
         HIGHEST_ORDER_RANGE,
         {f"{order}{n}": values for order, values in TYPICAL_ORDERS.items() for n in range(1, 5)},
@@ -129,7 +135,7 @@ def _hints(form: Form) -> Hints:
 
 
 def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, InputOrder]:
-    """Return the requested form; an input order implies the published form."""
+    """Return the form and the input order; an input order selects the published form by default."""
     if form is None:
         form = "lagrange" if input_order is None else "published"
     if form not in ("lagrange", "published"):
@@ -149,34 +155,34 @@ def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Fo
 def order_law(
     stage: int, input_order: InputOrder | None = None, *, form: Form | None = None, velocities: bool = False
 ) -> dict[str, Order]:
-    """Return every order of the two equations of a joint as a function of the five free orders.
+    """Return the order law of one joint: every order of its two equations as a function of five free orders.
 
     Parameters
     ----------
     stage
         1 or 2.
     input_order
-        ``"published"`` or ``"derived"``, of the published form.
+        ``"published"`` or ``"derived"``, only for the published form.
     form
-        ``"lagrange"`` or ``"published"``, see :func:`flexible_link`; default lagrange, or published where an input
-        order is named.
+        ``"lagrange"`` or ``"published"``; see :func:`flexible_link`. The default is ``"lagrange"``, or ``"published"``
+        if an input order is given.
     velocities
-        Whether gamma_1 = mu_2, so that D^gamma_1 theta_11 and D^mu_2 theta_12, which (8) adds, are velocities of one
-        kind; the hub angle then stands in the deflection's equation (15) with alpha_2 itself.
+        Whether gamma_1 = mu_2, so that D^gamma_1 theta_11 and D^mu_2 theta_12, which equation (8) adds, have the same
+        order. The order of the hub angle in the deflection's equation (15) is then alpha_2.
 
     Returns
     -------
     dict
-        alpha, beta, gamma, mu of the hub (index 2*stage - 1) and of the deflection (2*stage). The hub angle stands in
-        the deflection's equation with gamma_2 = alpha_2 - mu_2 + gamma_1 (15), above alpha_2 where gamma_1 exceeds
-        mu_2; in the published form with 2 gamma_1 - alpha_1 + alpha_2 - mu_2. That form also has ``input``, the order
-        of the current in the deflection's equation: 0 as published in (23), alpha_2 - mu_2 + gamma_1 - alpha_1 as
-        derived (the published elimination drops it).
+        Orders by name: alpha, beta, gamma, mu of the hub (index 2*stage - 1) and of the deflection (index 2*stage). The
+        order of the hub angle in the deflection's equation is gamma_2 = alpha_2 - mu_2 + gamma_1 by (15), which exceeds
+        alpha_2 if gamma_1 exceeds mu_2. In the published form it is 2 gamma_1 - alpha_1 + alpha_2 - mu_2. That form
+        also has ``input``, the order of the current in the deflection's equation: 0 as published in (23), or alpha_2 -
+        mu_2 + gamma_1 - alpha_1 as derived.
 
     Raises
     ------
     ModelError
-        A stage that is neither 1 nor 2, a form or an input order that is not known or not of that form.
+        If the stage is neither 1 nor 2, or a form or input order is unknown or does not belong to the form.
     """
     if stage not in (1, 2):
         raise ModelError(f"{setting('stage')} {stage!r} is not known; use 1, 2 or 'both'")
@@ -221,93 +227,87 @@ def flexible_link(
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
     offset: Literal["none", "level", "constant", "ramp"] = "none",
 ) -> Structure:
-    """Return the structure of a flexible link: two equations for each joint, of its hub and of its deflection.
+    """Return the structure of a flexible joint: an equation of its hub angle and one of its link's deflection.
 
     Parameters
     ----------
     stage
-        1 (theta11, theta12, I1), 2 (theta21, theta22, I2) or both.
+        Joint: 1 (theta11, theta12, I1), 2 (theta21, theta22, I2) or ``"both"``.
     form
-        ``"lagrange"``, the default: the Euler-Lagrange equations (14)-(15) with (16), nothing eliminated. The
-        deflection hangs on the hub's motion alone, D^alpha_2 theta_12 = a_2 D^beta_2 theta_12 - D^(alpha_2 - mu_2 +
-        gamma_1) theta_11 + d_2 D^mu_2 theta_12 with a_2 = -K_s/J_2 and d_2 = -B_2/J_2: no current, no hub friction and
-        no motor constant in it, and a signal above its own highest order where gamma_1 exceeds mu_2. The hub's equation
-        is (17).
-        ``"published"``: (22)-(25) as printed. There the hub's acceleration is eliminated from the deflection's
-        equation, and with it a derivative of the current is dropped: with fractional orders that link bends the wrong
-        way (its deflection goes with the current where a real one goes against it). It is the paper's, for its tables.
+        ``"lagrange"`` (default): the Euler-Lagrange equations (14)-(15) with (16), without elimination. The equation of
+        the deflection is D^alpha_2 theta_12 = a_2 D^beta_2 theta_12 - D^(alpha_2 - mu_2 + gamma_1) theta_11 + d_2
+        D^mu_2 theta_12 with a_2 = -K_s/J_2 and d_2 = -B_2/J_2. Its only input is the hub angle, whose order exceeds
+        alpha_2 if gamma_1 exceeds mu_2. The equation of the hub is (17). ``"published"``: equations (22)-(25) as
+        printed, for comparison with the paper. They eliminate the hub's acceleration from the deflection's equation and
+        drop a derivative of the current. With fractional orders, the simulated deflection then has the wrong sign.
     input_order
-        Of the published form: order of the current in the deflection's equation, see :func:`order_law`. ``"derived"``
-        is the Lagrange form with the hub's acceleration eliminated and nothing dropped: the same simulations, but what
-        bends the link is then the small difference of large terms. Naming it chooses the published form.
+        Order of the current in the deflection's equation of the published form; see :func:`order_law`. ``"derived"``
+        eliminates the hub's acceleration without dropping a term, which gives the same simulations as the Lagrange
+        form, but the deflection is then driven by a small difference of large terms. Giving this argument selects the
+        published form.
     coupling
-        ``"measured"``: each equation is driven by the other angle as it was measured, the default of the Lagrange form.
-        ``"simulated"``: both follow from the currents alone, the default of the published one; noise of the hub's angle
-        then drives nothing.
+        ``"measured"`` (default of the Lagrange form): the other measured angle is an input of each equation.
+        ``"simulated"`` (default of the published form): both angles are simulated from the currents, so noise on the
+        measured hub angle has no effect.
     cross_stage
-        ``"torques"`` (or True) adds the other stage's angles and current to every equation (order 0).
-        ``"inertial"``, of the Lagrange form, adds what the energies of the planar arm give, linearised: hub 2 sits on
-        the tip of link 1, so the accelerations of stage 2 push back on link 1 (p_2 D^2 theta_21 + q_2 D^2 theta_22) and
-        those of stage 1 carry hub 2 and link 2 with them (p_3, p_4 of theta_11, q_3, q_4 of theta_12); hub 1 feels
-        stage 2 through its link alone. With ``stage="both"`` the other stage is modelled too, and velocities add up as
-        in (8): theta_21 stands in the equation of theta_12 with alpha_2 - mu_2 + gamma_3, and so on. Of a stage alone
-        these terms are of the order of their equation, alpha_2, alpha_3 or alpha_4.
+        ``"torques"`` (or True) adds angles and current of the other joint to every equation, with order 0.
+        ``"inertial"``, for the Lagrange form, adds the linearized inertial coupling of the planar arm, in which hub 2
+        is mounted on the tip of link 1. Accelerations of joint 2 act on link 1 (p_2 D^2 theta_21 + q_2 D^2 theta_22),
+        and those of joint 1 act on hub 2 and link 2 (p_3, p_4 of theta_11 and q_3, q_4 of theta_12). Joint 2 acts on
+        hub 1 only through link 1. With ``stage="both"`` the other joint is modeled too, and orders follow from the sum
+        of velocities in (8): theta_21 has the order alpha_2 - mu_2 + gamma_3 in the equation of theta_12, and so on.
+        For a single joint, these terms have the order of their equation, alpha_2, alpha_3 or alpha_4.
     friction
         ``"coulomb"`` (or True) adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the
-        Lagrange form, it is - fc_j * sign(D theta_j1) of the velocity that the model gives, set-valued at rest
-        (:class:`Friction`), by output error: hubs stick and slip while their links ring, with ``stage="both"`` and
-        inertial coupling each of them while the other's motion shakes it. With measured coupling it is a linear term
-        c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
-        ``"stribeck"``, with simulated coupling, adds what hubs have more near rest, fs_j below the speed vs_j
-        (:class:`Stribeck`).
+        Lagrange form, it is - fc_j * sign(D theta_j1) of the simulated velocity, set-valued at rest
+        (:class:`Friction`), and is estimated by output error. With measured coupling, in the published form, it is a
+        linear term c * coulomb_theta_j1 in the sign of the measured velocity, in both equations. ``"stribeck"``, with
+        simulated coupling, adds the larger friction fs_j below the speed vs_j (:class:`Stribeck`).
     cross_sensitivity
-        Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
-        deflection follow the hub's angle. e_2 theta_11 in that of theta_12, and with ``cross_stage="inertial"``
-        f_2 theta_21.
+        Whether hub angles are added to the deflection's equation with order 0, because strain gauges and cables make a
+        measured deflection depend on the hub angle. The terms are e_2 theta_11 in the equation of theta_12 and, with
+        ``cross_stage="inertial"``, f_2 theta_21.
     cross_damping
-        Adds the rate of the other link's deflection, w_2 D theta_22 in the equation of theta_12, with
-        ``cross_stage="inertial"`` and measured coupling. No dissipation of the arm: it damps what a link does against
-        the other one, as the gain of an observer would, so that a simulation is not thrown off by what little is
-        wrong with what drives it (docs/arm.md has what that is worth).
+        Whether the rate of the other link's deflection is added, w_2 D theta_22 in the equation of theta_12, with
+        ``cross_stage="inertial"`` and measured coupling. The term is not a physical dissipation. Like the gain of an
+        observer, it makes the simulation less sensitive to errors of the measured inputs; docs/arm.md shows its effect.
     hub
-        False leaves the hub's equation out: a deflection driven by the measured hub, whose friction nobody knows. No
-        ratio of inertias is left to tie coefficients, and no other equation to tell the link's spring from its damper:
-        beta is sought up to 1/2, mu from there.
+        Whether the hub's equation is included. Without it, the deflection has the measured hub angle as input, and the
+        friction of the hub need not be known. Without the hub's equation there is no coefficient law, and the data
+        hardly distinguish the link's spring from its damper. beta is therefore searched up to 1/2, and mu from 1/2.
     laws
-        ``"orders"``: orders obey :func:`order_law`, five are free. Without it each equation has its own four orders.
-        With the Lagrange form and with ``"derived"`` alpha_2 (alpha_4) is fixed at 2: it is seen only through the
-        link's viscous friction.
-        ``"coefficients"``: the coefficient law is stated in the structure, with the ratio r = (J_1 + J_2)/J_2 of the
-        published form or j = J_1/J_2 of the Lagrange form, where the coefficient -1 of the hub's motion is then known;
-        without it that is free, b_2. The equation-error estimators estimate the coefficients freely and report how far
-        they are from the law. With inertial coupling it says besides that the tip of link 1 carries stage 2 by the sum
-        of its angles: q_3 = p_3 and q_4 = p_4.
-        ``"velocities"``: gamma_1 = mu_2 (gamma_3 = mu_4), see :func:`order_law`; of the Lagrange form under
-        ``"orders"``.
+        ``"orders"``: orders obey :func:`order_law`, with five free orders. Without it, each equation has four free
+        orders. In the Lagrange form and with ``"derived"``, alpha_2 (alpha_4) is fixed at 2, because only the viscous
+        friction of the link depends on it. ``"coefficients"``: the structure has the coefficient law, with the ratio r
+        = (J_1 + J_2)/J_2 in the published form, or j = J_1/J_2 in the Lagrange form. The coefficient of the hub's
+        motion in the Lagrange form is then -1, otherwise the free coefficient b_2. With inertial coupling, the law also
+        has q_3 = p_3 and q_4 = p_4. Equation-error methods estimate all coefficients freely, and report their deviation
+        from the law. ``"velocities"``: gamma_1 = mu_2 (gamma_3 = mu_4), for the Lagrange form together with
+        ``"orders"``; see :func:`order_law`.
     parameters
-        Named set that results are set beside.
+        Named set of nominal values, which are printed next to the estimates.
     sensor_filter
-        ``"stock"`` for the 2 Hz low-pass that the arm's stock real-time model puts on both deflections, whether they
-        are modelled or drive a model, or a filter.
+        Filter that the deflections passed when they were measured. ``"stock"`` is the 2 Hz low-pass of the arm's
+        original real-time model on both deflections.
     offset
-        ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one per run, such as the
-        current that holds the arm still; see :func:`ftlm.equation`.
+        ``"constant"`` or ``"ramp"``: an unknown constant (and a linear drift) in each equation and run, such as a
+        current at which the arm rests; see :func:`ftlm.equation`.
 
     Returns
     -------
     Structure
-        Orders and coefficients free.
+        Structure with free orders and coefficients.
 
     Raises
     ------
     ModelError
-        An argument that is not known, or not used by that form.
+        If an argument is unknown, or the form does not use it.
 
     Notes
     -----
-    Time is in seconds. Where gamma_1 may differ from mu_2 the law of coefficients ties numbers whose dimensions differ
-    by time to the power of gamma_1 - mu_2, the known -1 among them: it is another law for a run told in milliseconds.
-    Under ``"velocities"`` the unit does not matter.
+    Time must be in seconds. If gamma_1 may differ from mu_2, the coefficient law relates coefficients whose dimensions
+    differ by time to the power of gamma_1 - mu_2, including the fixed -1, so it depends on the unit of time. With
+    ``"velocities"`` it does not.
     """
     if stage not in (1, 2, "both"):
         raise ModelError(f"{setting('stage')} {stage!r} is not known; use 1, 2 or 'both'")
@@ -456,13 +456,13 @@ def _joint_equations(
 
 
 def _append_terms(item: Equation, terms: Sequence[Term]) -> Equation:
-    """Return an equation with further terms inserted before its friction terms."""
+    """Return an equation with further terms, inserted before its friction terms."""
     rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
     return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
 
 
 def _add_cross_torques(pair: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
-    """Add the torques of the other joint: terms in its angles and its current, of order 0."""
+    """Return the equations of a joint with terms of order 0 in the angles and the current of the other joint."""
     other, first = 3 - stage, 2 * stage - 1
     signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
     hub, deflection = (
@@ -475,11 +475,14 @@ def _add_cross_torques(pair: tuple[Equation, Equation], stage: int) -> tuple[Equ
 def _add_cross_inertia(
     pair: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool
 ) -> tuple[Equation, Equation]:
-    """Add the inertial terms of the other joint, from the energies of the planar arm with the absolute rates of (8).
+    """Return the equations of a joint with the inertial terms of the other joint.
+
+    They follow from the kinetic energy of the planar arm with the absolute rates of (8).
 
     T = (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12,
-    w_3 = w_2 + D theta_21, w_4 = w_3 + D theta_22, J_12 with all masses beyond link 1 at its tip and H the product of
-    that arm with the moment of mass of link 2. Of hub 1 less link 1 nothing of stage 2 is left.
+    w_3 = w_2 + D theta_21, w_4 = w_3 + D theta_22. J_12 includes all masses beyond link 1, at its tip, and H is the
+    length of link 1 times the first moment of mass of link 2. The difference of the equations of hub 1 and link 1 has
+    no term of joint 2.
     """
     h, d, other = 2 * stage - 1, 2 * stage, 3 - stage
     oh, od = 2 * other - 1, 2 * other
@@ -497,7 +500,7 @@ def _add_cross_inertia(
 
 
 def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equation:
-    """Add hub angles to the equation of the measured deflection."""
+    """Return the equation of a measured deflection with terms of order 0 in the hub angles."""
     signals = (f"theta{stage}1", f"theta{3 - stage}1")[: 1 + other]
     return _append_terms(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
 
@@ -521,25 +524,25 @@ def link_model(
     Parameters
     ----------
     stage
-        1, 2 or both.
+        Joint: 1, 2 or ``"both"``.
     parameters
-        Named set, or physical parameters by stage.
+        Named set, or physical parameters by joint.
     orders
-        Free orders of the law, by name; default the manual's integer ones.
+        Values of the free orders of the order law by name; by default the integer ones of the manual.
     coefficients
-        Coefficients to use instead of the parameters', by name.
+        Coefficients by name, which replace those that follow from the parameters.
     form, input_order, coupling
-        See :func:`flexible_link`; both angles follow from the current by default.
+        See :func:`flexible_link`. By default, both angles are simulated from the current.
 
     Returns
     -------
     Model
-        Ready to simulate.
+        Model without free parameters.
 
     Raises
     ------
     ModelError
-        A name that is not known, orders out of range.
+        If a name is unknown, or an order is out of range.
     """
     parameters_name = parameters if isinstance(parameters, str) else "effective"
     form, order = _resolve_form(form, input_order)

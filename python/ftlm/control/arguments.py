@@ -1,4 +1,4 @@
-"""Argument checks that designs share: outputs and their sums, rates, positive numbers."""
+"""Checks of arguments that several control designs share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POSITIVE_RANGE = (1e-100, 1e100)
 
 
 def checked_rate(rate: object) -> float:
-    """Return a sampling rate [Hz]; raise outside the range."""
+    """Return a sampling rate [Hz]; raise ModelError if it is out of range."""
     value = real_number("rate", rate)
     if not RATE_RANGE_HZ[0] <= value <= RATE_RANGE_HZ[1]:
         raise ModelError(
@@ -34,7 +34,7 @@ def same_rate(first: float, second: float) -> bool:
 
 
 def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the given outputs, or all without a list."""
+    """Return the chosen outputs, or all outputs if the choice is None; raise ModelError for an unknown one."""
     if choice is None:
         return outputs
     names = [] if isinstance(choice, str) or not isinstance(choice, Sequence) else [*choice[: len(outputs) + 1]]
@@ -53,7 +53,7 @@ def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, 
 
 
 def positive(name: str, value: object) -> float:
-    """Return a finite number above 0."""
+    """Return a number; raise ModelError if it is not finite and positive."""
     number = real_number(name, value)
     if not (math.isfinite(number) and number > 0):
         raise ModelError(f"{name} = {short_repr(value)} is not a finite number above 0")
@@ -66,7 +66,7 @@ def positive(name: str, value: object) -> float:
 
 
 def check_limit(limit: object) -> float:
-    """Return the largest command, which may be infinite."""
+    """Return the limit of a command, which may be infinite; raise ModelError if it is not positive."""
     most = real_number("limit", limit)
     if not most > 0:
         raise ModelError(f"{setting('limit')} {short_repr(limit)} is not a number above 0")
@@ -74,12 +74,12 @@ def check_limit(limit: object) -> float:
 
 
 def check_samples(samples: object, seed: object) -> tuple[int, int]:
-    """Return the number of parameter samples and their seed."""
+    """Return the number of parameter samples and their seed; raise ModelError if one is invalid."""
     return check_integer("samples", samples, 0, 10_000), check_seed(seed)
 
 
 def sum_row(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
-    """Return the coefficients of a sum of outputs, such as "theta11 + theta12"."""
+    """Return the coefficient of each output in a sum such as "theta11 + theta12"; raise ModelError if it is invalid."""
     row = np.zeros(len(outputs))
     for part in text.split("+") if isinstance(text, str) else [""]:
         name = part.strip()

@@ -1,4 +1,4 @@
-"""Controller file with all numbers of the discrete-time algorithm; controllers of both joints for the rig."""
+"""Files of discrete-time controllers, and a pair of controllers for both joints of the rig."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Matrix: TypeAlias = list[list[float]]
 
 
 class Lag(msgspec.Struct, forbid_unknown_fields=True):
-    """First-order lag of the discrete-time controller."""
+    """First-order lag of a discrete-time controller, in a file."""
 
     of: Literal["integral", "derivative"]
     keep: float
@@ -43,7 +43,7 @@ class Lag(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
-    """Fractional PID at a sampling rate: gains, orders, and discrete-time coefficients."""
+    """File form of a fractional PID controller: gains, orders and discrete-time coefficients."""
 
     kp: float
     ki: float
@@ -58,14 +58,14 @@ class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
     lags: list[Lag]
 
     def controller(self) -> DiscretePid:
-        """Return the controller."""
+        """Return the controller from its file form."""
         pid = FractionalPid(self.kp, self.ki, self.kd, self.lam, self.mu)
         limit = math.inf if self.limit is None else self.limit
         return DiscretePid(pid, self.rate, limit=limit, band=self.band, order=self.order)
 
 
 class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
-    """Observer and state feedback at a sampling rate."""
+    """File form of an LQG controller: observer and state feedback in discrete time."""
 
     rate: float
     limit: float | None
@@ -88,7 +88,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
     deviations: list[float]
 
     def controller(self) -> Lqg:
-        """Return the controller."""
+        """Return the controller from its file form."""
         a, b, c, correction, feedback = (
             np.array(m, dtype=np.float64) for m in (self.a, self.b, self.c, self.correction, self.feedback)
         )
@@ -136,7 +136,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
 
 
 class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a controller file."""
+    """Content of a controller file, which has one of the two kinds of controller."""
 
     format: Literal["ftlm-controller"]
     schema: int
@@ -154,7 +154,7 @@ CONTROLLER_FORMAT = JsonFormat("controller", "a file that ftlm control wrote", C
 def save_controller(
     controller: DiscretePid | Lqg, path: str | os.PathLike[str], *, model: str = "", force: bool = False
 ) -> None:
-    """Write a controller as JSON: design data and the coefficients of its discrete-time algorithm.
+    """Write a controller to a JSON file, with its design data and discrete-time coefficients.
 
     Parameters
     ----------
@@ -163,16 +163,16 @@ def save_controller(
     path
         File to write.
     model
-        Description of the model it was designed on.
+        Description of the model for which the controller was designed.
     force
         Overwrite an existing file.
 
     Raises
     ------
     ModelError
-        Another type of controller.
+        If the controller has another type.
     DataError
-        The file exists and ``force`` is not set, or it cannot be written.
+        If the file exists and ``force`` is False, or it cannot be written.
     """
     if isinstance(controller, DiscretePid):
         record: PidFile | LqgFile = _pid(controller)
@@ -194,7 +194,7 @@ def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
     Raises
     ------
     DataError
-        A file that cannot be read, or is not a controller of this version.
+        If the file cannot be read, or is not a controller file of this version.
     """
     read = CONTROLLER_FORMAT.read(path)
     CONTROLLER_FORMAT.check_schema(path, read, CONTROLLER_SCHEMA)
@@ -252,19 +252,21 @@ MOTOR_INPUTS = ("I1", "I2")
 
 
 class JointControllers:
-    """Controllers of both joints for :func:`ftlm.rig.control`: angles and references to motor currents.
+    """Pair of controllers for both joints of the rig, which computes motor currents from angles and references.
+
+    :func:`ftlm.rig.control` calls it once per sample.
 
     Parameters
     ----------
     first, second
-        Controllers of joint 1 and joint 2: a :class:`DiscretePid` gets the reference minus the hub angle [rad], an
-        :class:`Lqg` gets its measured angles; None means zero current.
+        Controllers of joint 1 and joint 2. The input of a :class:`DiscretePid` is the reference minus the hub angle
+        [rad], and the inputs of an :class:`Lqg` are its measured angles. None means zero current.
 
     Raises
     ------
     ModelError
-        Another type of controller, one that needs a signal that the arm does not measure or drives the other motor, or
-        two sampling rates.
+        If a controller has another type, requires a signal that the arm does not measure, or commands the other motor,
+        or if the sampling rates differ.
     """
 
     @check_arguments
@@ -297,18 +299,18 @@ class JointControllers:
         self.rate = rates[0] if rates else None
 
     def reset(self) -> None:
-        """Reset both controllers."""
+        """Reset the states of both controllers."""
         for loop in self.loops:
             if loop is not None:
                 loop.reset()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return both controllers for JSON."""
+        """Return both controllers as a dictionary for JSON."""
         return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
 
     @check_arguments
     def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
-        """Return both currents [A]."""
+        """Return the currents (joint 1, joint 2) [A] for measured angles and references [rad] at a time [s]."""
         angles, reference = as_floats("angles", angles), as_floats("reference", reference)
         if angles.shape != (4,) or reference.shape != (2,):
             raise DataError(

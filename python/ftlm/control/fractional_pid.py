@@ -1,4 +1,4 @@
-"""Fractional PID controllers and their discrete-time realization in bounded memory."""
+"""Fractional PID controllers: design, and discrete-time approximation with a fixed number of states."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class FractionalPid:
     Raises
     ------
     ModelError
-        A gain that is not finite, or an order out of range.
+        If a gain is not finite, or an order is out of range.
     """
 
     kp: float
@@ -79,13 +79,13 @@ class FractionalPid:
 
     @check_arguments
     def response(self, w: Floats | Complex) -> Complex:
-        """Exact response at frequencies above 0 [rad/s]."""
+        """Return the exact complex frequency response at positive frequencies [rad/s]."""
         s = 1j * as_complex("w", w)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return gains and orders for JSON."""
+        """Return gains and orders as a dictionary for JSON."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -94,7 +94,7 @@ class FractionalPid:
 
 @dataclass(frozen=True)
 class _Bank:
-    """Bank of first-order lags 1/(s + p) with a gain, exact for signals that are linear between samples."""
+    """Sum of first-order lags 1/(s + p) with gains, discretized exactly for signals that are linear between samples."""
 
     direct: float
     weights: Floats
@@ -103,17 +103,17 @@ class _Bank:
     before: Floats
 
     def response(self, z: Complex) -> Complex:
-        """Frequency response at points of the unit circle."""
+        """Return the frequency response at points z of the unit circle."""
         inverse = 1.0 / z[:, None]
         lags = (self.now + self.before * inverse) / (1.0 - self.keeps * inverse)
         return np.asarray(self.direct + lags @ self.weights)
 
 
 class DiscretePid:
-    """Fractional PID at a sampling rate: Oustaloup's approximation as a bank of first-order lags.
+    """Discrete-time fractional PID controller: Oustaloup's approximation as a sum of first-order lags.
 
-    The controller starts without a derivative kick: the first error is taken as constant in the past. While the output
-    is saturated, the integral does not change in the direction of the saturation (anti-windup).
+    The first error is assumed to have been constant in the past, so the controller starts without a derivative kick.
+    While the output is saturated, the integral does not change in the direction of the saturation (anti-windup).
 
     Parameters
     ----------
@@ -122,16 +122,16 @@ class DiscretePid:
     rate
         Sampling rate [Hz].
     limit
-        Largest output; it saturates there.
+        Magnitude at which the output saturates.
     band
-        Frequency band of the approximation [rad/s]; default from a thousandth to an eighth of the Nyquist frequency.
+        Frequency band of the approximation [rad/s]; by default from a thousandth to an eighth of the Nyquist frequency.
     order
-        Order of Oustaloup's filter: 2 order + 1 poles for the integral, and as many for the derivative.
+        Order of Oustaloup's filter, which has 2 order + 1 poles for the integral and as many for the derivative.
 
     Raises
     ------
     ModelError
-        Orders above 1, gains that overflow, or an invalid rate, limit, band or order.
+        If an order of the PID is above 1, gains overflow, or rate, limit, band or order is invalid.
     """
 
     @check_arguments
@@ -176,18 +176,19 @@ class DiscretePid:
 
     @property
     def memory(self) -> int:
-        """Number of states between two samples."""
+        """Number of states of the controller."""
         return len(self._integral.weights) + len(self._derivative.weights) + 1
 
     @property
     def direct(self) -> float:
-        """Direct feedthrough of integral and derivative, without kp."""
+        """Direct feedthrough of the integral and derivative parts, without kp."""
         return self._integral.direct + self._derivative.direct
 
     def lags(self) -> list[tuple[Literal["integral", "derivative"], tuple[float, float, float, float]]]:
         """Return the coefficients (keep, now, before, weight) of each first-order lag, as in the controller file.
 
-        State of sample k: x_k = keep x_{k-1} + now e_k + before e_{k-1}. Output: the sum of weight x_k over the lags.
+        The state of a lag at sample k is x_k = keep x_{k-1} + now e_k + before e_{k-1}, where e is the error. The
+        output is the sum of weight x_k over all lags.
         """
         banks: tuple[tuple[Literal["integral", "derivative"], _Bank], ...] = (
             ("integral", self._integral),
@@ -201,7 +202,7 @@ class DiscretePid:
 
     @check_arguments
     def response(self, w: Floats | Complex) -> Complex:
-        """Frequency response [rad/s] of the discrete-time controller without saturation."""
+        """Return the frequency response of the discrete-time controller at w [rad/s], without saturation."""
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
 
@@ -213,7 +214,7 @@ class DiscretePid:
 
     @check_arguments
     def __call__(self, error: float) -> float:
-        """Return the output for the error of a sample."""
+        """Return the controller output for the control error of the next sample."""
         error = float(error)
         if self._lags is None:
             # The derivative starts in the steady state of a constant error, where it is zero.
@@ -242,7 +243,7 @@ class DiscretePid:
         return gain, float(np.degrees(np.max(np.abs(np.angle(quotient)))))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return design data and approximation errors for JSON."""
+        """Return design data and approximation errors as a dictionary for JSON."""
         return {
             "pid": self.pid.to_dict(),
             "rate": self.rate,
@@ -260,7 +261,7 @@ class DiscretePid:
 
 
 def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
-    """Poles, residues and direct gain of s^power, 0 < power <= 1."""
+    """Return poles, residues and direct gain of Oustaloup's filter for s^power, 0 < power <= 1."""
     if power < 1.0:
         poles, residues, _ = oustaloup(power, reach, order)
         # The gain that makes the response to a constant zero; Oustaloup's gain is that at the band's lower end.
@@ -270,7 +271,10 @@ def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats
 
 
 def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
-    """Poles, residues and direct gain of s^-power, an integral of s^(1 - power) without steady-state error."""
+    """Return poles, residues and direct gain of an approximation of s^-power without steady-state error.
+
+    It is an integrator in series with Oustaloup's filter for s^(1 - power).
+    """
     if power >= 1.0:
         return np.zeros(1), np.ones(1), 0.0
     poles, residues, gain = oustaloup(1.0 - power, reach, order)
@@ -279,7 +283,10 @@ def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Flo
 
 
 def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: float) -> _Bank:
-    """Return first-order lags that are exact for signals that are linear between samples."""
+    """Return a sum of first-order lags, discretized exactly for signals that are linear between samples.
+
+    `step` is the sampling interval [s], and `factor` multiplies all residues and the direct gain.
+    """
     x = poles * step
     keeps = np.exp(-x)
     # (1 - e^-x)/x and what follows from it, whose limits at 0 are 1, 1/2 and 1/2.
@@ -315,22 +322,22 @@ GAIN_VARIATIONS = (0.7, 1.4)
 
 @dataclass(frozen=True)
 class PidDesign(LoopDesign):
-    """Fractional PID with the margins of its loop.
+    """Result of :func:`fractional_pid`: the controller and the stability margins of its loop.
 
     Parameters
     ----------
     pid
-        The controller.
+        Designed controller.
     rate
-        Sampling rate [Hz].
+         Sampling rate [Hz].
     nominal
         Margins at the nominal parameters.
     samples
         Margins at parameters drawn from the covariance; empty without a covariance.
     flat
-        Phase margin at 0.7, 1 and 1.4 times the plant gain [degrees].
+        Phase margins [degrees] at 0.7, 1 and 1.4 times the plant gain.
     plants
-        All outputs that depend on the input, the controlled output first.
+        Plants from the input to all outputs that depend on it, the controlled output first.
     """
 
     pid: FractionalPid
@@ -342,12 +349,12 @@ class PidDesign(LoopDesign):
 
     @check_arguments
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return the measured output, and responses to it and to the reference at frequencies [rad/s]."""
+        """Return measured outputs, and responses of the command to them and to the reference at w [rad/s]."""
         response = DiscretePid(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response
 
     def to_dict(self) -> dict[str, Any]:
-        """Return design and margins for JSON."""
+        """Return design and margins as a dictionary for JSON."""
         return {
             "design": "pid",
             "rate": self.rate,
@@ -380,7 +387,9 @@ def fractional_pid(
     coupling: Literal["simulated", "measured"] = "simulated",
     sensor: bool = False,
 ) -> PidDesign:
-    """Tune a fractional PID for crossover, phase margin and flat phase, robust over the model's uncertainty.
+    """Design a fractional PID controller for a crossover frequency, a phase margin and a flat phase.
+
+    The design is robust to the uncertainty of the model.
 
     Parameters
     ----------
@@ -391,37 +400,37 @@ def fractional_pid(
     crossover
         Gain crossover frequency [rad/s], the highest one of the loop.
     phase_margin
-        Phase margin there [degrees], 10 to 80.
+        Phase margin at the crossover [degrees], 10 to 80.
     rate
-        Sampling rate [Hz]; one sample of delay and the zero-order hold are included.
+        Sampling rate [Hz]. The loop includes one sample of delay and the zero-order hold.
     samples
         Number of parameter samples from the covariance, 0 to 10000.
     seed
         Seed of the samples.
     coupling
-        ``"measured"``: only the equation of the output.
+        ``"simulated"``: plant of all coupled equations. ``"measured"``: plant of the output's equation alone.
     sensor
-        Whether the loop measures after the model's sensor filter; by default the filter belongs to the recording only.
+        Whether the loop measures the output after the model's sensor filter; by default before it.
 
     Returns
     -------
     PidDesign
-        With margins at the nominal parameters and at each sample.
+        Controller with margins at the nominal parameters and at each parameter sample.
 
     Raises
     ------
     ModelError
-        An unstable model (an integrator is allowed), friction, or too much uncertainty: more than 5 % of the samples
-        make the loop unstable or halve its phase margin. Requirements that no nonnegative gains meet, or not without
-        another crossover above the requested one.
+        If the model is unstable (an integrator is allowed), has friction, or is too uncertain: with more than 5 % of
+        the samples the loop is unstable or has half the phase margin. Also if no nonnegative gains meet the
+        requirements, or only with another crossover above the requested one.
 
     Notes
     -----
-    At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear in the
-    three gains and hold exactly. Among all orders whose largest sensitivity over all samples is at most 1.5 (or
-    within 5 % of the smallest), those with the largest loop gain at a tenth of the crossover are selected. If their
-    loop gain is 1 again above the crossover, only orders without another crossover there are compared. Monje,
-    Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
+    At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear in the three
+    gains and are met exactly. Among all orders whose maximum sensitivity over all samples is at most 1.5 (or within 5 %
+    of the smallest), those with the largest loop gain at a tenth of the crossover are selected. If their loop has
+    another crossover at a higher frequency, only orders without one are compared. Source: Monje, Vinagre, Feliu and
+    Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
@@ -497,7 +506,7 @@ def fractional_pid(
 def plant_of(
     model: Model, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
 ) -> Plant:
-    """Return the plant of an output and an input; raise if they are unknown or ambiguous."""
+    """Return the plant from an input to an output; raise ModelError if they are unknown or ambiguous."""
     check_model(model)
     if not isinstance(sensor, bool):
         raise ModelError(f"sensor = {short_repr(sensor)} is neither True nor False")
@@ -528,7 +537,7 @@ def _best(
     curves: Complex,
     is_allowed: Callable[[FractionalPid], bool] = lambda _: True,
 ) -> FractionalPid | None:
-    """Controller with the largest low-frequency gain among those that meet all conditions with low sensitivity."""
+    """Return the controller with the largest low-frequency gain that meets all conditions with low sensitivity."""
     candidates: list[tuple[float, float, FractionalPid]] = []
     centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
     for _ in range(REFINEMENT_ROUNDS):
@@ -549,7 +558,7 @@ def _best(
 
 
 def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
-    """Gains at given orders: C(j wc) = target and d arg C/dw = -slope; None where one is negative."""
+    """Return the controller with given orders, C(j wc) = target and d arg C/dw = -slope; None if a gain is negative."""
     powers = np.array([0.0, -lam, mu])
     parts = (1j * wc) ** powers
     turning = powers * parts / (wc * target)
@@ -566,7 +575,7 @@ def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float
 
 
 def least_certain_parameter(model: Model) -> str:
-    """Name of the coefficient or order with the largest relative uncertainty."""
+    """Return the name of the coefficient or order with the largest relative uncertainty."""
     covariance = covariance_of(model)
     if covariance is None:
         return "none is known"

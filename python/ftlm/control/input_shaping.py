@@ -1,4 +1,4 @@
-"""ZV and ZVD input shapers for the poles of a model."""
+"""ZV and ZVD input shapers for the oscillatory modes of a model."""
 
 from __future__ import annotations
 
@@ -33,16 +33,17 @@ INTERVAL_GRID_POINTS = 9
 
 @dataclass(frozen=True)
 class Shaper:
-    """Input shaper: impulses of sum 1 without residual vibration at given poles.
+    """Input shaper: a sequence of impulses with sum 1 that causes no residual vibration of given modes.
 
     Parameters
     ----------
     kind
-        ``"zv"``: zero vibration. ``"zvd"``: also zero derivative with respect to the pole, at twice the delay.
+        ``"zv"``: zero vibration. ``"zvd"``: in addition, zero derivative of the vibration with respect to the pole,
+        with twice the delay.
     modes
         Modes that are shaped.
     times, amplitudes
-        Impulses in continuous time [s].
+        Times [s] and amplitudes of the impulses in continuous time.
     worst
         Largest residual vibration within the 95 % intervals of the modes; None without intervals.
     """
@@ -55,12 +56,12 @@ class Shaper:
 
     @property
     def delay(self) -> float:
-        """Delay of a shaped reference [s]."""
+        """Delay by which the shaper extends a reference [s]."""
         return self.times[-1]
 
     @check_arguments
     def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-        """Residual vibration of a mode after a shaped step, relative to an unshaped one.
+        """Return the residual vibration of a mode after a shaped step, relative to that after an unshaped step.
 
         Parameters
         ----------
@@ -73,16 +74,15 @@ class Shaper:
 
     @check_arguments
     def impulses(self, rate: float) -> Floats:
-        """Impulses at the samples of a rate [Hz], shape (N,), with exact zeros at the poles and sum 1.
+        """Return the impulses at a sampling rate [Hz], shape (N,), with sum 1 and exact zeros at the poles.
 
-        An impulse between two samples is split over both so that its effect at the pole is unchanged, unlike
-        interpolation.
+        An impulse between two samples is divided between them in such a way that its effect at the pole does not
+        change. Linear interpolation would change it.
 
         Raises
         ------
         ModelError
-            An invalid rate, one with fewer than four samples per period of a mode, or one at which the shaper has
-            millions of samples.
+            If the rate is invalid, gives fewer than four samples per period of a mode, or gives millions of samples.
         """
         rate = checked_rate(rate)
         if self.delay * rate > MAX_SHAPER_SAMPLES:
@@ -104,23 +104,24 @@ class Shaper:
 
     @check_arguments
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
-        """Apply the shaper to a reference or input at a sampling rate [Hz]; the length does not change.
+        """Return a reference filtered by the shaper at a sampling rate [Hz]; its length does not change.
 
-        The past is taken equal to the first row. The output lags by `delay`, so the reference should end at rest.
+        The reference is assumed to equal its first row in the past. The result is delayed by `delay`, so the reference
+        should end at rest.
 
         Parameters
         ----------
         reference
-            One row per sample.
+            Reference with one row per sample.
         rate
             Sampling rate [Hz].
 
         Raises
         ------
         DataError
-            Rows that are not finite.
+            If a row is not finite.
         ModelError
-            As :meth:`impulses`.
+            In the cases of :meth:`impulses`.
         """
         values = as_array("reference", reference)
         if values.dtype.kind not in "fiu" or values.ndim not in (1, 2) or values.size == 0:
@@ -135,7 +136,7 @@ class Shaper:
         return np.asarray(shaped.reshape(values.shape), dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return impulses and modes for JSON."""
+        """Return impulses and modes as a dictionary for JSON."""
         modes = [[m.frequency, m.damping] for m in self.modes]
         return attributes(self, ("kind", "times", "amplitudes")) | {"modes": modes, "worst": self.worst}
 
@@ -154,20 +155,20 @@ def input_shaper(
     modes: int = 1,
     coupling: Literal["simulated", "measured"] = "simulated",
 ) -> Shaper:
-    """Design an input shaper for the poles of a model of any orders.
+    """Design an input shaper for the least damped modes of a model of any orders.
 
     Parameters
     ----------
     model
         Identified model, whose least damped modes are shaped; or a pole [rad/s] such as ``-2 + 17j``.
     kind
-        ``"zv"`` (Smith's posicast; half a period of delay) or ``"zvd"`` (a full period; pole errors have a second-order
-        effect only).
+        ``"zv"`` (Smith's posicast, with a delay of half a period) or ``"zvd"`` (with a delay of a full period; errors
+        of the pole have only a second-order effect).
     modes
-        Number of modes, the least damped first. Each adds its delay.
+        Number of modes that are shaped, the least damped first. Their delays are added.
     coupling
-        ``"simulated"``: poles of the coupled equations. ``"measured"``: poles of each equation alone, for a link whose
-        hub is moved by a stiff loop.
+        ``"simulated"``: poles of the coupled equations. ``"measured"``: poles of each equation alone, as for a flexible
+        link on a hub that a stiff position loop moves.
 
     Returns
     -------
@@ -176,13 +177,13 @@ def input_shaper(
     Raises
     ------
     ModelError
-        An unstable model, friction, too few oscillatory modes, or poles so uncertain that the residual vibration may
-        exceed 20 %.
+        If the model is unstable, has friction or too few oscillatory modes, or its poles are so uncertain that the
+        residual vibration may exceed 20 %.
 
     Notes
     -----
-    Singer and Seering (1990), doi:10.1115/1.2894142. Besides its oscillation a fractional model has a component that
-    decays as a power of time, which no shaper cancels; it is not a vibration.
+    Source: Singer and Seering (1990), doi:10.1115/1.2894142. In addition to its oscillation, the response of a
+    fractional model has a component that decays as a power of time. It is not a vibration, and no shaper cancels it.
     """
     check_choice("kind", kind, SHAPER_REPETITIONS)
     count = check_integer("modes", modes, 1)
@@ -225,7 +226,7 @@ def input_shaper(
 
 
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-    """Amplitude of the vibration after the last impulse, relative to a single impulse of sum 1 at that time."""
+    """Return the amplitude of the vibration after the last impulse, relative to that of a single unit impulse."""
     w, z = np.broadcast_arrays(as_floats("frequency", frequency), as_floats("damping", damping))
     if not (np.all(np.abs(w) < POLE_RANGE_RAD_S[1]) and np.all(np.abs(z) <= 1.0)):
         raise DataError("frequency or damping is out of range; give rad/s, finite, and damping ratios from -1 to 1")
@@ -235,7 +236,7 @@ def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, 
 
 
 def _convolve(x: Floats, taps: Floats) -> Floats:
-    """Causal convolution with a few impulses, truncated to the length of the signal."""
+    """Return the causal convolution of a signal with a few impulses, truncated to the length of the signal."""
     out = np.zeros(len(x))
     for at in np.flatnonzero(taps[: len(x)]):
         out[at:] += taps[at] * x[: len(x) - at]
@@ -256,13 +257,13 @@ def _mode_of(value: complex | np.number[Any]) -> Mode:
 
 
 def _half(mode: Mode) -> tuple[float, float]:
-    """Half a period of a mode [s], and the decay over it."""
+    """Return half the damped period of a mode [s], and the decay of its amplitude over this time."""
     half = math.pi / mode.pole.imag
     return half, math.exp(mode.pole.real * half)
 
 
 def _zv_samples(mode: Mode, step: float) -> Floats:
-    """Discrete zero-vibration shaper of a mode: 1 + K e^(-s half) = 0 exactly at its pole."""
+    """Return the sampled zero-vibration shaper of a mode, which is zero exactly at the pole of the mode."""
     half, decay_ratio = _half(mode)
     whole = math.floor(half / step)
     rest = half - whole * step
@@ -278,7 +279,7 @@ def _zv_samples(mode: Mode, step: float) -> Floats:
 
 
 def _worst_residual(times: Floats, amplitudes: Floats, modes: tuple[Mode, ...]) -> float | None:
-    """Largest residual vibration over the confidence intervals of frequency and damping."""
+    """Return the largest residual vibration over the confidence intervals of the modes; None without intervals."""
     worst: float | None = None
     for mode in modes:
         if mode.frequency_error is None or mode.damping_error is None:

@@ -1,4 +1,4 @@
-"""Inverse dynamics: reference signal that moves an output along a path, by inversion of the exact response."""
+"""Inverse dynamics: a reference that moves an output along a path, by inversion of the exact frequency response."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MAX_RESIDUAL_SHARE = 0.5
 
 
 class Loop(Protocol):
-    """Protocol of a loop design."""
+    """Protocol of a loop design, which gives the responses that inverse dynamics requires."""
 
     @property
     def rate(self) -> float:
@@ -43,28 +43,28 @@ class Loop(Protocol):
         """Plants of the loop, one per output."""
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return measured outputs, responses to each, shape (outputs, W), and to the reference, (W,)."""
+        """Return measured outputs, and responses of the command to each, (outputs, W), and to the reference, (W,)."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Reference signal for a move along a path.
+    """Result of :func:`inverse_dynamics`: the reference for a move along a path, and its predicted effect.
 
     Parameters
     ----------
     reference
-        Reference of the loop, one row per sample.
+        Reference for the loop, one row per sample.
     path
         Desired path.
     command
-        Predicted command of the loop, from its linear model.
+        Command of the loop that its linear model predicts, one row per sample.
     outputs
-        Predicted outputs of the model.
+        Outputs that the model predicts, one row per sample.
     residual_vibration
-        RMS deviation from the path after its end, exceeded by at most 2.5 % of the parameter samples; None without a
+        RMS deviation from the path after its end that at most 2.5 % of the parameter samples exceed; None without a
         covariance.
     plain
-        Nominal RMS deviation with the path itself as reference.
+        RMS deviation after the end of the path if the path itself is the reference, at the nominal parameters.
     """
 
     reference: Floats
@@ -75,7 +75,7 @@ class Trajectory:
     plain: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a summary for JSON, without the rows."""
+        """Return a summary as a dictionary for JSON, without the samples."""
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
@@ -100,7 +100,9 @@ class Trajectory:
 def point_to_point(
     distance: float, duration: float, rate: float = 500.0, *, dwell_before: float = 0.3, dwell_after: float = 1.2
 ) -> Floats:
-    """Point-to-point path with zero velocity, acceleration and jerk at both ends: a polynomial of degree 7.
+    """Return a point-to-point path: a polynomial of degree 7 whose derivatives are zero at both ends.
+
+    Velocity, acceleration and jerk are zero there. The path has shape (N,).
 
     Parameters
     ----------
@@ -116,7 +118,7 @@ def point_to_point(
     Raises
     ------
     ModelError
-        Invalid numbers, or a move of fewer than ten samples.
+        If a number is invalid, or the move has fewer than ten samples.
     """
     reach = real_number("distance", distance)
     if not math.isfinite(reach):
@@ -147,20 +149,21 @@ def inverse_dynamics(
     samples: int = 40,
     seed: int = 0,
 ) -> Trajectory:
-    """Compute the reference with which a loop moves a sum of outputs, such as a tip, along a path.
+    """Compute the reference with which a loop moves an output, or a sum of outputs such as a tip, along a path.
 
     Parameters
     ----------
     design : PidDesign or LqgDesign
-        Loop design. The exact fractional response is inverted with delay, hold and the discrete-time controller.
+        Loop design. The inverted response includes the exact fractional model, delay, hold and the discrete-time
+        controller.
     path : array_like
-        Desired path, one row per sample at the loop's rate. It is at rest at both ends, with a dwell before the move as
-        long as the reference must lead.
+        Desired path, one row per sample at the rate of the loop. It must be at rest at both ends. The dwell before the
+        move must be at least as long as the time by which the reference starts earlier.
     output : str, optional
         Output of the model or a sum such as ``"theta11 + theta12"``, as measured by the loop; may be omitted for a
         model with one output.
     limit
-        Largest command.
+        Maximum magnitude of the command.
     samples, seed
         Number of parameter samples from the covariance, 0 to 10000, and their seed.
 
@@ -171,15 +174,15 @@ def inverse_dynamics(
     Raises
     ------
     DataError
-        An invalid path.
+        If the path is invalid.
     ModelError
-        A path that exceeds the limit, a reference that moves before the path's first row, or too much uncertainty: the
-        residual vibration may exceed half of that with the path itself as reference.
+        If the command exceeds the limit, the reference would start before the first row of the path, or the model is
+        too uncertain: the residual vibration may exceed half of that with the path itself as reference.
 
     Notes
     -----
-    In the frequency domain a nonminimum-phase response has a bounded inverse, which starts before the path: Bayo
-    (1987), doi:10.1002/rob.4620040406.
+    In the frequency domain, a nonminimum-phase response has a bounded inverse that starts before the path (Bayo 1987,
+    doi:10.1002/rob.4620040406).
     """
     if not isinstance(design, LoopDesign):
         raise ModelError(f"design is a {type(design).__name__}, no PidDesign or LqgDesign; design a loop first")
@@ -197,7 +200,7 @@ def inverse_dynamics(
     heard, acts, asks = design.controller_response(w[inside])
 
     def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
-        """Command and outputs of the closed loop per reference."""
+        """Return the responses of command and outputs to the reference in closed loop."""
         responses = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
         loop = np.sum([a * responses[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
         command = asks / (1.0 + loop)
@@ -252,7 +255,7 @@ def inverse_dynamics(
 
 
 def _path(path: ArrayLike) -> Floats:
-    """Return a path as an array of shape (rows,)."""
+    """Return a path as an array of shape (rows,); raise DataError if it is invalid."""
     raw = as_array("path", path)
     if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
         raise DataError(f"path is not an array of 16 to {MAX_PATH_ROWS} numbers, one per sample")
@@ -274,5 +277,5 @@ def _path(path: ArrayLike) -> Floats:
 
 
 def _residual_rms(output: Floats, rows: Floats, ends: int) -> float:
-    """RMS deviation from a path after its end."""
+    """Return the RMS deviation of an output from a path after row `ends`."""
     return float(np.sqrt(np.mean(np.square((output - rows)[min(ends, len(rows) - 1) :]))))

@@ -1,4 +1,4 @@
-"""Kalman filter on the low-order realization of an identified model."""
+"""LQG control and Kalman filters (observers) on a low-order realization of an identified model."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ UNKNOWN_INPUT = "unknown input"
 
 @dataclass(frozen=True)
 class Observer:
-    """Kalman filter of a sampled model with an unknown input disturbance.
+    """Kalman filter of a discrete-time model with an unknown input disturbance.
 
     Parameters
     ----------
     realisation
         Realization of the model for all outputs, with its approximation error.
     measured
-        Measured outputs.
+        Names of the measured outputs.
     noise
-        Standard deviation of the noise of each measured output.
+         Standard deviation of the noise of each measured output.
     process_noise
-        Process noise intensity: standard deviation of the disturbance's change in a second.
+        Process noise intensity: standard deviation of the change of the disturbance within one second.
     gain
-        Correction gain, shape (states + 1, measured).
+        Kalman gain of the correction, shape (states + 1, measured); the last row is that of the disturbance.
     deviations
-        Steady-state standard deviation of every output's estimate, according to the model and its noise.
+        Steady-state standard deviation of the estimate of every output, by the model and its noise.
     """
 
     realisation: Realisation
@@ -61,7 +61,7 @@ class Observer:
 
     @property
     def matrices(self) -> tuple[Floats, Floats, Floats]:
-        """Matrices a, b, c of the discrete-time system extended by the input disturbance."""
+        """Matrices a, b, c of the discrete-time system, in which the input disturbance is the last state."""
         a, b = self.realisation.a, self.realisation.b
         size = len(a)
         whole = np.eye(size + 1)
@@ -70,14 +70,15 @@ class Observer:
 
     @check_arguments
     def over(self, run: Run) -> dict[str, Floats]:
-        """Filter a run: estimates of every output and of the input disturbance from past and present samples.
+        """Return estimates of every output and of the input disturbance for a run, from past and present samples.
 
-        The initial state is at rest; if the first measured output integrates, it is that output's first sample.
+        The filter starts at rest. If the first measured output has an integrator, it starts at the first sample of this
+        output.
 
         Raises
         ------
         DataError
-            A run without these signals, or with another sampling step.
+            If the run lacks a signal, or has another sampling interval.
         """
         names = (self.realisation.input, *self.measured)
         absent = [n for n in names if n not in run.signals]
@@ -109,7 +110,7 @@ class Observer:
 
     @check_arguments
     def rest(self, measured: Floats) -> Floats:
-        """Equilibrium states for a measured value of an integrating output; 0 for any other output."""
+        """Return the equilibrium state at measured values, if the first output has an integrator; otherwise 0."""
         states = np.zeros(self.realisation.states)
         column = self.rows[:, 0]
         if self.realisation.poles[0] == 0 and np.any(column):
@@ -125,7 +126,7 @@ class Observer:
 
 
 def _measured_values(observer: Observer, measured: Sequence[float] | Floats) -> Floats:
-    """Return measured values of one sample; raise unless there is one of each measured output."""
+    """Return the measured values of one sample; raise ModelError unless there is one for each measured output."""
     values = as_floats("measured", measured)
     if values.shape != (len(observer.measured),):
         raise DataError(f"measured has shape {values.shape}; give one value each of {', '.join(observer.measured)}")
@@ -146,7 +147,7 @@ def observer(
     coupling: Literal["simulated", "measured"] = "simulated",
     sensor: bool = False,
 ) -> Observer:
-    """Design an observer of all outputs of a model from some of them, such as a deflection from a hub angle.
+    """Design an observer that estimates all outputs of a model from some of them, such as a deflection from an angle.
 
     Parameters
     ----------
@@ -155,15 +156,15 @@ def observer(
     input : str, optional
         Input; may be omitted for a model with one input.
     measured : sequence of str, optional
-        Measured outputs; default all.
+        Names of the measured outputs; by default all.
     noise : mapping, optional
-        Standard deviation of the noise of each measured output; default the residuals of the model's fit.
+        Standard deviation of the noise of each measured output; by default that of the residuals of the model's fit.
     process_noise
-        Process noise intensity: standard deviation of the change of an input disturbance in a second, in the unit of
-        the input. It covers friction, offsets and other unmodeled effects.
+        Process noise intensity: standard deviation of the change of an input disturbance within one second, in the unit
+        of the input. The disturbance represents friction, offsets and other unmodeled effects.
     rate, band, poles
-        Arguments of the realization; see :class:`Realisation`. The default band is from a five-thousandth to an eighth
-        of the Nyquist frequency. The default number of poles gives errors below 0.1 dB and 1 degree.
+        Options of the realization; see :class:`Realisation`. The default band is from 1/5000 to 1/8 of the Nyquist
+        frequency. By default, as many poles are used as errors below 0.1 dB and 1 degree require.
     coupling, sensor
         See :func:`ftlm.analysis.frequency_response`; by default the measurements are not filtered.
 
@@ -174,8 +175,8 @@ def observer(
     Raises
     ------
     ModelError
-        An unstable model, an unknown output or input, unknown noise, a model without an accurate low-order realization,
-        or python-control is not installed.
+        If the model is unstable or has no accurate low-order realization, an output or input is unknown, the noise is
+        unknown, or python-control is not installed.
     """
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = select_outputs("measured", measured, tuple(p.output for p in plants))
@@ -188,7 +189,7 @@ def observer(
 
 
 def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
-    """Return all outputs of a stable model from one input; raise for an unstable model."""
+    """Return plants from one input to all outputs of a model; raise ModelError if the model is unstable."""
     check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
     plants[0].check_stable()
@@ -227,7 +228,7 @@ def kalman_filter(
 
 
 def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str, float] | None) -> tuple[float, ...]:
-    """Standard deviation of the noise of each measured output."""
+    """Return the noise standard deviation of each measured output; raise ModelError if one is unknown."""
     if noise is not None and not isinstance(noise, Mapping):
         raise ModelError(f"{setting('noise')} {short_repr(noise)} is not a mapping from outputs to standard deviations")
     for name in noise or {}:
@@ -257,10 +258,10 @@ INTEGRATOR_TOLERANCE = 1e-7
 
 
 class Lqg:
-    """Discrete-time observer and state feedback.
+    """Discrete-time LQG controller: an observer and a state feedback.
 
-    The controller starts without a step: the observer begins at rest at the measured output. It uses the saturated
-    commands, which avoids windup.
+    The observer starts at rest at the measured output, so the first command has no step. The observer uses the
+    saturated commands, which avoids windup.
 
     Parameters
     ----------
@@ -269,15 +270,15 @@ class Lqg:
     feedback
         State feedback gain, shape (1, states).
     tracked
-        Output that follows the reference.
+        Name of the output that follows the reference.
     limit
-        Largest command.
+        Maximum magnitude of the command.
 
     Raises
     ------
     ModelError
-        Feedback of the wrong shape or not finite, a limit that is not above 0, an output without an equilibrium; when
-        called, a command that is not finite.
+        If the feedback has the wrong shape or is not finite, the limit is not positive, or the output has no
+        equilibrium. When called, if the command is not finite.
     """
 
     @check_arguments
@@ -298,12 +299,12 @@ class Lqg:
 
     @property
     def memory(self) -> int:
-        """Number of states between two samples."""
+        """Number of states of the controller."""
         return len(self._a) + 1
 
     @property
     def estimate(self) -> dict[str, float]:
-        """Prediction of all outputs at the next sample, and estimate of the input disturbance."""
+        """Predictions of all outputs at the next sample, and estimate of the input disturbance, by name."""
         states = np.zeros(len(self._a)) if self._states is None else self._states
         estimates = (self.observer.realisation.c @ states[:-1]).tolist()
         return dict(zip(self.observer.realisation.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: float(states[-1])}
@@ -330,7 +331,7 @@ class Lqg:
 
     @check_arguments
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
-        """Frequency responses of the command to the measured outputs, (measured, W), and to the reference, (W,)."""
+        """Return frequency responses of the command to the measured outputs, (measured, W), and the reference, (W,)."""
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         a, into = self._transition_matrices()
         system = z[:, None, None] * np.eye(len(a)) - a
@@ -343,12 +344,12 @@ class Lqg:
         return np.asarray(np.linalg.eigvals(self._transition_matrices()[0]))
 
     def _transition_matrices(self) -> tuple[Floats, Floats]:
-        """State and input matrices of the controller."""
+        """Return the state matrix and the input matrix of the controller."""
         into = self._a @ self.observer.gain
         return self._a - self._b @ self._gains - into @ self._c, into
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the controller for JSON."""
+        """Return the controller as a dictionary for JSON."""
         realisation = self.observer.realisation
         return {
             "kind": "lqg",
@@ -376,20 +377,20 @@ class Lqg:
 
 @dataclass(frozen=True)
 class LqgDesign(LoopDesign):
-    """Linear-quadratic controller with the margins of its loop on the exact model.
+    """Result of :func:`lqg`: the controller, and the stability margins of its loop with the exact model.
 
     Parameters
     ----------
     controller
-        Controller to run.
+        Designed discrete-time controller.
     realisation
         Realization of the model, with its approximation error.
     nominal
-        Margins at the nominal parameters, at the plant input.
+        Margins of the loop, opened at the plant input, at the nominal parameters.
     samples
         Margins at parameters drawn from the covariance; empty without a covariance.
     plants
-        Measured outputs of the model.
+        Plants from the input to the measured outputs.
     """
 
     controller: Lqg
@@ -405,17 +406,17 @@ class LqgDesign(LoopDesign):
 
     @check_arguments
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return the measured outputs, and responses to each of them and to the reference at frequencies [rad/s]."""
+        """Return measured outputs, and responses of the command to each and to the reference at w [rad/s]."""
         heard, reference_response = self.controller.response(w)
         return self.controller.observer.measured, -heard, reference_response
 
     @check_arguments
     def with_limit(self, limit: float) -> Lqg:
-        """Return the controller with a limit of its command."""
+        """Return the controller with another maximum magnitude of its command."""
         return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return design and margins for JSON, without the matrices."""
+        """Return design and margins as a dictionary for JSON, without the matrices."""
         realisation = self.realisation
         return {
             "design": "lqg",
@@ -462,17 +463,18 @@ def lqg(
     model
         Linear model that is stable except for an integrator.
     max_deviation : mapping
-        Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip); Bryson's rule.
+        Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip), from which
+        Bryson's rule gives the weights.
     max_input
         Maximum acceptable input, in its unit.
     input, output : str, optional
-        Manipulated input and output that follows the reference, by default the integrating output, or the first. The
-        input may be omitted for a model with one input.
+        Manipulated input, and output that follows the reference. The default output is the one with an integrator, else
+        the first. The input may be omitted for a model with one input.
     measured, noise, rate, band, poles, coupling, sensor
         See :func:`observer`.
     process_noise
-        Process noise intensity: change of an input disturbance in a second; default a fifth of `max_input`. Larger
-        values give a faster observer and more noise in the command.
+        Process noise intensity; see :func:`observer`. The default is a fifth of `max_input`. Larger values give a
+        faster observer and more noise in the command.
     limit
         Largest command.
     samples, seed
@@ -481,20 +483,20 @@ def lqg(
     Returns
     -------
     LqgDesign
-        Its `controller` runs in discrete time; the margins are those of this controller on the exact response of the
+        Design with a discrete-time `controller`. Its margins are computed with the exact frequency response of the
         model.
 
     Raises
     ------
     ModelError
-        As :func:`observer`; a largest sensitivity above 3 on the exact model, nominally or for more than 5 % of the
-        parameter samples.
+        In the cases of :func:`observer`, or if the maximum sensitivity with the exact model exceeds 3, nominally or for
+        more than 5 % of the parameter samples.
 
     Notes
     -----
-    Solves the Riccati equations by python-control on the sampled realization, including one sample of delay. LQG
-    loops have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. Therefore the argument principle
-    on the exact response decides.
+    python-control solves the Riccati equations for the sampled realization, which includes one sample of delay. LQG
+    loops have no guaranteed margins (Doyle 1978, doi:10.1109/TAC.1978.1101812). Stability is therefore tested by the
+    argument principle on the exact response.
     """
     count, start = check_samples(samples, seed)
     dear = positive("max_input", max_input)
@@ -546,7 +548,7 @@ def lqg(
 
 
 def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
-    """Return the output that follows the reference."""
+    """Return the name of the output that follows the reference; raise ModelError if it is unknown."""
     names = [p.output for p in plants]
     if output is not None:
         return select_outputs("output", [output], tuple(names))[0]
@@ -554,7 +556,7 @@ def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
 
 
 def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
-    """Return coefficients of sums of outputs, with their maximum acceptable deviations."""
+    """Return (coefficients of the outputs, maximum acceptable deviation) of each weighted sum of outputs."""
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
             f"{setting('max_deviation')} {short_repr(max_deviation)} is not a mapping from outputs, or sums of them, "
@@ -568,7 +570,7 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
 
 
 def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
-    """States and input at rest with the tracked output at 1."""
+    """Return the states and the input at rest, as one vector, with the tracked output at 1."""
     if tracked not in realisation.outputs:
         raise ModelError(f"tracked = {short_repr(tracked)} is not one of the outputs {', '.join(realisation.outputs)}")
     size = realisation.states

@@ -1,4 +1,4 @@
-"""Low-order realization by vector fitting of the exact response, and its discretization with errors."""
+"""Low-order realization of a model by vector fitting of its exact frequency response, and its discretization."""
 
 from __future__ import annotations
 
@@ -43,22 +43,22 @@ COARSE_DB, COARSE_DEGREES = 1.0, 6.0
 
 @dataclass(frozen=True)
 class Realisation:
-    """Integer-order state-space realization of a model from one input, continuous and sampled.
+    """Integer-order state-space realization of a model from one input, in continuous and discrete time.
 
     Parameters
     ----------
     outputs, input
-        Names.
+        Signal names.
     rate
-        Sampling rate [Hz]; the input has a zero-order hold.
+         Sampling rate [Hz]; the input has a zero-order hold.
     band
-        Fitted frequency band [rad/s].
+        Frequency band of the fit [rad/s].
     poles
         Poles in the s-plane [rad/s], one of each conjugate pair; 0 for an integrator.
     a, b, c
         Discrete-time state space: x' = a x + b u, y = c x.
     gain_error, phase_error
-        Largest errors over the band of each output against the exact response [dB], [degrees].
+        Largest gain error [dB] and phase error [degrees] of each output over the band, relative to the exact response.
     """
 
     outputs: tuple[str, ...]
@@ -79,7 +79,7 @@ class Realisation:
 
     @check_arguments
     def response(self, w: Floats) -> Complex:
-        """Frequency response [rad/s] of the samples to a held input, shape (outputs, W)."""
+        """Return the frequency response of the samples to a zero-order-hold input at w [rad/s], shape (outputs, W)."""
         z = np.exp(1j * check_vector("w", as_floats("w", w)) / self.rate)
         system = z[:, None, None] * np.eye(self.states) - self.a
         states = np.linalg.solve(system, np.broadcast_to(self.b, (z.size, *self.b.shape)))[:, :, 0]
@@ -94,26 +94,26 @@ class Realisation:
 
 
 def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, poles: int | None) -> Realisation:
-    """Fit an integer-order system to the exact response of outputs to one input, and discretize it.
+    """Fit an integer-order system to the exact responses of outputs to one input, and discretize it.
 
     Parameters
     ----------
     plants
         Plants of one model, input and rate, one per output.
     band
-        Frequencies (low, high) [rad/s]; default from a five-thousandth to an eighth of the Nyquist frequency.
+        Frequency band (low, high) [rad/s]; by default from 1/5000 to 1/8 of the Nyquist frequency.
     poles
-        Number of poles without the integrator; default as many as give errors below 0.1 dB and 1 degree.
+        Number of poles without the integrator; by default as many as errors below 0.1 dB and 1 degree require.
 
     Raises
     ------
     ModelError
-        An invalid band or number, python-control is not installed, or errors above 1 dB or 6 degrees.
+        If the band or number of poles is invalid, python-control is not installed, or errors exceed 1 dB or 6 degrees.
 
     Notes
     -----
-    Common poles by vector fitting: Gustavsen and Semlyen (1999), doi:10.1109/61.772353, with equal weight on relative
-    errors. Discretized with a zero-order hold by python-control.
+    Vector fitting gives poles that are common to all outputs, with equal weight on relative errors (Gustavsen and
+    Semlyen 1999, doi:10.1109/61.772353). python-control discretizes the system with a zero-order hold.
     """
     low, high = _band(band, plants[0].rate)
     counts = (
@@ -153,7 +153,10 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
 
 @contextmanager
 def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
-    """Raise ModelError for overflow and for numerically singular matrices."""
+    """Convert overflow and numerical singularity within a block to a ModelError.
+
+    `what` and `way_out` are the failed computation and the remedy in its message.
+    """
     with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
         # SciPy warns of a matrix whose solution has no digits.
         warnings.simplefilter("error", RuntimeWarning)
@@ -178,14 +181,20 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
 
 
 def _initial_poles(own: Sequence[complex], low: float, high: float, count: int) -> Complex:
-    """Initial poles, one of each pair: the oscillatory modes of the model, and real poles over the band."""
+    """Return initial poles for vector fitting: oscillatory modes of the model, and real poles over the band.
+
+    Of each conjugate pair one pole is returned.
+    """
     pairs = list(own)[: count // 2]
     real = -np.geomspace(low, high, count - 2 * len(pairs))
     return np.asarray([*pairs, *real.tolist()], dtype=np.complex128)
 
 
 def _basis(s: Complex, poles: Complex) -> Complex:
-    """Partial fractions 1/(s - p) of every pole, real and imaginary part for a pair, shape (S, number of poles)."""
+    """Return the partial fractions 1/(s - p) of every pole, shape (S, number of poles).
+
+    A conjugate pair gives two columns, with real residues.
+    """
     columns = []
     for p in poles:
         one = 1.0 / (s - p)
@@ -198,7 +207,7 @@ def _basis(s: Complex, poles: Complex) -> Complex:
 
 
 def _system(poles: Complex) -> tuple[Floats, Floats]:
-    """State space with the columns of :func:`_basis` as outputs."""
+    """Return matrices of a system whose states have the responses 1/(s - p) of :func:`_basis` to its input."""
     size = int(np.sum(np.where(poles.imag == 0, 1, 2)))
     a, b = np.zeros((size, size)), np.zeros((size, 1))
     at = 0
@@ -214,7 +223,7 @@ def _system(poles: Complex) -> tuple[Floats, Floats]:
 
 
 def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> tuple[Complex, Floats, bool]:
-    """Return the poles and, by output, their residues, the integrator's first."""
+    """Return the poles, the residues of each output (the integrator's first), and whether there is an integrator."""
     weight = 1.0 / np.abs(exact)
     for _ in range(MAX_POLE_ITERATIONS):
         basis = _basis(s, poles)
@@ -258,14 +267,14 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
 
 
 def _least(matrix: Complex, vector: Complex) -> Floats:
-    """Real least-squares solution of complex equations, by their triangular factor."""
+    """Return the real least-squares solution of complex equations, by QR factorization."""
     both = np.column_stack([matrix, vector])
     triangle = np.asarray(np.linalg.qr(np.concatenate([both.real, both.imag]), mode="r"), dtype=np.float64)
     return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1])[0])
 
 
 def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> Floats:
-    """Residues of an integrator and of the columns of :func:`_basis`, by output."""
+    """Return the residues of the integrator and of the columns of :func:`_basis`, by output."""
     basis = _basis(s, poles)
     residues = np.zeros((len(exact), basis.shape[1] + 1))
     for i, line in enumerate(exact):
@@ -313,6 +322,6 @@ def _discretize(
 
 
 def _scaled_error(realisation: Realisation) -> float:
-    """Largest approximation error relative to its target."""
+    """Return the largest approximation error, divided by its target."""
     worst = max(max(realisation.gain_error.values()) / GAIN_DB, max(realisation.phase_error.values()) / PHASE_DEGREES)
     return worst if math.isfinite(worst) else math.inf

@@ -29,7 +29,7 @@ LOWEST_FREQUENCY_SHARE = 1e-3
 
 @dataclass(frozen=True)
 class Margins:
-    """Stability margins of a loop.
+    """Stability margins of a loop with loop transfer function L.
 
     Parameters
     ----------
@@ -38,11 +38,11 @@ class Margins:
     crossover
         Highest frequency with abs(L) = 1 [rad/s]; NaN without one.
     phase
-        Smallest phase margin of all crossovers [degrees].
+        Smallest phase margin over all crossovers [degrees].
     gain
-        Gain margin: smallest factor by which the loop gain may rise or fall until L = -1.
+        Gain margin: smallest factor by which an increase or decrease of the loop gain makes L = -1 at some frequency.
     sensitivity
-        Largest abs(1/(1 + L)).
+        Maximum sensitivity: largest abs(1/(1 + L)) over frequency.
     """
 
     stable: bool
@@ -61,18 +61,18 @@ class Margins:
 
 
 class LoopDesign:
-    """Loop design with margins at the nominal parameters and at samples of their distribution."""
+    """Base class of loop designs, with margins at the nominal parameters and at parameter samples."""
 
     nominal: Margins
     samples: tuple[Margins, ...]
 
     @property
     def stable_share(self) -> float:
-        """Share of the samples with a stable loop; 1 without samples."""
+        """Fraction of the parameter samples with a stable loop; 1 without samples."""
         return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
 
     def margin_interval(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
-        """Central 95 % interval of a margin over the samples."""
+        """Return the central 95 % interval of a margin over the parameter samples."""
         if not self.samples:
             value = getattr(self.nominal, what)
             return value, value
@@ -80,14 +80,14 @@ class LoopDesign:
         return float(low), float(high)
 
     def _margins(self) -> dict[str, Any]:
-        """Nominal and sampled margins for JSON."""
+        """Return nominal and sampled margins as a dictionary for JSON."""
         margins = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
         for one in margins:
             one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
         return {"nominal": margins[0], "samples": margins[1:]}
 
     def _margin_lines(self) -> list[str]:
-        """Margins as lines of text."""
+        """Return the margins as lines of text."""
         lines = [f"at the values: {self.nominal}"]
         if self.samples:
             phase, gain, peak = (self.margin_interval(n) for n in ("phase", "gain", "sensitivity"))
@@ -102,16 +102,16 @@ class LoopDesign:
 
 @dataclass(frozen=True)
 class Plant:
-    """Input and output of a model in a sampled loop.
+    """Model from one input to one output, as plant of a sampled loop.
 
     Parameters
     ----------
     model
         The model.
     output, input
-        Names.
+        Signal names.
     rate
-        Sampling rate [Hz]; a command acts one sample later and is held.
+         Sampling rate [Hz]. A command acts with one sample of delay and a zero-order hold.
     coupling, sensor
         See :func:`ftlm.analysis.frequency_response`.
     """
@@ -124,7 +124,7 @@ class Plant:
     sensor: bool = False
 
     def exact(self, w: Floats | Complex) -> Complex:
-        """Response of the model at frequencies [rad/s], which may be complex: s = jw."""
+        """Return the response of the continuous-time model at frequencies w [rad/s], which may be complex: s = jw."""
         if np.iscomplexobj(w):
             transfer = transfer_functions(self.model, coupling=self.coupling)
             s: Complex = 1j * as_complex("w", w)
@@ -138,7 +138,7 @@ class Plant:
         return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
 
     def _filter_response(self, s: Complex) -> Complex:
-        """Response of the sensor filter."""
+        """Return the response of the sensor filter at s."""
         passed = self.model.structure.sensor_filter if self.sensor else None
         if passed is None:
             return np.ones_like(s)
@@ -147,16 +147,16 @@ class Plant:
         return np.asarray((above / below) ** power)
 
     def held_response(self, w: Floats | Complex) -> Complex:
-        """Response with a zero-order hold of the input, below half the rate."""
+        """Return the response with a zero-order hold of the input, at frequencies below the Nyquist frequency."""
         turn = 1j * w / self.rate
         return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
 
     def response(self, w: Floats | Complex) -> Complex:
-        """Response with zero-order hold and one sample of delay."""
+        """Return the response with a zero-order hold and one sample of delay, at frequencies w [rad/s]."""
         return np.asarray(self.held_response(w) * np.exp(-1j * w / self.rate))
 
     def integral_order(self) -> float:
-        """Order of the plant's integration at zero frequency."""
+        """Return the order of the plant's pole at s = 0."""
         transfer = transfer_functions(self.model, coupling=self.coupling)
         above = transfer.numerators[self.output, self.input]
         if not above:
@@ -164,7 +164,7 @@ class Plant:
         return transfer.denominator[self.output][-1][1] - above[-1][1]
 
     def count_unstable_poles(self) -> float:
-        """Number of unstable poles; NaN with a pole on the imaginary axis."""
+        """Return the number of poles with a positive real part; NaN if a pole is on the imaginary axis."""
         result = stability(self.model, coupling=self.coupling)
         return math.nan if result.on_axis else result.unstable_poles
 
@@ -173,7 +173,7 @@ class Plant:
         return bool(transfer_functions(self.model, coupling=self.coupling).numerators[self.output, self.input])
 
     def check_stable(self) -> None:
-        """Raise for an unstable model; an integrator is allowed."""
+        """Raise ModelError if the model is unstable; an integrator is allowed."""
         grows = self.count_unstable_poles()
         if grows != 0:
             why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
@@ -197,21 +197,21 @@ class Plant:
 
 
 def nyquist_frequencies(crossover: float, rate: float) -> Floats:
-    """Frequencies of a Nyquist curve [rad/s]."""
+    """Return frequencies [rad/s] at which a Nyquist curve is computed."""
     return np.geomspace(LOWEST_FREQUENCY_SHARE * crossover, 0.999 * math.pi * rate, NYQUIST_POINTS)
 
 
 def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) -> Margins:
-    """Margins of a loop's frequency response on a fine grid.
+    """Return the margins of a loop from its frequency response on a fine grid.
 
     Parameters
     ----------
     loop
-        L(jw), shape (W,).
+        Loop transfer function L(jw), shape (W,).
     w
-        Frequencies, rising [rad/s].
+        Frequencies [rad/s], ascending, shape (W,).
     integrates
-        Order of integration of L at zero frequency.
+        Order of the pole of L at s = 0.
     grows
         Number of unstable poles of L.
     """

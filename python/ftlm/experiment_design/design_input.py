@@ -1,4 +1,4 @@
-"""Initial inputs of an input design: square waves, sweeps, random switching, and multisines with a low crest factor."""
+"""Design of an optimal input: arguments, initial inputs and the best candidate."""
 
 from __future__ import annotations
 
@@ -39,12 +39,15 @@ LOW_POWER_QUANTILE, MEDIAN_POWER_QUANTILE, HIGH_POWER_QUANTILE = 0.05, 0.5, 0.95
 
 
 def square_wave(rows: int, period: int) -> Floats:
-    """Square wave of amplitude 1 that starts high; period in samples."""
+    """Return a square wave of amplitude 1 that starts high; the period is in samples."""
     return np.where((np.arange(rows) % period) * 2 < period, 1.0, -1.0)
 
 
 def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -> Iterator[tuple[str, Floats]]:
-    """Yield name and commands, shape (inputs, rows), of amplitude at most 1; random signals differ between inputs."""
+    """Yield (name, commands) of initial inputs; commands have shape (inputs, rows) and amplitude at most 1.
+
+    Random signals differ between inputs.
+    """
     rng = np.random.default_rng(seed)
     sines = multisine(spectrum, inputs, rows, step, rng)
     yield "multisine", sines
@@ -67,7 +70,7 @@ def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed
 
 
 def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
-    """Low, median and high frequency of the power of a spectrum [Hz]."""
+    """Return the frequencies [Hz] below which a small part, half and most of the power of a spectrum lie."""
     order = np.argsort(spectrum.lines.frequencies)
     frequencies, power = spectrum.lines.frequencies[order], spectrum.power[order]
     total = np.cumsum(power)
@@ -81,10 +84,10 @@ def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, 
 
 
 def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.random.Generator) -> Floats:
-    """Multisine with the powers of a spectrum, amplitude 1, and phases that give a low crest factor.
+    """Return multisines with the powers of a spectrum, amplitude 1 and a low crest factor, shape (inputs, rows).
 
-    Starts from Schroeder's phases (doi:10.1109/TIT.1970.1054411), then clips peaks and restores the spectrum in turn
-    (Van der Ouderaa, Schoukens & Renneboog, 1988).
+    Starting from Schroeder's phases (doi:10.1109/TIT.1970.1054411), peaks are clipped and the power spectrum is
+    restored in turn (Van der Ouderaa, Schoukens & Renneboog, 1988).
     """
     points = len(spectrum.power)
     of_input = np.argmax(spectrum.lines.costs[:inputs] > 0, axis=0) if points else np.zeros(0, int)
@@ -131,7 +134,7 @@ MAX_RELATIVE_UNCERTAINTY = 0.5
 
 @dataclass(frozen=True)
 class DesignTask:
-    """Arguments of an input design after all checks."""
+    """Arguments of an input design after validation."""
 
     fit: ModelFit
     step: float
@@ -160,54 +163,55 @@ def design_input(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> DesignedInput:
-    """Design the input that identifies the parameters of a model best within the limits of a machine.
+    """Design the input from which the parameters of a model are identified most precisely, within given limits.
 
-    The Fisher information of any input follows from the exact output sensitivities, those of the fit, over the noise
-    standard deviation of the fit. A convex problem gives the best periodic spectrum with a certificate. Its multisine,
-    sweeps, square waves and random switching sequences are the initial inputs of an exchange algorithm over
-    piecewise-constant levels, which stops at a local optimum. Computing time is seconds to a minute and grows with
-    samples and parameters.
+    The Fisher information of an input follows from the exact sensitivities of the outputs to the parameters, divided by
+    the noise standard deviation. A convex problem gives the optimal periodic spectrum, with a certificate of its
+    optimality. A multisine with this spectrum, sweeps, square waves and random switching sequences are initial inputs
+    of an exchange algorithm over piecewise-constant levels, which stops at a local optimum. The design takes seconds to
+    a minute, and more for more samples and parameters.
 
     Parameters
     ----------
     model : Identification or Model
-        Of method ``"output-error"``; a saved model will do.
+        Identification by output error, or a saved model from one.
     reference_run : Run, optional
-        An admissible run of the machine. It gives the defaults of the other arguments, the largest output included.
-        Default of an identification: its first run.
+        Run that is admissible for the machine. It gives the defaults of the other arguments, including limits of the
+        outputs. By default the first run of an identification.
     duration, step : float, optional
-        Of the run [s].
+        Duration and sampling interval of the run [s].
     peak : float or mapping, optional
-        Largest size of each input.
+        Maximum magnitude of each input.
     slew : float or mapping, optional
-        Fastest change of each input, a second; default none.
+        Maximum rate of change of each input [unit/s]; by default unlimited.
     limits : mapping, optional
-        Largest size of outputs by name, in the model's units; infinity for none.
+        Maximum magnitude of outputs by name, in the units of the model; infinite for no limit.
     parameters : sequence of str, optional
-        Parameters of interest; default all free orders, or all parameters if no order is free.
+        Names of the parameters of interest; by default all free orders, or all parameters if no order is free.
     criterion : {"D", "E"}, default "D"
-        ``"D"``: smallest volume of the confidence ellipsoid of these parameters. ``"E"``: shortest widest axis, with
-        coefficients in units of their values.
+        ``"D"``: smallest volume of the confidence ellipsoid of these parameters. ``"E"``: smallest length of its
+        longest axis, with coefficients relative to their values.
     noise : mapping, optional
-        Noise standard deviation of each output; default that of the fit.
+        Noise standard deviation of each output; by default that of the fit.
     period : float, optional
-        Period of the reference square wave [s]; default a fifth of the duration, as in the paper.
+        Period [s] of the square wave with which the design is compared; by default a fifth of the duration, as in the
+        paper.
     seed : int
         Seed of the random initial inputs.
     progress : callable, optional
-        Called with the number of steps done and their total.
+        Callback with (steps done, total steps).
 
     Returns
     -------
     DesignedInput
-        Commands, predicted intervals, those of the model and of the reference square wave, active constraints.
-        ``.save`` writes the commands for a rig.
+        Commands, confidence intervals predicted for them, those of the model and of the square wave, and active
+        constraints. ``.save`` writes the commands for a rig.
 
     Raises
     ------
     ModelError
-        A model that is not stable, or integrates without a limit of that output; one with friction, saturations or dead
-        zones; intervals too wide to design on; an argument that cannot be used, or a limit that cannot be kept.
+        If the model is unstable, has an integrator without a limit of its output, or has friction, saturations or dead
+        zones; if it is too uncertain; or if an argument is invalid or a limit cannot be met.
     """
     if progress is not None and not callable(progress):
         raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
@@ -267,7 +271,10 @@ def design_input(
 def _design_candidates(
     task: DesignTask, sensitivities: Sensitivities, spectrum: Spectrum, course: ShareTracker
 ) -> list[Design]:
-    """Return all candidate inputs, best first: initial signals, and the exchange results of the best of them."""
+    """Return all candidate inputs, best first.
+
+    They are the initial inputs, and the results of the exchange algorithm from the best of them.
+    """
     fit, bounds, goal, rows = task.fit, task.bounds, task.criterion, task.rows - 1
     ended = stop_flag()
 
@@ -323,7 +330,7 @@ def _check_arguments(
     period: float | None,
     seed: int,
 ) -> DesignTask:
-    """Check every argument and the model."""
+    """Return the validated task of an input design; raise ModelError for invalid arguments or an unsuitable model."""
     solved = model.model if isinstance(model, Identification) else model
     check_model(solved)
     check_linear(solved.equations, "a design of the next experiment")
@@ -407,7 +414,7 @@ def _check_arguments(
 
 
 def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
-    """Raise if a model has no usable input, or a run lacks its inputs."""
+    """Raise ModelError if a model has no usable input, or the reference run lacks its inputs."""
     if not fit.inputs:
         raise ModelError("the model has no input, so there is nothing to design; give one with an input")
     if fit.problem.structure.all_filtered:
@@ -435,7 +442,7 @@ def _positive(name: str, value: object, what: str) -> float:
 
 
 def _largest_values(run: Run, names: Sequence[str], *, from_start: bool) -> dict[str, float]:
-    """Return the largest absolute values of signals of a run; missing and constant signals are omitted.
+    """Return the largest absolute values of signals of a run by name; missing and constant signals are omitted.
 
     With ``from_start`` they are measured from the first value of each signal.
     """
@@ -453,7 +460,7 @@ def _largest_values(run: Run, names: Sequence[str], *, from_start: bool) -> dict
 
 
 def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the indices of the parameters of interest."""
+    """Return the indices of the parameters of interest; raise ModelError for an unknown name."""
     if isinstance(names, str):
         names = [names]
     if names is None:
@@ -476,7 +483,7 @@ def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int,
 
 
 def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
-    """Raise if a model is unstable, or integrates without a limit of its output."""
+    """Raise ModelError if a model is unstable, or has an integrator without a limit of its output."""
     poles = stability(fit.model)
     if poles.unstable_poles != 0 or poles.on_axis:
         raise ModelError(
@@ -493,7 +500,7 @@ def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
 
 
 def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
-    """Raise if the model is too uncertain: an input optimal for it may be poor for the machine."""
+    """Raise ModelError if the model is so uncertain that an input optimal for it may be poor for the machine."""
     spread = fit.covariance
     errors = np.sqrt(np.diag(spread))
     vague = [
@@ -519,7 +526,7 @@ def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
 
 
 def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | None) -> None:
-    """Raise with a recommended first experiment."""
+    """Raise ModelError for an uncertain model, with a recommended first experiment."""
     low, high = (0.1, 10.0) if times is None else (1.0 / times[1], 0.1 / times[0])
     try:
         own = [abs(m.pole) / (2 * math.pi) for m in modes(fit.model)]
@@ -537,7 +544,7 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
 
 
 def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floats) -> float:
-    """Factor that keeps outputs within their limits over the confidence intervals of the model."""
+    """Return the factor that keeps outputs within their limits over the confidence intervals of the model."""
     outputs, slopes = sensitivities.outputs(commands), sensitivities.derivatives(commands)
     spread = np.einsum("pot,pq,qot->ot", slopes, task.fit.covariance, slopes)
     noise = np.array([task.fit.noise[o] for o in task.fit.outputs])[:, None]
@@ -546,7 +553,7 @@ def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floa
 
 
 def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
-    """Return standard errors of the model, and those predicted for fits to the reference and to the designed run."""
+    """Return standard errors of the model, and those predicted for fits to the square wave and to the designed run."""
     now, new = fit.covariance, fit.predicted_covariance(run)
     size = np.sqrt(np.diag(now))
     covariance = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
@@ -569,7 +576,7 @@ def _predicted_extremes(run: Run, bounds: Bounds) -> tuple[PredictedExtreme, ...
 
 
 def _shape_text(best: Design, run: Run, task: DesignTask) -> str:
-    """Describe the designed input."""
+    """Return text on the shape of the designed input."""
     if not best.name.endswith("exchanged"):
         return best.name
     first = next(iter(task.fit.inputs))

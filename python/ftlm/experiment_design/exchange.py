@@ -1,4 +1,7 @@
-"""Exchange algorithm for piecewise-constant inputs: the best switching sequence, one or two holds at a time."""
+"""Exchange algorithm for piecewise-constant inputs, which changes one or two holds at a time.
+
+A hold is an interval of constant input.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +32,11 @@ class Design:
     Parameters
     ----------
     name
-        Origin of the commands.
+        Origin of the commands, such as "sweep".
     commands
-        Shape (inputs, rows), within all limits.
+        Commands of shape (inputs, rows), within all limits.
     score
-        Value of the criterion.
+        Value of the criterion; higher is better.
     exchanges
         Number of exchanges made.
     """
@@ -61,11 +64,13 @@ def exchange_holds(
     bounds: Bounds,
     stopped: Callable[[], None] = lambda: None,
 ) -> Design:
-    """Exchange holds of an input, one or two at a time (Fedorov, Theory of Optimal Experiments, 1972).
+    """Improve a piecewise-constant input by exchanges of holds, one or two at a time, and return the design.
 
-    The information is quadratic in the commands, so its change by every exchange follows exactly from convolutions. The
-    best feasible exchange is made until none improves the score. The result is a local optimum: no change of one hold
-    is better, nor an opposite change of two holds near each other. Another switching sequence may be better.
+    Source: Fedorov, Theory of Optimal Experiments, 1972. `hold` is the length of a hold in samples.
+
+    The Fisher information is quadratic in the commands, so convolutions give its change by every exchange exactly. The
+    best feasible exchange is made until none improves the score. The result is a local optimum with respect to changes
+    of one hold, and to opposite changes of two neighboring holds.
     """
     inputs, rows = begin.commands.shape
     starts = np.arange(0, rows, hold)
@@ -126,12 +131,15 @@ def exchange_holds(
 
 
 def _log_limit_excess(outputs: Floats, limits: Floats) -> float:
-    """Logarithm of the largest ratio of outputs to their limits; 0 if all limits hold."""
+    """Return the logarithm of the largest ratio of outputs to their limits; 0 if all limits are met."""
     return math.log(max(1.0, float(np.max(np.abs(outputs) / limits))))
 
 
 def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
-    """Mask of the holds that may change by a step, with the hold one gap later changed by the opposite amount."""
+    """Return a mask of the holds that can change by a step.
+
+    The hold `gap` later changes by the opposite amount.
+    """
     is_feasible: NDArray[np.bool_] = np.abs(level + step) < COMMAND_LEVELS[-1] + 0.5
     if gap:
         is_feasible[:-gap] &= np.abs(level[gap:] - step) < COMMAND_LEVELS[-1] + 0.5
@@ -141,20 +149,20 @@ def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Hold:
-    """Response to one hold of an input at its peak level.
+    """Response of the model to one hold of an input at its peak level, with quantities derived from it.
 
     Parameters
     ----------
     starts
-        Samples at which holds start.
+        Sample indices at which holds start.
     block, response
-        Derivatives, shape (parameters, outputs, rows), and outputs from the start of a hold.
+        Derivatives by parameters, shape (parameters, outputs, rows), and outputs, both from the start of a hold.
     spectrum
         Fourier transform of the derivatives.
     offsets
-        Projection of a hold onto the offsets of the run, by its start.
+        Projection of the response of a hold onto responses to offsets, by the start of the hold.
     own
-        Information of one hold by its start, and of one minus another that starts a gap later, by gap.
+        Information of one hold by its start, and by gap that of one hold minus another that starts one gap later.
     """
 
     starts: NDArray[np.int64]
@@ -166,7 +174,7 @@ class Hold:
 
     @classmethod
     def of(cls, sensitivities: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
-        """Compute the response of one input."""
+        """Return the hold of the input with index `place`, of `hold` samples, from the sensitivities."""
         block, response = (
             _hold_response(sensitivities.kernels[place], hold) * peak,
             _hold_response(sensitivities.responses[place], hold) * peak,
@@ -192,7 +200,7 @@ class Hold:
     def information_changes(
         self, sensitivities: Sensitivities, derivatives: Floats
     ) -> Iterator[tuple[int, Floats, Floats]]:
-        """Yield for each gap the first- and second-order change of the information by an exchange, by its start."""
+        """Yield, for each gap, the first- and second-order changes of the information by an exchange, by its start."""
         shared = _correlate_at_starts(sensitivities, derivatives, self.spectrum, self.starts)
         if len(sensitivities.nuisance):
             flat = derivatives.reshape(len(derivatives), -1) @ sensitivities.nuisance.T
@@ -206,7 +214,7 @@ class Hold:
             yield gap, pair, own
 
     def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, of_response: bool) -> Floats:
-        """Return derivatives, or outputs, after an exchange."""
+        """Return derivatives (or outputs with `of_response`) after an exchange."""
         block, out = self.response if of_response else self.block, series.copy()
         for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
             out[..., begins:] += size * block[..., : block.shape[-1] - begins]
@@ -214,20 +222,20 @@ class Hold:
 
 
 def _nearest_level(values: Floats) -> Floats:
-    """Return the nearest level of each value; a midpoint goes to the outer level."""
+    """Return values rounded to the nearest level; midpoints are rounded away from zero."""
     levels = np.array(COMMAND_LEVELS)
     return np.asarray(levels[np.argmin(np.abs(values[..., None] * (1 + 1e-9) - levels), axis=-1)])
 
 
 def _hold_response(kernel: Floats, hold: int) -> Floats:
-    """Response to a hold from the response to one sample."""
+    """Return the response to a hold, computed from the response to one sample."""
     total = np.cumsum(kernel, axis=-1)
     total[..., hold:] -= total[..., :-hold].copy()
     return total
 
 
 def _inner_products(sensitivities: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
-    """Inner products of two responses from their common start to the end of the run, by that start."""
+    """Return, for each start, the inner product of two responses that both begin there and end with the run."""
     products = np.zeros((len(starts), len(one), len(other)))
     for p, row in enumerate(one):
         total = np.cumsum(np.einsum("ot,qot->qt", row, other), axis=-1)
@@ -238,7 +246,7 @@ def _inner_products(sensitivities: Sensitivities, one: Floats, other: Floats, st
 def _correlate_at_starts(
     sensitivities: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]
 ) -> Floats:
-    """Inner products of series with holds that start at given samples, shape (starts, parameters, series)."""
+    """Return inner products of series with holds that start at given samples, shape (starts, parameters, series)."""
     out = np.zeros((len(starts), spectrum.shape[0], len(series)))
     for place, one in enumerate(np.fft.rfft(series, sensitivities.length)):
         product = np.einsum("of,pof->pf", one, np.conj(spectrum))

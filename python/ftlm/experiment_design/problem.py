@@ -1,4 +1,4 @@
-"""Problem of input design: bounds, criterion, sensitivities of the outputs to the parameters."""
+"""Problem of an input design: limits, criterion, and sensitivities of the outputs to the parameters."""
 
 from __future__ import annotations
 
@@ -32,16 +32,18 @@ MIN_SCALED_DETERMINANT = 1e-28
 
 @dataclass(frozen=True)
 class Criterion:
-    """Log precision of the parameters of interest, in their units; twice the input adds ln 2.
+    """Optimality criterion: logarithm of the precision of the parameters of interest.
+
+    Twice the input amplitude adds ln 2.
 
     Parameters
     ----------
     kind
-        ``"D"``: geometric mean of the axes of the confidence ellipsoid. ``"E"``: its widest axis.
+        ``"D"``: geometric mean of the axes of the confidence ellipsoid. ``"E"``: its longest axis.
     indices
         Indices of the parameters of interest.
     units
-        Unit of each of them.
+        Scale of each parameter of interest.
     """
 
     kind: Kind
@@ -54,7 +56,7 @@ class Criterion:
         return len(self.indices)
 
     def score(self, information: Floats) -> Floats:
-        """Score of information matrices, shape (…, p, p); -inf if the parameters are not identifiable."""
+        """Return the score of information matrices of shape (…, p, p); -inf if the parameters are not identifiable."""
         spread = self._inverse(information)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == "D":
@@ -66,7 +68,7 @@ class Criterion:
         return np.where(np.isfinite(spread[..., 0, 0]), scores, -np.inf)
 
     def smooth_score(self, information: Floats) -> float:
-        """Differentiable score: for E, Kiefer's mean in place of the widest axis; never below :meth:`score`."""
+        """Return a differentiable upper bound of the score: for E, Kiefer's mean replaces the longest axis."""
         if self.kind == "D":
             return float(self.score(information))
         axes = np.linalg.eigvalsh(self._inverse(information))
@@ -78,7 +80,7 @@ class Criterion:
         )
 
     def gradient(self, information: Floats) -> Floats:
-        """Gradient of twice :meth:`smooth_score`, shape (p, p); its inner product with the information is 1."""
+        """Return the gradient of twice the smooth score, shape (p, p); its inner product with the information is 1."""
         p = len(information)
         size = np.sqrt(np.diag(information))
         whole = np.linalg.inv(information / np.outer(size, size)) / np.outer(size, size)
@@ -93,7 +95,7 @@ class Criterion:
         return np.asarray((lever * weights) @ lever.T).reshape(p, p)
 
     def _inverse(self, information: Floats) -> Floats:
-        """Covariance of the parameters of interest in their units; infinite if the information is singular."""
+        """Return the covariance of the scaled parameters of interest; infinite if the information is singular."""
         diagonal = np.diagonal(information, axis1=-2, axis2=-1)
         is_positive = np.all(diagonal > 0, axis=-1)
         size = np.sqrt(np.where(is_positive[..., None], diagonal, 1.0))
@@ -114,7 +116,7 @@ LIMIT_RANGE = (1e-50, 1e50)
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits of a run, in the units of its signals.
+    """Limits of inputs, rates and outputs of a run, in the units of its signals.
 
     Parameters
     ----------
@@ -131,7 +133,7 @@ class Bounds:
     output_limits: Mapping[str, float]
 
     def ramp_samples(self, step: float) -> int:
-        """Number of samples that a change from one peak to the other takes under the slew rates."""
+        """Return the number of samples that a change from one peak to the opposite one takes at the maximum rates."""
         return max(1, *(math.ceil(min(2 * p / self.slews[n] / step, 1e18) - 1e-9) for n, p in self.peaks.items()))
 
     def scale(self, commands: Floats, outputs: Floats) -> float:
@@ -160,7 +162,7 @@ def per_signal_values(
     Raises
     ------
     ModelError
-        An unknown name, a value that is not positive, or a missing value without a default.
+        If a name is unknown, a value is not positive, or a value without a default is missing.
     """
     if isinstance(values, Mapping):
         for name in values:
@@ -203,18 +205,18 @@ SIMULATION_TOLERANCE = 1e-7
 
 @dataclass(frozen=True)
 class ModelFit:
-    """Fit of a model as input design needs it: free parameters, their values, and the noise of each output.
+    """Data of a fit that an input design requires: free parameters, their values, and the noise of each output.
 
     Parameters
     ----------
     model
-        Model, simulated from its inputs only.
+        Model with simulated coupling, whose outputs depend only on its inputs.
     problem, values
-        Estimation problem of a run at rest, and its free parameters.
+        Estimation problem of a run that starts at rest, and the values of its free parameters.
     noise
         Noise standard deviation of each output.
     refinement
-        Block pulses per sampling interval.
+        Number of block pulses per sampling interval.
     """
 
     model: Model
@@ -225,7 +227,7 @@ class ModelFit:
 
     @classmethod
     def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
-        """Build from a model that records which of its parameters were free."""
+        """Return the data from a model whose file lists its free parameters."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
         return cls(whole, problem, tuple(values), noise, parameter_set_of(model).refinement)
@@ -247,13 +249,13 @@ class ModelFit:
 
     @property
     def covariance(self) -> Floats:
-        """Covariance of the free parameters, as estimated from the runs of the model."""
+        """Covariance matrix of the free parameters, as estimated."""
         parameters = parameter_set_of(self.model)
         at = [parameters.names.index(n) for n in self.names]
         return np.asarray(parameters.covariance)[np.ix_(at, at)]
 
     def run(self, commands: Floats, step: float, name: str) -> Run:
-        """Simulate the model for commands of shape (inputs, rows)."""
+        """Return the run that the model simulates for commands of shape (inputs, rows)."""
         blank = Run.from_arrays(
             step=step,
             inputs=dict(zip(self.inputs, commands, strict=True)),
@@ -267,8 +269,8 @@ class ModelFit:
     def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
         """Return output sensitivities of a simulated run over the noise, shape (parameters, outputs * samples).
 
-        They are those of the fit, computed by the core on its grid. The first and the last sample are not compared.
-        Offsets of each run, if the model has any, are projected out unless ``offset`` is False.
+        The core computes them in the same way as for a fit, without the first and the last sample. Responses to
+        offsets, if the model has any, are projected out unless ``offset`` is False.
         """
         problem = self.problem
         if not offset:
@@ -276,12 +278,12 @@ class ModelFit:
         return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.refinement)
 
     def predicted_covariance(self, run: Run) -> Floats:
-        """Return the covariance predicted for a fit of a simulated run alone, from exact derivatives."""
+        """Return the covariance that is predicted for a fit to a simulated run alone, from exact derivatives."""
         return _covariance_of(self.jacobian(run))
 
 
 def _covariance_of(rows: Floats) -> Floats:
-    """Inverse of the information of scaled derivatives; infinite variances if a parameter is not identifiable."""
+    """Return the inverse of the Fisher information from scaled derivatives; infinite variances if not identifiable."""
     size = np.linalg.norm(rows, axis=1)
     scaled = rows / np.where(size > 0, size, 1.0)[:, None]
     _, sizes, right = thin_svd(scaled.T)
@@ -301,10 +303,11 @@ def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weig
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """Responses to one zero-order-hold sample of each input; those to any input follow by convolution.
+    """Sensitivities of the outputs to parameters for one zero-order-hold sample of each input.
 
-    All equations are linear in their inputs and start at rest, so this is exact: it agrees with the derivatives of the
-    fit to rounding error.
+    Convolution gives those for any input.
+
+    This is exact, because all equations are linear in their inputs and start at rest.
 
     Parameters
     ----------
@@ -313,13 +316,13 @@ class Sensitivities:
     step, rows
         Sampling interval of the run [s], and its number of compared samples: all but the last.
     ramp
-        Samples over which a command changes: every input is a moving average over that many samples.
+        Number of samples over which a change of a command is spread: every input is a moving average over them.
     kernels
-        Derivatives over the noise, shape (inputs, parameters, outputs, rows).
+        Derivatives divided by the noise standard deviation, shape (inputs, parameters, outputs, rows).
     responses
-        Outputs, shape (inputs, outputs, rows).
+        Outputs for one sample of each input, shape (inputs, outputs, rows).
     nuisance
-        Orthonormal basis of the responses to offsets of the run, shape (basis vectors, outputs · rows).
+        Orthonormal basis of the responses to offsets, shape (basis vectors, outputs · rows).
     """
 
     fit: ModelFit
@@ -332,7 +335,7 @@ class Sensitivities:
 
     @classmethod
     def of(cls, fit: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
-        """Simulate the response to one sample of each input."""
+        """Return the sensitivities, from simulations of the response to one sample of each input."""
         kernels, answers, inputs = [], [], len(fit.inputs)
         for k in range(inputs):
             # The first sample of a run is not compared, so the pulse comes with the second.
@@ -347,7 +350,7 @@ class Sensitivities:
 
     @cached_property
     def length(self) -> int:
-        """Length of the Fourier transform that avoids circular convolution."""
+        """Length of the Fourier transforms, which avoids circular convolution."""
         return fast_length(2 * self.rows)
 
     @cached_property
@@ -356,7 +359,7 @@ class Sensitivities:
         return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.responses, self.length)
 
     def derivatives(self, commands: Floats) -> Floats:
-        """Return derivatives of the outputs over the noise standard deviation, shape (parameters, outputs, rows).
+        """Return derivatives of the outputs divided by the noise, shape (parameters, outputs, rows).
 
         ``commands`` has shape (inputs, rows).
         """
@@ -365,12 +368,12 @@ class Sensitivities:
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
 
     def outputs(self, commands: Floats) -> Floats:
-        """Outputs of the model, shape (outputs, rows), for commands of shape (inputs, rows)."""
+        """Return the outputs of the model, shape (outputs, rows), for commands of shape (inputs, rows)."""
         total = np.einsum("iof,if->of", self.spectra[1], np.fft.rfft(commands, self.length))
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
 
     def information(self, derivatives: Floats) -> Floats:
-        """Fisher information of the free parameters, with offsets of the run projected out."""
+        """Return the Fisher information of the free parameters; responses to offsets are projected out."""
         flat = derivatives.reshape(len(derivatives), -1)
         information = flat @ flat.T
         if len(self.nuisance):
@@ -379,7 +382,7 @@ class Sensitivities:
         return np.asarray(information)
 
     def rig_commands(self, commands: Floats) -> Floats:
-        """Commands for a rig, shape (inputs, rows + 1): changes as ramps, and a last row of zeros."""
+        """Return commands for a rig, shape (inputs, rows + 1), with changes as ramps and a last row of zeros."""
         total = np.cumsum(commands, axis=1)
         delayed = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
         smooth = commands if self.ramp == 1 else (total - delayed) / self.ramp
@@ -387,7 +390,7 @@ class Sensitivities:
 
 
 def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
-    """Responses, over the noise, to unknown constants (and ramps) in the equations of one run."""
+    """Return the responses, divided by the noise, to unknown constants (and ramps) in the equations."""
     structure = fit.problem.structure
     drives = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
@@ -421,5 +424,5 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
 
 
 def fast_length(least: int) -> int:
-    """Smallest 2^a, 3·2^a, 5·2^a or 15·2^a that is at least ``least``: a fast length of a Fourier transform."""
+    """Return the smallest 2^a, 3·2^a, 5·2^a or 15·2^a that is at least ``least``, a fast length of an FFT."""
     return min(f << max((least - 1) // f, 0).bit_length() for f in (1, 3, 5, 15))

@@ -27,7 +27,7 @@ MAX_PRINTED_INPUTS = 6
 
 @dataclass(frozen=True)
 class PredictedExtreme:
-    """Extreme value predicted for a signal of the designed run, and its limit; slew rates are per second."""
+    """Extreme value predicted for a signal or its rate of change in the designed run, and its limit."""
 
     name: str
     largest: float
@@ -35,7 +35,7 @@ class PredictedExtreme:
 
     @property
     def is_active(self) -> bool:
-        """Whether the constraint is active."""
+        """Whether the extreme value reaches its limit, so that the constraint is active."""
         return self.largest >= ACTIVE_LIMIT_FRACTION * self.limit
 
     def __str__(self) -> str:
@@ -45,39 +45,41 @@ class PredictedExtreme:
 
 @dataclass(frozen=True)
 class DesignedInput:
-    """Input with the smallest predicted confidence intervals within the limits of a machine.
+    """Result of an input design: the designed run, predicted confidence intervals, and active constraints.
 
     Parameters
     ----------
     run
         Designed run from rest: commands (zero-order hold) and the simulated response of the model.
     reference
-        Run of the reference square wave of the same length and peaks.
+        Run with a square wave of the same length and peaks, for comparison.
     shape
-        Description of the input.
+        Description of the shape of the input.
     criterion
         ``"D"`` or ``"E"``.
     parameters
-        Parameters of interest.
+        Names of the parameters of interest.
     values
-        Free parameters of the model.
+        Values of the free parameters of the model by name.
     errors
-        Standard errors by name: ``"now"`` those of the model; ``"square"`` and ``"designed"`` predicted for a fit of
-        either run alone; ``"both"`` for one of the designed run together with those that the model came from.
+        Standard errors of the free parameters by case. ``"now"``: those of the model. ``"square"`` and ``"designed"``:
+        predicted for a fit to the square wave or to the designed run alone. ``"both"``: predicted for a fit to the
+        designed run together with the estimation runs.
     gain
-        Ratio of the products of the intervals of these parameters, reference square wave over designed input.
+        Product of the interval widths of the parameters of interest for the square wave, divided by that for the
+        designed input.
     gains
-        The same ratio of every candidate input, best first, in the measure of the criterion: for D the volume of the
-        confidence ellipsoid, for E its widest axis to the power of the number of parameters.
+        Similar ratio for every candidate input, best first, in the measure of the criterion: for D the volume of the
+        confidence ellipsoid, for E its longest axis to the power of the number of parameters.
     predicted_extremes
         Extremes of inputs, slew rates and outputs, with their limits.
     spectrum
-        The best periodic input in steady state under the same limits.
+        Optimal spectrum of a periodic input in steady state under the same limits.
     efficiency
-        Precision of the designed input over the largest one of a periodic input in steady state under the limits.
-        The start from rest adds information, so the ratio may exceed 1.
+        Precision of the designed input, divided by the maximum precision of a periodic input in steady state under the
+        limits. The start from rest adds information, so the ratio may exceed 1.
     findings
-        Reasons why predictions may be wrong.
+        Findings on reasons why predictions may be wrong.
     """
 
     run: Run
@@ -96,32 +98,32 @@ class DesignedInput:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
+        """Findings as sentences."""
         return texts(self.findings)
 
     @property
     def input(self) -> dict[str, Floats]:
-        """Commands by input, as long as the run."""
+        """Commands by input name, one array over the rows of the run each."""
         return {n: np.array(self.run[n]) for n in self.run.inputs}
 
     @property
     def step(self) -> float:
-        """Step of the commands [s]."""
+        """Sampling interval of the commands [s]."""
         return self.run.step
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals predicted for a fit of the designed run alone, around the values of the model."""
+        """95 % intervals (low, high) predicted for a fit to the designed run alone, centered at the model's values."""
         errors = self.errors["designed"]
         return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in self.values.items()}
 
     @property
     def active_constraints(self) -> tuple[str, ...]:
-        """Names of the active constraints."""
+        """Names of the signals and rates that reach their limits."""
         return tuple(r.name for r in self.predicted_extremes if r.is_active)
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write the designed run as csv, the format of ``ftlm record --input csv --file PATH``.
+        """Write the designed run to a csv file, which ``ftlm record --input csv --file PATH`` reads.
 
         Parameters
         ----------
@@ -133,12 +135,12 @@ class DesignedInput:
         Raises
         ------
         DataError
-            The file exists and ``force`` is not set, or it cannot be written.
+            If the file exists and ``force`` is False, or it cannot be written.
         """
         self.run.to_csv(path, force=force)
 
     def to_frame(self) -> Any:
-        """Return parameters as a pandas frame: value, and standard errors now and predicted."""
+        """Return a pandas DataFrame of the parameters: value, current standard error, and predicted standard errors."""
         rows = [
             {"parameter": n, "value": v, **{kind: errors[n] for kind, errors in self.errors.items()}}
             for n, v in self.values.items()
@@ -146,7 +148,7 @@ class DesignedInput:
         return to_frame(rows, ["parameter"])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-compatible dict without the run."""
+        """Return the result as a dictionary for JSON, without the run."""
         spectrum = self.spectrum
         return {
             **attributes(self, ("shape", "criterion", "parameters")),

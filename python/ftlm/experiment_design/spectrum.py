@@ -1,4 +1,4 @@
-"""Optimal spectrum of a periodic input: a convex problem whose optimum the equivalence theorem certifies."""
+"""Optimal spectrum of a periodic input, a convex problem whose solution the equivalence theorem certifies."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ OPTIMALITY_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class SpectralLines:
-    """Information and use of each limit, per unit of power at each line of each input.
+    """Fisher information, and use of each limit, per unit of power at each spectral line of each input.
 
     Parameters
     ----------
     frequencies
         Frequencies of the lines [Hz].
     information
-        Shape (points, parameters, parameters): points are lines of the first input, then of the next, each at the mean
-        square of its peak.
+        Fisher information, shape (points, parameters, parameters). Points are the lines of the first input, then of the
+        next input, each with a mean square equal to the squared peak.
     costs
-        Shape (limits, points): share of each limit's square that a point uses up, inputs first.
+        Fraction of each squared limit that a point uses, shape (limits, points); limits of inputs come first.
     """
 
     frequencies: Floats
@@ -50,14 +50,14 @@ class SpectralLines:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Optimal distribution of power over lines.
+    """Optimal distribution of power over the spectral lines of the inputs.
 
     Parameters
     ----------
     lines
-        Lines of all inputs.
+        Spectral lines of all inputs.
     power
-        Mean square of each point, in units of its input's peak squared; within all limits.
+        Mean square of each point, relative to the squared peak of its input; within all limits.
     score
         Value of the criterion.
     bound
@@ -71,12 +71,12 @@ class Spectrum:
 
     @property
     def gap(self) -> float:
-        """Upper bound of the relative gain in precision of any better spectrum."""
+        """Upper bound of the relative gain in precision that any other spectrum can have."""
         return math.expm1(self.bound - self.score)
 
 
 def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> SpectralLines:
-    """Lines of a run that is one period, distributed among inputs so that no two share a line."""
+    """Return the spectral lines of a run of one period, distributed among inputs so that no two share a line."""
     inputs = fit.inputs
     most = max(int(MAX_FREQUENCY_RATIO * rows), len(inputs) + 1)
     numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES * 4)).astype(np.int64))
@@ -104,7 +104,10 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
 
 
 def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Complex, Complex]:
-    """Derivatives (outputs, inputs, W, parameters) of frequency responses to zero-order-hold inputs, and these."""
+    """Return the frequency responses to zero-order-hold inputs, and their derivatives by parameters.
+
+    The derivatives come first and have shape (outputs, inputs, W, parameters).
+    """
     hold_response = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
     gains = frequency_response(fit.model, w)
     coupling = fit.problem.structure.coupling
@@ -139,7 +142,7 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
 def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
     """Return the frequency responses of the outputs to the inputs, shape (outputs, inputs, frequencies).
 
-    With measured coupling the equations read other signals, whose responses to the inputs are ``drives``.
+    With measured coupling, other `signals` enter the equations; ``drives`` are their responses to the inputs.
     """
     if coupling == "simulated":
         return frequency_response(model, w)
@@ -151,12 +154,12 @@ def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, s
 
 
 def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
-    """Optimal power of each line under all limits.
+    """Return the spectrum with the optimal power of each line under all limits.
 
-    With a price for each limit the problem is one of weights that sum to one, solved by Titterington's multiplicative
-    algorithm (Silvey, Titterington & Torsney, 1978). For any prices its optimum is an upper bound of the original
-    problem, and the equivalence theorem of Kiefer & Wolfowitz bounds the distance of a design from it. Prices follow
-    the use of the limits.
+    With a dual variable (price) for each limit, the problem becomes one of weights that sum to one, which
+    Titterington's multiplicative algorithm solves (Silvey, Titterington & Torsney, 1978). For any prices, its optimum
+    is an upper bound of the original problem. The equivalence theorem of Kiefer & Wolfowitz bounds the distance of a
+    design from this optimum. Prices are adapted to the use of the limits.
     """
     limits, points = lines.costs.shape
     price = np.full(limits, 1.0 / limits)
@@ -193,7 +196,10 @@ def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
 
 
 def _gain_per_point(weights: Floats, information: Floats, criterion: Criterion) -> Floats | None:
-    """Derivative of the criterion with respect to the power of each point, 1 on average; None if not identifiable."""
+    """Return the derivative of the criterion with respect to the power of each point; None if not identifiable.
+
+    Its weighted mean is 1.
+    """
     total = np.tensordot(weights, information, 1)
     if not np.isfinite(criterion.score(total)):
         return None

@@ -212,7 +212,7 @@ class Timestamps:
 
     @classmethod
     def read(cls, cells: Sequence[str]) -> Timestamps | None:
-        """Parse all cells; None if one is not a timestamp or differs in notation from the first."""
+        """Return the timestamps of all cells; None if a cell is none, or has another notation than the first cell."""
         spans = [_DURATION_PATTERN.fullmatch(cell) for cell in cells]
         if all(span is not None for span in spans) and cells:
             clock = np.array([_duration_ns(*span.groups("")) for span in spans if span is not None], np.int64)

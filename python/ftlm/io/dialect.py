@@ -223,7 +223,7 @@ _ROW_INDEX_UNIT = "sequence"
 
 @dataclass(frozen=True)
 class TableDialect:
-    """Detected layout and position of a table in a text.
+    """Layout and position of a table in a text, as detected.
 
     Parameters
     ----------
@@ -393,7 +393,10 @@ def _dialect_candidates(text: str, layout: Layout) -> Iterator[tuple[str | None,
 def _choose_separator(
     table_rows: Sequence[tuple[int, str]], layout: Layout, source: str
 ) -> tuple[str | None, bool, str | None, list[_Line]]:
-    """Choose separator and decimal mark such that most lines are rows of equal width."""
+    """Return separator, whether the decimal mark is a comma, thousands separator, and the split lines.
+
+    They are chosen such that most lines are rows of equal width.
+    """
     text = "".join(line for _, line in table_rows)
     best: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
     for separator, comma in _dialect_candidates(text, layout):
@@ -460,7 +463,7 @@ def _first_row(cut: list[_Line], width: int) -> int:
 
 
 def _is_above_units(cut: list[_Line], first: int) -> bool:
-    """Whether the line above is a header with numbers, such as channels 1 and 2, because a line of units follows."""
+    """Whether the line above `first` is a header although it has numbers, because a line of units follows it."""
     return first < len(cut) and _is_unit_line(cut[first])
 
 

@@ -242,7 +242,10 @@ class Pool:
         return clocks[0], assumed
 
     def _clocks(self, table: FileTable, signals: Collection[str]) -> tuple[list[Column], str]:
-        """Candidate time columns of a file by the most reliable criterion, and the reason if it is an assumption."""
+        """Return candidates for the time column of a file, and the reason if the choice is an assumption.
+
+        The most reliable criterion that finds any candidate is used.
+        """
         others = [c for c in self._columns.values() if c.source == table.path and c.name not in signals]
         own = [c for c in others if c.matrix is None]
         groups = {name.rpartition("/")[0] for name in signals}

@@ -430,8 +430,9 @@ def resume_search(
     Parameters
     ----------
     path
-        Checkpoint file that :func:`search_orders` wrote with ``store=``. threads, progress, executor As for
-        :func:`search_orders`.
+        Checkpoint file that :func:`search_orders` wrote with ``store=``.
+    threads, progress, executor
+        As for :func:`search_orders`.
     recover
         Whether to continue a damaged file. The part before the damage is kept, the rest is computed again, and the
         damaged file is renamed to ``….damaged``.

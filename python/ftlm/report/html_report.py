@@ -1,4 +1,4 @@
-"""Top of a report page: verdict, grouped warnings, equations, poles, modes and steady-state gain."""
+"""HTML report of an identification or a saved model: its sections, tables and charts."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"
 
 
 def verdict_box(judgement: Verdict, of: str = "") -> Markup:
-    """Return a verdict as the first box of a page; `of` names the model if there are several."""
+    """Return HTML of a verdict for the top of a page; `of` names the model if there are several."""
     remedy = Markup(' <span class="todo">→ {}</span>').format(judgement.remedy) if judgement.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
         _LEVEL_CSS_CLASSES[judgement.level],
@@ -83,7 +83,7 @@ def verdict_box(judgement: Verdict, of: str = "") -> Markup:
 
 
 def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
-    """Split findings into the most serious groups, with remedies, and the sentences of the others."""
+    """Return (sentences of the most serious groups of findings with remedies, sentences of the other findings)."""
     first: list[str] = []
     rest: list[str] = []
     for k, group in enumerate(group_findings(findings)):
@@ -97,12 +97,12 @@ def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
 
 
 def _on_validation(findings: Iterable[Finding], run: Run) -> list[Finding]:
-    """Return findings on a run as those of a run that the model was not identified from."""
+    """Return findings on a run, marked as findings on a validation run."""
     return [msgspec.structs.replace(f, run=f.run or run.name, role=VALIDATION_ROLE) for f in findings]
 
 
 def title_of(model: Model) -> str:
-    """Return the page title of a model."""
+    """Return the page title for a model."""
     structure = model.structure
     if structure.name != "equation":
         return structure.name
@@ -212,7 +212,7 @@ def identification_page(
     Parameters
     ----------
     result
-        From :func:`ftlm.identify`.
+        Result of :func:`ftlm.identify`.
     path, validation, force
         See :meth:`ftlm.Identification.report`.
     """
@@ -264,9 +264,10 @@ def first_sections(
     runs: Sequence[Run] = (),
     bands: Sequence[Mapping[str, Band]] = (),
 ) -> list[Section]:
-    """Return the first sections of a page: the fit on validation runs, equations, warnings; then collapsed details.
+    """Return the first sections of a page: fit on validation runs, equations, warnings, and collapsed details.
 
-    Without validation runs the fit is that on the estimation runs. `bands` are those of the validation runs.
+    Without validation runs, the fit on the estimation runs is shown. `bands` are confidence bands of the simulated
+    outputs on the validation runs.
     """
     units = model.units
     words = [
@@ -321,7 +322,7 @@ def _with_inputs(
 ) -> list[Figure]:
     """Return charts of measured and simulated outputs of each run, followed by its inputs if available.
 
-    Takes the runs of the comparisons from the front of `runs`.
+    The runs of the comparisons are removed from the start of the list `runs`.
     """
     inputs = [s for s in model.structure.signals if s not in model.outputs]
     charts: list[Figure] = []
@@ -342,7 +343,7 @@ def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
 
 
 def correlation_sections(joint: JointFit | None) -> list[Section]:
-    """Return the correlation matrix of a joint fit; empty for one parameter or without covariance."""
+    """Return a section with the correlation matrix of a joint fit; [] for one parameter or without covariance."""
     if joint is None or len(joint.names) < 2:
         return []
     words = (
@@ -360,7 +361,7 @@ def residual_section(
     compared: Sequence[tuple[str, Comparison]] = (),
     units: Mapping[str, str] | None = None,
 ) -> Section:
-    """Return residual tests, information criteria, residual series, histograms and correlations."""
+    """Return a section with residual tests, information criteria, residual series, histograms and correlations."""
     tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
     if information is not None:
         tables.append(information_table(information))
@@ -372,7 +373,10 @@ def residual_section(
 
 
 def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Section:
-    """Return Bode charts over the frequency range of runs with these steps and durations."""
+    """Return a section with Bode charts over the frequency range of runs.
+
+    `steps` are the (sampling interval, duration) pairs of the runs [s].
+    """
     if model.structure.has_friction:
         words = "A body that may stick has none: its answer is not in proportion to what drives it."
         return Section("Frequency response", words)
@@ -392,7 +396,7 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
 
 
 def _search_sections(result: Identification) -> list[Section]:
-    """Return the convergence of the recursion and the order search with its score maps."""
+    """Return sections with the convergence of the multi-innovation recursion and the order search with score maps."""
     sections = []
     traces = _traces(result)
     if traces:
@@ -420,7 +424,7 @@ def _search_sections(result: Identification) -> list[Section]:
 
 
 def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
-    """Return score maps of the searches over two or more orders; a table suffices for one."""
+    """Return score maps of searches over two or more orders; for a single order the table is sufficient."""
     maps: list[Figure] = []
     for name, search in searches.items():
         part = task.structure if name == "stage" else task.structure.equation(name)
@@ -431,7 +435,7 @@ def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
 
 
 def _traces(result: Identification) -> list[LineChart]:
-    """Return the recursion at the orders found, for the paper's p and the one used.
+    """Return charts of the multi-innovation recursion at the best orders, for the paper's p and the p of the result.
 
     Empty if the first run does not start at rest.
     """
@@ -460,7 +464,7 @@ def _traces(result: Identification) -> list[LineChart]:
 
 
 def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
-    """Return the fit percentages of the simulations, one sentence for each data set."""
+    """Return text with the fit of the simulation in percent, one sentence for each data set."""
     sentences = []
     for label, comparison in compared:
         fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit.items())
@@ -470,7 +474,7 @@ def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
 
 
 def estimates_table(result: Identification | None, truth: Mapping[str, float] | None = None) -> Table:
-    """Return orders and coefficients of a joint fit with intervals, and true values if known."""
+    """Return a table of orders and coefficients of a joint fit with intervals, and true values if given."""
     rows: list[list[Cell]] = []
     if result is not None and result.joint is not None:
         for name, value in {**result.orders, **result.joint.coefficients}.items():
@@ -485,7 +489,7 @@ def estimates_table(result: Identification | None, truth: Mapping[str, float] | 
 
 
 def grouped_findings(results: Mapping[str, Identification | None]) -> list[str]:
-    """Return sentences on several results by label, merging findings that differ only in numbers."""
+    """Return sentences on findings of several results by label; findings that differ only in numbers are merged."""
     groups: dict[tuple[str, ...], tuple[Finding, list[str]]] = {}
     for label, result in results.items():
         for item in () if result is None else result.findings:
@@ -503,7 +507,7 @@ MAX_STARTS_SHOWN = 10
 
 
 def starts_table(joint: JointFit) -> Table:
-    """Return the initial guesses and their costs on decimated samples, best first."""
+    """Return a table of the initial guesses and their costs on subsampled records, best first."""
     best = joint.starts[:MAX_STARTS_SHOWN]
     cells: list[list[Cell]] = [[rank, origin, level] for rank, (level, origin) in enumerate(best, 1)]
     note = f"{joint.origin_text}. The best ones went on on all samples." if joint.starts else ""
@@ -511,7 +515,7 @@ def starts_table(joint: JointFit) -> Table:
 
 
 def settings_table(result: Identification) -> Table:
-    """Return a table of the settings of a result: estimator, criterion, M, p, K0, initial terms and runs."""
+    """Return a table of the options of a result: estimator, criterion, M, p, K0, initial terms and runs."""
     structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
         ["structure", structure.name],
@@ -570,12 +574,12 @@ def identification_html(result: Identification) -> str:
 def model_page(
     model: Model, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
-    """Write the HTML report of a saved model: identification results from its file, and validation runs.
+    """Write the HTML report of a saved model, with identification results from its file, and validation runs.
 
     Parameters
     ----------
     model
-        From :func:`ftlm.load_model`.
+        Model, as :func:`ftlm.load_model` returns it.
     path, validation, force
         See :meth:`ftlm.Identification.report`.
     """

@@ -1,4 +1,4 @@
-"""Text summary of a result and its settings."""
+"""Text summary of an identification: verdict, equations, parameters, modes, fit, findings and settings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def summary(result: Identification, validation: Comparison | None = None) -> str
 
 
 def equation_lines(model: Model, comparison: Comparison | None = None) -> list[str]:
-    """Return the equations with delays, limits and friction, and with offsets if there is one run."""
+    """Return the equations as text lines with delays, limits and friction, and with offsets if there is one run."""
     structure = model.structure
     lines = []
     for item in model.equations:
@@ -53,7 +53,7 @@ def equation_lines(model: Model, comparison: Comparison | None = None) -> list[s
 
 
 def _readable(item: Equation) -> Equation:
-    """Return the equation with orders rounded to four decimals."""
+    """Return the equation with its orders rounded to four decimals."""
     new = copy.copy(item)
     terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in item.terms)
     vars(new).update(order=Order(round(item.order.constant, ORDER_DECIMALS)), terms=terms)
@@ -61,9 +61,9 @@ def _readable(item: Equation) -> Equation:
 
 
 def _offset(output: str, comparison: Comparison | None) -> str | None:
-    """Return the offset of the only run as terms of an equation; None without one, or with several runs.
+    """Return the offset of the only run as text in an equation; None without an offset, or with several runs.
 
-    A level is added to the output, and is not a term of its equation.
+    A level is omitted, because it is added to the output and is not a term of the equation.
     """
     if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
         return None
@@ -92,7 +92,7 @@ def parameter_lines(result: Identification) -> list[str]:
 
 
 def behavior_lines(model: Model) -> list[str]:
-    """Return lines on steady-state gains and modes, if the model has them."""
+    """Return text lines on steady-state gains and modes; [] if the model has none."""
     if model.structure.has_friction:
         return ["  no poles and no gain: a model with friction is not linear"]
     if model.structure.has_nonlinear_terms:
@@ -114,14 +114,14 @@ def behavior_lines(model: Model) -> list[str]:
 
 
 def describe_mode(mode: Mode) -> str:
-    """Describe a mode and its pole."""
+    """Return text on a mode and its pole."""
     s = mode.pole
     where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.oscillatory else f"{s.real:.4g}"
     return f"{mode}; pole {where}"
 
 
 def describe_gain(state: SteadyState, model: Model) -> str:
-    """Describe a steady-state gain, or the growth of an output without steady state."""
+    """Return text on a steady-state gain, or on the growth of an output without steady state."""
     pair = f"{state.output} from {state.input}"
     above, below = (model.units.get(n, "") for n in (state.output, state.input))
     unit = f" {above}/{below}" if above and below else ""
@@ -135,7 +135,7 @@ def describe_gain(state: SteadyState, model: Model) -> str:
 
 
 def describe_order(state: SteadyState) -> str:
-    """Describe the uncertainty of the order with which an output grows, if it was estimated."""
+    """Return text on the uncertainty of the exponent with which an output grows; empty if it is fixed."""
     error = state.order_error
     if not error:
         return ""
@@ -148,7 +148,7 @@ def describe_order(state: SteadyState) -> str:
 
 
 def fit_lines(result: Identification, validation: Comparison | None) -> list[str]:
-    """Return lines on the simulation fit on estimation and validation data, and on the equation error."""
+    """Return text lines on the simulation fit to estimation and validation data, and on the equation error."""
     width = max(len(o) for o in result.output_error) + 2
     lines = [f"{'simulation fit, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
     for output, own in result.output_error.items():
@@ -169,7 +169,7 @@ def _residuals(result: Identification) -> list[str]:
 
 
 def _starts(result: Identification) -> list[str]:
-    """Return lines on offsets outside the equations, and on runs with nonzero initial conditions."""
+    """Return text lines on output levels, and on runs with nonzero initial conditions."""
     comparison = result.comparison
     visible = {o for o in result.output_error if _offset(o, comparison) is not None}
     has_hidden_offset = any(o not in visible or "level" in run[o] for run in comparison.offsets for o in run)
@@ -181,7 +181,7 @@ def _starts(result: Identification) -> list[str]:
 
 
 def finding_lines(findings: Iterable[Finding], how: str | None = None) -> list[str]:
-    """Return up to three groups of findings with remedies, most serious first."""
+    """Return text lines on up to three groups of findings with remedies, most serious first."""
     groups = group_findings(findings)
     lines = []
     for group in groups[:MAX_SUMMARY_FINDINGS]:
@@ -204,7 +204,7 @@ NORM_TEXTS = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}
 
 
 def settings_text(settings: Mapping[str, Any]) -> str:
-    """Return the settings on one line."""
+    """Return the options of a result as one line of text."""
     words = f"M = {settings['m']}"
     if "refinement" in settings:
         words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} initial guesses"
@@ -235,7 +235,10 @@ def robust_loss_text(settings: Mapping[str, Any]) -> str:
 
 
 def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
-    """Return the settings as table rows; the ranking criterion only if orders were searched."""
+    """Return the options of a result as table rows.
+
+    The ranking criterion is included only if orders were searched.
+    """
     rows: list[list[Cell]] = [["block pulses per run, M", int(settings["m"])]]
     if "innovation_length" in settings:
         rows += [

@@ -1,4 +1,4 @@
-"""Typesetting: equations as MathML, parameters as a table."""
+"""Typesetting of models in HTML: equations as MathML, parameters as a table."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ def equation_html(
     limits: Sequence[InputNonlinearity] = (),
     offset: Mapping[str, float] | str = "",
 ) -> Markup:
-    """Return an identified equation as MathML, one element per term so that lines break between terms.
+    """Return an identified equation as MathML, with one element per term so that lines break between terms.
 
     Parameters
     ----------
     item
         Equation.
     delay
-        Delays of inputs [s]; a delayed input is written u(t − 0.035 s).
+        Delays of inputs [s] by name; a delayed input is written u(t − 0.035 s).
     limits
         Known saturations and dead zones of inputs; a saturated input is written sat(u, 0.94).
     offset
-        Offset of the equation, ``"constant"`` and perhaps ``"ramp"``, as estimated on one run, or a text.
+        Offset of the equation: estimates for ``"constant"`` and possibly ``"ramp"`` from one run, or a text.
     """
     parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(item.terms):
@@ -88,7 +88,7 @@ def equation_html(
 
 
 def equations_html(model: Model, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None) -> list[Markup]:
-    """Equations of a model as MathML; offsets as numbers if there is one run, since each run has its own."""
+    """Return the equations of a model as MathML; offsets are numbers only if there is one run."""
     structure = model.structure
     own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
     return [
@@ -120,7 +120,7 @@ def _number_math(value: float | Exact) -> Markup:
 
 
 def _short(value: float) -> Exact:
-    """Return a number of an input with six digits at most."""
+    """Return a number of an input, rounded to six digits, in a form that is printed in full."""
     return Exact(f"{value:.6g}")
 
 
@@ -148,7 +148,7 @@ def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequ
 
 
 def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
-    """Return what a coefficient multiplies: a derivative of a signal, or of an expression."""
+    """Return the operand of a coefficient as MathML: a derivative of a signal or of an expression."""
     shape = term.nonlinear
     if shape is None:
         return _derivative_math(term.order, term.signal, delay.get(term.signal, 0.0), limits)
@@ -202,7 +202,7 @@ def _signed_math(value: float) -> Markup:
 
 
 def derivative_html(order: Order, signal: str) -> Markup:
-    """Return a derivative of a signal as text."""
+    """Return a derivative of a signal as HTML."""
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return symbol_html(signal)
     text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
@@ -210,12 +210,12 @@ def derivative_html(order: Order, signal: str) -> Markup:
 
 
 def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
-    """Return a table of orders and coefficients with their terms, standard errors and reference values.
+    """Return a table of orders and coefficients with their terms, standard errors and nominal values.
 
     Parameters
     ----------
     model
-        Model; its ``estimate`` is used without a fit.
+        Model. Its ``estimate`` is used if `joint` is None.
     joint
         Output-error fit of the model with its standard errors.
     """
@@ -301,7 +301,7 @@ def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
 
 
 def unit_html(unit: str) -> Markup:
-    """Return a unit with superscript exponents."""
+    """Return a unit as HTML, with exponents as superscripts."""
     parts = re.split(r"\^(-?[\d.]+)", unit)
     raised = (
         Markup("<sup>{}</sup>").format(p.replace("-", "−")) if k % 2 else Markup("{}").format(p)

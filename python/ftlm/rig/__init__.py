@@ -1,4 +1,4 @@
-"""Laboratory rig: simulated arm and Q8-USB board behind one interface with the same limits and checks."""
+"""Laboratory rig: a simulated arm and a Q8-USB board with the same interface, limits and checks."""
 
 from ftlm.estimation.linear import Streaming
 from ftlm.rig.arm_parameters import ArmParameters, StageParameters

@@ -44,9 +44,9 @@ class StageParameters:
     Parameters
     ----------
     a, b, d, g, r
-        Coefficients of the hub equation and inertia ratio r = (J_1 + J_2)/J_2; they determine the link equation.
+        Coefficients of the hub equation, and inertia ratio r = (J_1 + J_2)/J_2. They also determine the link equation.
     gamma, beta, mu
-        Free orders; every order of the law must lie in [0, 3). Both highest orders are 2.
+        Free orders of the order law, by which every order must lie in [0, 3). The order of both equations is 2.
     coulomb
         Coulomb friction as an equivalent motor current [A]; 0 for none.
     """
@@ -63,13 +63,13 @@ class StageParameters:
 
     @check_arguments
     def orders(self, stage: int) -> dict[str, float]:
-        """Return the five free orders, by their names in the law."""
+        """Return the five free orders by name."""
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
     @check_arguments
     def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
-        """Return the coefficients of both equations, by their names in the law."""
+        """Return the coefficients of both equations by name."""
         h, k = 2 * stage - 1, 2 * stage
         hub = {f"a{h}": self.a, f"b{h}": self.b, f"d{h}": self.d, f"g{h}": self.g}
         if form == "lagrange":
@@ -89,17 +89,17 @@ class ArmParameters:
         Parameters of the two joints.
     coupling
         Inertial coupling between the joints: 0 for none, 1 for joint 2 mounted on link 1, as in
-        :func:`ftlm.flexible_link` with ``cross_stage="inertial"``. Values in between scale the motion of link 1 that
-        acts on joint 2, consistently in the kinetic energy.
+        :func:`ftlm.flexible_link` with ``cross_stage="inertial"``. A value in between scales the motion of link 1 in
+        the kinetic energy of joint 2.
     inertia_ratio
-        J_21/J_12, where J_12 includes everything that link 1 carries.
+        Inertia ratio J_21/J_12, where J_12 includes everything that link 1 carries.
     reach
         Coupling ratio H/J_22, where H is the length of link 1 times the first moment of mass of link 2. It is 1 for
         equally long links with the mass at the tip.
     rotating_share
-        Share of J_21 that rotates with link 1. A rotor behind a gear contributes only by the inverse of the gear ratio.
+        Fraction of J_21 that rotates with link 1. A rotor behind a gear contributes only the inverse of its gear ratio.
     current_offset
-        Current offset of each motor while the amplifiers are enabled [A]; a property of a run, not of the arm.
+        Current offset of each motor while the amplifiers are enabled [A]. It differs from run to run on the real arm.
     strain_noise, current_noise
         Standard deviation of the noise on the gauges and on the current sense [V].
     strain_bias, current_bias
@@ -137,14 +137,14 @@ class ArmParameters:
     @classmethod
     @check_arguments
     def of(cls, source: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
-        """Return a named parameter set, the set of a TOML file, or the argument itself.
+        """Return the parameter set that a name or a TOML file denotes, or the argument itself.
 
         Raises
         ------
         ModelError
-            An unknown name.
+            If the name is unknown.
         DataError
-            A file that cannot be read, or an invalid key or value in it.
+            If the file cannot be read, or has an invalid key or value.
         """
         if isinstance(source, ArmParameters):
             return source
@@ -181,16 +181,16 @@ class ArmParameters:
         return replace(start, **{**values, **merged, "name": path.name[:100]})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the parameters as a JSON-compatible dictionary."""
+        """Return the parameters as a dictionary for JSON."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def coupling_coefficients(self) -> dict[str, float]:
-        """Return the inertial coupling coefficients of D^2 of the other joint's angles, by their names in the law.
+        """Return the coefficients of the accelerations of the other joint's angles, by name.
 
         Raises
         ------
         ModelError
-            Parameters out of range, or inertias for which the kinetic energy of the arm is not positive definite.
+            If a parameter is out of range, or the kinetic energy of the arm is not positive definite.
         """
         for name, highest in (
             ("coupling", 1.0),
@@ -227,7 +227,7 @@ class ArmParameters:
         Raises
         ------
         ModelError
-            Invalid orders or coefficients, or the published form with coupling or friction.
+            If orders or coefficients are invalid, or the published form is combined with coupling or friction.
         """
         if self.form == "published" and self.coupling != 0.0:
             raise ModelError(
@@ -253,7 +253,7 @@ class ArmParameters:
 
     @check_arguments
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:
-        """Return the simulated arm at rest, for runs of at most `horizon` s with samples of `step` s."""
+        """Return the simulated arm at rest, for runs of at most `horizon` seconds with sampling interval `step` [s]."""
         model = self.model()
         links = {
             "equations": [equation_tuple(item, ARM_SIGNALS) for item in model.equations],
@@ -277,7 +277,7 @@ class ArmParameters:
 
 
 def _optional(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
-    """Return the fields of a dataclass as optional keys of a file."""
+    """Return the fields of a dataclass as definitions of optional keys of a file."""
     hints = {**get_type_hints(kind), **replaced}
     return [(name, hint | UnsetType, UNSET) for name, hint in hints.items() if name != "name"]
 
@@ -294,7 +294,7 @@ def _values_of(file: msgspec.Struct) -> dict[str, Any]:
 
 
 def _check_values(path: Path, where: str, table: Mapping[str, Any]) -> None:
-    """Raise for numbers of a file that are out of range."""
+    """Raise DataError if a number in a file is out of range."""
     for key, value in table.items():
         values = [v for v in (value if isinstance(value, tuple) else (value,)) if not isinstance(v, str)]
         if not all(map(math.isfinite, values)):

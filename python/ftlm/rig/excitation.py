@@ -1,4 +1,4 @@
-"""Motor-current signals of experiments."""
+"""Motor-current signals (excitations) of experiments."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Excitation:
     Parameters
     ----------
     shape
-        One of SIGNAL_SHAPES. ``"square"``: duty cycle one half. ``"sine"``. ``"chirp"``: exponential frequency sweep
+        Shape of the signal. ``"square"``: duty cycle one half. ``"sine"``. ``"chirp"``: exponential frequency sweep
         over the band. ``"multisine"``: all multiples of 1/period in the band, with equal amplitudes and random phases.
         ``"prbs"``: random sign in every `period`. ``"doublet"``: half a period positive, half negative, then zero.
         ``"csv"``: columns I1 and I2 [A] of a file, with zero-order hold.
     amplitude
-        Largest current [A], of both motors or (stage 1, stage 2).
+        Maximum current [A] of both motors, or (motor 1, motor 2).
     period
-        Period [s]; default 2 for square and doublet, 10 for multisine, 2 pi/6.3 for sine, 0.1 for prbs.
+        Period [s]; by default 2 for square and doublet, 10 for multisine, 2 pi/6.3 for sine, 0.1 for prbs.
     band
         Lowest and highest frequency of chirp and multisine [Hz].
     ramp
@@ -59,14 +59,14 @@ class Excitation:
 
     @check_arguments
     def commands(self, rate: float, duration: float) -> Floats:
-        """Return the currents [A], shape (round(duration·rate) + 1, 2); the last row is zero.
+        """Return the currents [A] of both motors, shape (round(duration·rate) + 1, 2); the last row is zero.
 
         Raises
         ------
         ModelError
-            An invalid shape, amplitude, period or band, or a current above the amplifier limit.
+            If shape, amplitude, period or band is invalid, or a current exceeds the amplifier limit.
         DataError
-            A file that cannot be used.
+            If the file cannot be read or has other columns.
         """
         samples, length = finite_number(rate), finite_number(duration)
         if samples is None or length is None or not 0 <= length <= MAX_RUN_DURATION_S:
@@ -196,7 +196,7 @@ class Excitation:
         return currents
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the signal as a JSON-compatible dictionary."""
+        """Return the signal as a dictionary for JSON."""
         values = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
         return {k: _to_json_value(v) for k, v in values.items() if v is not None}
 
@@ -211,7 +211,7 @@ def finite_number(value: object) -> float | None:
 
 
 def _to_json_value(value: object) -> object:
-    """Convert tuples and NumPy scalars to JSON types."""
+    """Return a value in which tuples and NumPy scalars are replaced by JSON types."""
     if isinstance(value, (tuple, list)):
         return [_to_json_value(v) for v in value]
     return value.item() if isinstance(value, np.generic) else value

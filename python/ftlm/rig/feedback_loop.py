@@ -1,4 +1,4 @@
-"""Feedback control on a rig: a user's controller as command source, one call per sample."""
+"""Feedback control on a rig, with a user's controller that is called once per sample."""
 
 from __future__ import annotations
 
@@ -78,13 +78,14 @@ def control(
         drives the motor of its input; a :class:`ftlm.control.DiscretePid` belongs into a
         :class:`ftlm.control.JointControllers`.
     reference : array_like
-        Joint angles [rad]: shape (rows, 2), one row per sample; or a pair that is held for `duration`.
+        Reference of the joint angles [rad]: shape (rows, 2), one row per sample; or a pair that is constant during
+        `duration`.
     rig : {"virtual", "q8"} or Board, default "virtual"
         The simulated arm, the arm on a Q8-USB board, or a user-defined board.
     duration : float, optional
-        Duration [s]; default that of the reference.
+        Duration [s]; by default that of the reference.
     rate : float, optional
-        Sampling rate [Hz]; default that of the controller, or 500.
+        Sampling rate [Hz]; by default that of the controller, or 500.
     limit, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board, out, force, live, progress
         See :func:`ftlm.rig.record`.
     name : str
@@ -98,14 +99,15 @@ def control(
     Raises
     ------
     ModelError
-        An argument out of range, a controller for another rate, a reference beyond the arm's travel, or hardware
-        without ``arm=True``; the arm has not moved.
+        If an argument is out of range, the controller has another rate, the reference exceeds the arm's travel, or
+        hardware is used without ``arm=True``. The arm has not moved.
     DataError
-        An invalid reference array, or a file that exists already; the arm has not moved.
+        If the reference array is invalid, or the file already exists. The arm has not moved.
     RigFault
-        The rig stopped the run, or the controller raised, returned invalid or excessive currents, or was too late. 0 V
-        was written immediately, or by the watchdog if the controller did not return. The message states the cause,
-        ``__cause__`` is the exception of the controller, and `run` and the file hold the recorded samples.
+        If the rig stopped the run, or the controller raised an exception, returned invalid or excessive currents, or
+        was too late. 0 V was written immediately, or by the watchdog if the controller did not return. The message
+        states the cause, ``__cause__`` is the exception of the controller, and `run` and the file have the recorded
+        samples.
 
     Notes
     -----
@@ -163,7 +165,7 @@ def control(
 
 
 def _of_both_joints(controller: Controller) -> Controller:
-    """Return a controller that can be called with time, angles and reference; raise for a PID of one joint."""
+    """Return a controller that takes time, angles and reference; raise ModelError for a PID of one joint."""
     if isinstance(controller, Lqg) and controller.observer.realisation.input in MOTOR_INPUTS:
         second = controller.observer.realisation.input == MOTOR_INPUTS[1]
         return JointControllers(None, controller) if second else JointControllers(controller)
@@ -176,7 +178,7 @@ def _of_both_joints(controller: Controller) -> Controller:
 
 
 def _rate_of(controller: Controller, rate: float | None) -> float:
-    """Return the sampling rate [Hz]; raise if it is not that of the controller."""
+    """Return the sampling rate [Hz]; raise ModelError if it differs from that of the controller."""
     own = finite_number(getattr(controller, "rate", None))
     _, _, checked = check_times(
         MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, (own or DEFAULT_RATE_HZ) if rate is None else rate
@@ -190,18 +192,18 @@ def _rate_of(controller: Controller, rate: float | None) -> float:
 
 
 class ControllerSource:
-    """Command source that calls a controller once per sample.
+    """Command source whose commands are computed by a controller, once per sample.
 
     Parameters
     ----------
     controller
-        The controller function.
+        Controller function.
     reference
         Reference of both joints, shape (rows, 2) [rad].
     rate
         Sampling rate [Hz].
     clock
-        Clock [s] that measures the computing time of the controller.
+        Function that returns the time [s], with which the computing time of the controller is measured.
     """
 
     def __init__(self, controller: Controller, reference: Floats, rate: float, clock: Callable[[], float]) -> None:
@@ -214,12 +216,12 @@ class ControllerSource:
         self._took = 0.0
 
     def first_commands(self, rig: Rig, block: int) -> Floats:
-        """Return 0 A, because no measurement exists yet."""
+        """Return a command of 0 A, because no measurement exists yet."""
         self._rig, self._at = rig, -1
         return np.zeros((1, 2))
 
     def next_commands(self, rows: Floats) -> Floats:
-        """Return the controller output for the last measurement; 0 A at the end of the run."""
+        """Return the command of the controller for the last measured row; 0 A at the end of the run."""
         if self._rig is None or not len(rows):
             raise ModelError("the board ran a sample and handed over no row of it; correct its take()")
         self._at += 1
@@ -248,7 +250,7 @@ class ControllerSource:
         return currents
 
     def explain_fault(self, fault: str) -> str:
-        """Return a fault message, with the computing time of the controller if it exceeded one sample."""
+        """Return a fault message, extended by the computing time of the controller if it exceeded one sample."""
         where = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
         if self._since is not None and fault.startswith("stopped by"):
             return f"{fault}: the controller had not answered to {where} for {self.clock() - self._since:.3g} s"
@@ -258,7 +260,7 @@ class ControllerSource:
 
 
 def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]:
-    """Validate a controller output: currents, shape (1, 2), and an error text or ""."""
+    """Return the currents in a controller output, shape (1, 2), and an error text ("" if they are valid)."""
     nothing = np.zeros((1, 2))
     if answer is None:
         return nothing, "returned nothing; return both currents [A], such as (0.1, 0.0)"
@@ -290,7 +292,7 @@ def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]
 
 
 def _numbers(reference: ArrayLike) -> Floats:
-    """Validate a reference array of shape (rows, 2) or (2,)."""
+    """Return a validated reference array of shape (rows, 2) or (2,); raise DataError for another one."""
     raw = as_array("reference", reference)
     if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
         raise DataError(
@@ -302,7 +304,7 @@ def _numbers(reference: ArrayLike) -> Floats:
 
 
 def _rows(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
-    """Expand the reference to one row per sample; raise if it exceeds the arm's travel."""
+    """Return the reference with one row per sample; raise ModelError if it exceeds the arm's travel."""
     reference = np.tile(values, (rows, 1)) if values.ndim == 1 else values
     if len(reference) != rows:
         raise DataError(

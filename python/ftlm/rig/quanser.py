@@ -1,7 +1,7 @@
-"""Q8-USB board through the vendor's Python package, timed by the board's blocking read.
+"""Q8-USB board, accessed through the vendor's Python package; its blocking read sets the sampling times.
 
-No board was available during development: the module is tested against a stand-in with the package's names, types,
-error codes and rules. See docs/rig.md before the first run on hardware.
+No board was available during development. The module is tested with a substitute that has the names, types, error codes
+and rules of the package. See docs/rig.md before the first run on hardware.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _no_library(error: OSError) -> RigFault:
 
 
 def driver_state() -> str:
-    """Describe whether a board is usable: vendor package, library, and a test that opens the board."""
+    """Return text on whether a board is usable: vendor package, library, and a test that opens the board."""
     try:
         _driver()
     except RigFault as fault:
@@ -109,7 +109,7 @@ class QuanserBoard:
     card
         Identifier, such as ``"0"`` or ``"0@tcpip://host:port"``.
     clock
-        Clock [s] for the measurement of delays.
+        Function that returns the time [s], with which delays are measured.
     sleep
         Function that waits a number of seconds, for the watchdog.
     """
@@ -163,7 +163,7 @@ class QuanserBoard:
             raise RigFault(f"Q8-USB: {ERROR_MESSAGES[-108]}")
 
     def configure(self, rate: float) -> None:
-        """Set ranges, directions and encoders, zero the outputs, and create one reader for simultaneous sampling."""
+        """Set ranges, directions and encoders, set outputs to zero, and create a reader for simultaneous sampling."""
         check_rate(rate)
         self._rate, self._samples, self._origin, self._rows = rate, 0, math.inf, []
         speed = "normal" if rate <= MAX_NORMAL_RATE_HZ else "fast"
@@ -204,7 +204,10 @@ class QuanserBoard:
             hil.task_set_buffer_overflow_mode(self._task, OVERFLOW_IS_AN_ERROR)
 
     def set_expiration(self) -> None:
-        """Set the expiration states to 0 V and tristate; without tristate lines the analog outputs would stay."""
+        """Set the outputs after a watchdog expiration to 0 V and tristate.
+
+        Without tristate digital lines, the board would keep its analog outputs.
+        """
         with self._translate_errors("setting the watchdog's expiration states") as hil:
             hil.watchdog_set_analog_expiration_state(ANALOG_OUT, len(ANALOG_OUT), np.zeros(len(ANALOG_OUT)))
             self._analog_safe = True
@@ -213,11 +216,11 @@ class QuanserBoard:
             self._digital_safe = True
 
     def unsafe(self) -> str | None:
-        """Message on the expiration state that is not set; None if all are set."""
+        """Return a message if the outputs after a watchdog expiration are not set; None if all are set."""
         return missing_expiration_state(analog=self._analog_safe, digital=self._digital_safe)
 
     def start_watchdog(self, seconds: float) -> None:
-        """Start the watchdog of the board."""
+        """Start the watchdog of the board with a timeout [s]."""
         missing = self.unsafe()
         if missing is not None:
             raise RigFault(f"Q8-USB: {missing}")
@@ -228,7 +231,7 @@ class QuanserBoard:
             self._watched = True
 
     def start(self, rate: float) -> None:
-        """Start the sampling task on the clock of the board."""
+        """Start the sampling task at a rate [Hz] on the clock of the board."""
         with self._translate_errors("starting the task") as hil:
             clocks = getattr(self._module, "Clock", None)
             hil.task_start(self._task, getattr(clocks, "HARDWARE_CLOCK_0", 0), float(rate), UNLIMITED_SAMPLES)
@@ -248,14 +251,14 @@ class QuanserBoard:
             )
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Write output voltages; 0 V is accepted even if the watchdog has locked the board."""
+        """Write output voltages [V]; 0 V is accepted even if the watchdog has locked the board."""
         if self._hil is None:
             return
         with self.gate.lock, self._translate_errors("writing"):
             self._run_unless_expired(lambda: self._write(volts), is_end=volts == (0.0, 0.0))
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Sample with outputs at 0 V."""
+        """Record a number of samples with outputs at 0 V."""
         for _ in range(samples):
             if self._read(guard) is None:
                 return
@@ -265,7 +268,7 @@ class QuanserBoard:
                 return
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Sample while applying commands; each read blocks until the board has a sample."""
+        """Apply commands [A] and record a sample for each; a read blocks until the board has the sample."""
         for command in commands:
             late = self._read(guard)
             if late is None:
@@ -280,7 +283,7 @@ class QuanserBoard:
                 return
 
     def take(self) -> Floats:
-        """Return the rows since the last call."""
+        """Return the rows recorded since the last call."""
         rows, self._rows = self._rows, []
         return np.array(rows, dtype=np.float64).reshape(-1, len(RIG_COLUMNS) + 1)
 
@@ -304,7 +307,7 @@ class QuanserBoard:
         return self._has_expired()
 
     def stop_watchdog(self) -> None:
-        """Stop the watchdog; an expired one is left alone, because its safe outputs must stay."""
+        """Stop the watchdog unless it has expired, because its safe outputs must then remain."""
         if self._hil is not None and self._watched and not self._is_expired:
             self._watched = False
             with self._translate_errors("stopping the watchdog") as hil:
@@ -319,7 +322,7 @@ class QuanserBoard:
                 hil.close()
 
     def describe(self) -> str:
-        """Product name of the board in parentheses; empty if it cannot be read."""
+        """Return the product name of the board in parentheses; empty if it cannot be read."""
         try:
             codes = getattr(import_module("quanser.hardware.enumerations"), "StringProperty", None)
             text = string_property(self._hil, getattr(codes, "PRODUCT_NAME", 1))
@@ -328,7 +331,7 @@ class QuanserBoard:
         return f" ({text})" if text else ""
 
     def _read(self, guard: _core.Guard) -> float | None:
-        """Read one sample into the buffers; return its delay [s], None if sampling has stopped."""
+        """Read one sample into the buffers, and return its delay [s]; None if sampling has stopped."""
         with self._translate_errors("reading", guard=guard) as hil:
             count = hil.task_read(self._task, 1, self._analog, self._counts, self._digital, None)
             if count < 1:
@@ -359,7 +362,9 @@ class QuanserBoard:
                 self._hil.write_analog(ANALOG_OUT, len(ANALOG_OUT), self._volts)
 
     def _run_unless_expired(self, act: Callable[[], None], *, is_end: bool) -> None:
-        """Perform an action; ignore its error if the watchdog has expired and has already `is_end` it.
+        """Perform an action, and ignore its error if the watchdog has expired.
+
+        `is_end` states that the expired watchdog has already achieved the purpose of the action.
 
         The board stays locked, because clearing the watchdog would restore the previous outputs.
         """
@@ -370,7 +375,7 @@ class QuanserBoard:
                 raise
 
     def _has_expired(self) -> bool:
-        """Whether the watchdog has expired; False if the board cannot be asked."""
+        """Whether the watchdog has expired; False if the board does not answer."""
         if not self._watched or self._hil is None:
             return self._is_expired
         try:
@@ -395,7 +400,7 @@ class QuanserBoard:
 
 
 class _ErrorTranslator:
-    """Context manager that translates vendor errors to `RigFault`, and latches them during a run.
+    """Context manager that converts vendor errors to `RigFault`, and latches them during a run.
 
     Parameters
     ----------
@@ -431,7 +436,7 @@ MAX_PROPERTY_CHARACTERS = 64
 
 
 def string_property(hil: Any, code: Any) -> str:
-    """Read a string property; empty for the 2022 package, whose call overflows its buffer."""
+    """Return a string property of the board; "" for the 2022 package, whose call overflows its buffer."""
     if len(signature(hil.get_string_property).parameters) != 2:
         return ""
     return str(hil.get_string_property(code, MAX_PROPERTY_CHARACTERS))

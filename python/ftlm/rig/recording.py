@@ -1,4 +1,4 @@
-"""Recording of experiments: command sources, recording loop and partial files."""
+"""Recording of experiments on a rig: command sources, recording loop and partial files."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ COLUMN_UNITS = {name: "A" if name.startswith("I") else "rad" for name in RIG_COL
 
 
 def units_of(extra_columns: tuple[str, ...] = ()) -> dict[str, str]:
-    """Return the units of the columns of a run; additional signals are angles [rad]."""
+    """Return the units of the columns of a run; additional columns are angles [rad]."""
     return COLUMN_UNITS | dict.fromkeys(extra_columns, "rad")
 
 
 def partial_path(target: Path) -> Path:
-    """Return the path of the partial file of a run."""
+    """Return the path of the partial file that is written during a run."""
     return target.with_name(target.stem + ".csv.partial")
 
 
 class PartialRecording:
-    """Partial csv file of a running experiment, which can be loaded if the program terminates unexpectedly.
+    """Csv file that is written during an experiment, and can be loaded if the program terminates unexpectedly.
 
     Parameters
     ----------
     target
-        Final file; None writes nothing to disk.
+        Path of the final file; with None nothing is written to disk.
     name, step, about
-        Name, step [s] and metadata of the run.
+        Name, sampling interval [s] and metadata of the run.
     extra_columns
         Names of additional inputs, appended to the rig's columns in every row.
     """
@@ -84,7 +84,7 @@ class PartialRecording:
         Raises
         ------
         DataError
-            The file cannot be written; none is left.
+            If the file cannot be written; it is then removed.
         """
         if self.path is None:
             return
@@ -109,7 +109,7 @@ class PartialRecording:
         Raises
         ------
         RigFault
-            The rows cannot be written; complete rows stay in the file.
+            If the rows cannot be written. Complete rows remain in the file.
         """
         if self._descriptor is None or len(rows) == 0:
             self._rows += len(rows)
@@ -137,13 +137,13 @@ class PartialRecording:
             raise
 
     def close(self) -> None:
-        """Close the file, and delete it if it has no row: it would block the next recording."""
+        """Close the file, and delete it if it has no rows, because it would prevent the next recording."""
         if self.kept == 0:
             self.remove()
         self._close_descriptor()
 
     def remove(self) -> None:
-        """Close and delete the file, once the run has its final file."""
+        """Close and delete the file, after the run has been written to its final file."""
         self._close_descriptor()
         if self.path is not None and self._opened:
             with contextlib.suppress(OSError):
@@ -165,7 +165,7 @@ def save_run(
     ended: BaseException | None,
     faults: list[str],
 ) -> Run:
-    """Write the run to its final file, and raise the exception that ended it."""
+    """Write the run to its final file and return it, or raise the exception that ended the run."""
     place = "nothing was recorded until then"
     if run is not None:
         place = f"{run.length} rows were recorded until then"
@@ -243,7 +243,7 @@ def record(
     input : str
         Shape of the current, see `Excitation`: square, sine, chirp, multisine, prbs, doublet or csv.
     amplitude : float or pair of float
-        Largest current [A], at most 0.94 and 1.2.
+        Maximum current [A] of both motors or of each; at most 0.94 for motor 1 and 1.2 for motor 2.
     period : float, optional
         Period [s]; for prbs the switching interval.
     band : pair of float
@@ -296,14 +296,14 @@ def record(
     Raises
     ------
     ModelError
-        An argument out of range, or hardware without ``arm=True``; the arm has not moved.
+        If an argument is out of range, or hardware is used without ``arm=True``. The arm has not moved.
     DataError
-        A file that cannot be read or exists already; the arm has not moved.
+        If a file cannot be read or already exists. The arm has not moved.
     RigFault
-        The rig stopped the run. The message states the cause; `run` and the file hold the recorded samples.
+        If the rig stopped the run. The message states the cause; `run` and the file have the recorded samples.
     BaseException
-        Ctrl-C, SIGTERM, or an exception of `progress`, raised after shutdown and after the file is written; its notes
-        list errors during shutdown, and where the rows are. In another thread than the main one, Ctrl-C is a RigFault.
+        On Ctrl-C, SIGTERM, or an exception of `progress`, after shutdown and after the file is written. Its notes list
+        errors during shutdown, and where the rows are. In a thread other than the main one, Ctrl-C raises RigFault.
     """
     seed = check_seed(seed)
     duration, limit, rate = check_times(duration, limit, rate)
@@ -332,25 +332,25 @@ def record(
 
 
 class CommandSource(Protocol):
-    """Source of the commands of a run."""
+    """Protocol of a source of the commands of a run."""
 
     rows: int
     #: Additional signals of the run by name, one value per sample.
     extra_signals: dict[str, Floats]
 
     def first_commands(self, rig: Rig, block: int) -> Floats:
-        """Return the first commands, shape (n, 2) [A]; at most `block` rows."""
+        """Return the first commands [A], shape (n, 2) with n at most `block`."""
 
     def next_commands(self, rows: Floats) -> Floats:
-        """Return the commands that follow these measured rows; empty at the end of the run."""
+        """Return the commands [A] that follow the measured rows; empty at the end of the run."""
 
     def explain_fault(self, fault: str) -> str:
-        """Return a fault message, extended by the role of this source in it."""
+        """Return a fault message, extended by what this source contributed to the fault."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Arguments of an experiment; see :func:`record`."""
+    """Arguments of an experiment, validated; see :func:`record`."""
 
     rig: str | Board
     duration: float
@@ -459,7 +459,7 @@ class Experiment:
 
 
 class FixedCommands:
-    """Command source with precomputed commands, shape (rows, 2) [A]."""
+    """Command source of precomputed commands [A], shape (rows, 2)."""
 
     def __init__(self, commands: Floats) -> None:
         self.commands, self.rows = commands, len(commands)
@@ -482,7 +482,7 @@ class FixedCommands:
 
 
 def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None, list[str]]:
-    """Run all commands; return the exception that ended the run early, and all fault messages."""
+    """Run all commands, and return the exception that ended the run early (or None) and all fault messages."""
     faults: list[str] = []
     ended: BaseException | None = None
     try:
@@ -505,14 +505,14 @@ def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None,
 
 
 def describe_interruption(ended: KeyboardInterrupt | SystemExit) -> str:
-    """Describe the interruption of a run by a signal or an exit."""
+    """Return text on the interruption of a run by a signal or an exit."""
     if isinstance(ended, KeyboardInterrupt):
         return describe_signal(signal.SIGINT)
     return describe_signal(ended.code - 128 if isinstance(ended.code, int) else 0)
 
 
 class _Recorder:
-    """Recorder of the rows of a rig, in memory and on disk."""
+    """Recorder that stores the rows of a rig in memory and in a partial file."""
 
     def __init__(
         self,
@@ -531,7 +531,7 @@ class _Recorder:
         self.blocks = self.done = 0
 
     def follow(self, rig: Rig) -> None:
-        """Run the commands of the source and store the rows in blocks."""
+        """Run the commands of the source, and store the measured rows in blocks."""
         try:
             commands = self.source.first_commands(rig, self.block)
             while len(commands):
@@ -547,12 +547,15 @@ class _Recorder:
             self.flush()
 
     def collect(self, rig: Rig) -> Floats:
-        """Return the rows since the last call, which the run keeps; no signal may come between."""
+        """Store and return the rows recorded since the last call.
+
+        Signals are deferred meanwhile, so that no row is lost.
+        """
         self.taken.append(rig.take())
         return self.taken[-1]
 
     def flush(self) -> None:
-        """Pass pending rows on to the partial file, the live estimate and the progress callback."""
+        """Pass pending rows to the partial file, the live estimate and the progress callback."""
         pending, self.blocks = self.taken[self.blocks :], len(self.taken)
         rows = self._columns(pending, self.done)
         if not len(rows):
@@ -575,7 +578,7 @@ class _Recorder:
         return np.hstack([rows, *extra_values])
 
     def finish(self, name: str, about: dict[str, Any], faults: list[str], step: float) -> Run | None:
-        """Return the run; None if fewer than three rows were recorded."""
+        """Return the recorded run; None if it has fewer than three rows."""
         extra_names = tuple(self.source.extra_signals)
         rows = self._columns(self.taken, 0)
         if len(rows) < 3:
@@ -599,7 +602,7 @@ def _board(
     horizon: float,
     board: str,
 ) -> tuple[Board, dict[str, Any]]:
-    """Return the selected board, and its metadata for the run."""
+    """Return the board that the arguments select, and metadata on it for the run."""
     virtual = isinstance(rig, str) and rig == "virtual"
     if offset is not None and not virtual:
         raise ModelError("offset is of the virtual arm; a board has its own, leave it out")
@@ -641,7 +644,7 @@ def _check_target(target: Path, *, force: bool) -> None:
 
 
 def check_times(duration: float, limit: float, rate: float) -> tuple[float, float, float]:
-    """Validate duration, limit [s] and rate [Hz], and return them as floats."""
+    """Return duration [s], limit [s] and rate [Hz] as floats; raise ModelError if one is invalid."""
     longest, length, samples = finite_number(limit), finite_number(duration), finite_number(rate)
     if longest is None or not 0 < longest <= MAX_RUN_DURATION_S:
         raise ModelError(
@@ -670,7 +673,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
 
 
 def _column_of(name: str) -> int:
-    """Return the column of a signal of the live structure in a row of the rig."""
+    """Return the index of the column in a row of the rig that has a signal of the live structure."""
     if name not in RIG_COLUMNS:
         raise ModelError(
             f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(RIG_COLUMNS)}"

@@ -29,10 +29,10 @@ _HANDLER_CHECK_INTERVAL_MS = 20.0
 
 
 class OutputGate:
-    """Lock of every write to a board; once closed, only 0 V can be written, by any thread.
+    """Lock for writes to a board. After it is closed, no thread can write anything but 0 V.
 
-    :class:`Rig` assigns a gate to its board for each session. A user-defined board writes under `lock`, and calls
-    :meth:`check` there before any other voltage and before the amplifiers are enabled.
+    :class:`Rig` assigns a gate to its board for each session. A user-defined board must write while it holds `lock`.
+    Before it writes another voltage than 0 V or enables the amplifiers, it must call :meth:`check`.
     """
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class OutputGate:
         self.running = False
 
     def close(self, reason: str) -> None:
-        """Close the gate for good; the first reason is kept."""
+        """Close the gate permanently, with a reason; the reason of the first call is kept."""
         with self.lock:
             self.reason = self.reason or reason
 
@@ -54,10 +54,10 @@ class OutputGate:
 
 
 class InterruptWatch:
-    """Thread that stops the motors on a termination signal while their run is not in the main thread.
+    """Thread that stops the motors on a termination signal if their run is not in the main thread.
 
-    Python calls signal handlers in the main thread only, which may wait for the run. :mod:`faulthandler` instead writes
-    from within the signal itself, here to a pipe that the thread reads, and then passes the signal on to Python.
+    Python calls signal handlers only in the main thread, which may be waiting for the run. :mod:`faulthandler` instead
+    writes within the signal itself, here to a pipe that the thread reads, and then passes the signal to Python.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,10 @@ class InterruptWatch:
         return hasattr(faulthandler, "register")
 
     def add(self, board: Board) -> None:
-        """Stop this board on the next termination signal that Python handles; any other one ends the program."""
+        """Register a board whose motors are stopped at the next termination signal that Python handles.
+
+        Other signals end the program.
+        """
         with self._lock:
             self._boards.append(board)
             if self._pipes or not self.available:
@@ -87,12 +90,12 @@ class InterruptWatch:
             threading.Thread(target=self._watch, name="ftlm signals", daemon=True).start()
 
     def remove(self, board: Board) -> None:
-        """Forget a board."""
+        """Unregister a board."""
         with self._lock, contextlib.suppress(ValueError):
             self._boards.remove(board)
 
     def reset(self) -> None:
-        """Stop watching in a forked child, which has neither the thread nor the motors."""
+        """Clear the state in a forked child process, which has neither the thread nor the motors."""
         self._lock = threading.Lock()
         self._boards = []
         self._stop()
@@ -107,7 +110,10 @@ class InterruptWatch:
         self._handlers, self._pipes = {}, {}
 
     def _register(self) -> None:
-        """Register each signal whose handler the program has set since, which replaces that of faulthandler."""
+        """Register each signal whose handler the program has set since the last call.
+
+        Setting a handler replaces that of faulthandler.
+        """
         for number, (_, write_end) in self._pipes.items():
             if callable(signal.getsignal(number)) and _system_handler(number) != self._handlers.get(number):
                 faulthandler.unregister(number)
@@ -134,7 +140,7 @@ class InterruptWatch:
 
 
 def _system_handler(number: int) -> bytes:
-    """Address of the function that handles a signal, the first member of the system's structure."""
+    """Return the address of the function that handles a signal, the first member of the system's structure."""
     action = ctypes.create_string_buffer(1024)
     ctypes.CDLL(None).sigaction(number, None, action)
     return action.raw[: ctypes.sizeof(ctypes.c_void_p)]
@@ -146,7 +152,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def check_thread(board: Board) -> None:
-    """Raise if hardware is to run in a thread in which Ctrl-C cannot stop its motors."""
+    """Raise ModelError if hardware would run in a thread in which Ctrl-C cannot stop its motors."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     if board.hardware and not in_main_thread and not INTERRUPT_WATCH.available:
         raise ModelError(
@@ -156,7 +162,7 @@ def check_thread(board: Board) -> None:
 
 
 def describe_signal(number: int) -> str:
-    """Describe the end of a run by a signal."""
+    """Return text on the end of a run by a signal."""
     if number == signal.SIGINT:
         return "stopped by Ctrl-C"
     names = {int(s): s.name for s in signal.Signals}
@@ -173,15 +179,15 @@ def _stop_motors(board: Board, reason: str) -> None:
 
 
 class SignalHandlers:
-    """Handlers of termination signals between start-up and shutdown of a rig.
+    """Handlers of termination signals that are active from start-up to shutdown of a rig.
 
-    In the main thread a signal closes the output gate and raises; elsewhere `INTERRUPT_WATCH` stops the motors. The
-    object holds no reference to a rig, so that the handler table does not keep one alive.
+    In the main thread, a signal closes the output gate and raises an exception. In other threads, `INTERRUPT_WATCH`
+    stops the motors. The object has no reference to a rig, so that the handler table does not keep a rig alive.
 
     Parameters
     ----------
     deaf
-        Code objects that no signal may interrupt; signals that arrive while they run are deferred.
+        Code objects that no signal may interrupt. Signals that arrive while they run are deferred.
     board
         Board whose motors a signal stops, or None.
     """
@@ -194,7 +200,7 @@ class SignalHandlers:
         self._watched = self._is_persistent = self._deferring = False
 
     def install(self) -> None:
-        """Replace the current handlers; a Ctrl-C that the program ignores stays ignored."""
+        """Replace the current handlers, except that a Ctrl-C that the program ignores remains ignored."""
         if self._before or self._watched:
             return
         if threading.current_thread() is not threading.main_thread():
@@ -211,7 +217,7 @@ class SignalHandlers:
             signal.signal(number, self._handle)
 
     def keep(self) -> None:
-        """Install the handlers until :meth:`release`; signals after the first one, or after shutdown, are deferred."""
+        """Install the handlers until :meth:`release`; signals after the first one or after shutdown are deferred."""
         self._is_persistent = True
         self.install()
 
@@ -223,7 +229,7 @@ class SignalHandlers:
             self._restore()
 
     def release(self) -> None:
-        """Restore all previous handlers; :meth:`deliver` raises what was deferred."""
+        """Restore all previous handlers; :meth:`deliver` then raises the exceptions of deferred signals."""
         self._is_persistent, self._deferring = False, True
         self._restore()
         self._deferring = False
@@ -235,7 +241,7 @@ class SignalHandlers:
         self._before = {}
 
     def deliver(self) -> None:
-        """Raise the exception of a deferred signal, unless it has to wait for :meth:`release`."""
+        """Raise the exception of a deferred signal, unless it must wait for :meth:`release`."""
         if self._deferring:
             return
         number, self._waiting = self._waiting, None
@@ -245,7 +251,7 @@ class SignalHandlers:
             _end(number)
 
     def _restore(self) -> None:
-        """Restore all previous handlers; signals are blocked meanwhile, if the system supports it."""
+        """Restore all previous handlers, while signals are blocked if the system supports it."""
         if self._board is not None and self._watched:
             self._watched = False
             INTERRUPT_WATCH.remove(self._board)
@@ -315,7 +321,7 @@ RIG_COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measu
 @check_arguments
 @dataclass(frozen=True)
 class Limits:
-    """Safety limits of every command and sample; pairs are for joints 1 and 2.
+    """Safety limits that are applied to every command and sample; pairs are for joints 1 and 2.
 
     Parameters
     ----------
@@ -330,13 +336,13 @@ class Limits:
     deflection
         Largest link deflection [rad].
     saturation
-        Gauge voltage from which it counts as saturated [V].
+        Gauge voltage [V] from which a gauge counts as saturated.
     moving_current
         Current at which a hub must move [A]; at smaller currents it may stick.
     standstill
         Longest standstill at that current [s].
     fastest
-        Largest hub speed [rad/s]; a faster count is an encoder fault.
+        Maximum hub speed [rad/s]; a faster count is regarded as an encoder fault.
     max_write_delay
         Longest delay of a write [s].
     max_missed_deadlines
@@ -357,7 +363,7 @@ class Limits:
 
     @check_arguments
     def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
-        """Return the guard that enforces the limits at a sampling interval [s]."""
+        """Return the guard object of the core that enforces the limits at a sampling interval `step` [s]."""
         return _core.Guard(
             {
                 "step": step,
@@ -382,7 +388,7 @@ class Limits:
 
 
 class Board(Protocol):
-    """Interface of a board, in the order in which :class:`Rig` calls its methods."""
+    """Protocol of a board, with methods in the order in which :class:`Rig` calls them."""
 
     name: str
     hardware: bool
@@ -393,16 +399,16 @@ class Board(Protocol):
         """Open the board."""
 
     def configure(self, rate: float) -> None:
-        """Set ranges, directions and encoders, zero the outputs, and create the sampling task of all channels."""
+        """Set ranges, directions and encoders, set outputs to zero, and create a sampling task at a rate [Hz]."""
 
     def set_expiration(self) -> None:
-        """Set the expiration states of the watchdog: 0 V and safe digital lines."""
+        """Set the outputs that the watchdog applies when it expires: 0 V and safe digital lines."""
 
     def unsafe(self) -> str | None:
-        """Message on why the watchdog would not stop the motors; None if it would."""
+        """Return a message if the watchdog would not stop the motors; None if it would."""
 
     def start_watchdog(self, seconds: float) -> None:
-        """Start the watchdog."""
+        """Start the watchdog with a timeout [s]."""
 
     def start(self, rate: float) -> None:
         """Start sampling."""
@@ -414,19 +420,19 @@ class Board(Protocol):
         """Write output voltages [V]."""
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Sample with outputs at 0 V."""
+        """Record a number of samples with outputs at 0 V."""
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Sample while applying commands, shape (n, 2) [A], until they end or a fault latches."""
+        """Apply commands [A], shape (n, 2), and record a sample for each, until they end or a fault is latched."""
 
     def take(self) -> Floats:
-        """Return the rows since the last call: RIG_COLUMNS and the delay [s]."""
+        """Return the rows recorded since the last call; columns are RIG_COLUMNS and the delay [s]."""
 
     def stop(self) -> None:
         """Stop sampling."""
 
     def let_expire(self) -> bool:
-        """Wait without heartbeat for the watchdog to write 0 V; return whether this is confirmed."""
+        """Wait without heartbeat until the watchdog writes 0 V; return whether this is confirmed."""
 
     def stop_watchdog(self) -> None:
         """Stop the watchdog."""
@@ -436,13 +442,13 @@ class Board(Protocol):
 
 
 def shut_down(board: Board) -> list[str]:
-    """Run the shutdown sequence; return the error messages of its steps.
+    """Run the shutdown sequence of a board, and return the error messages of its steps.
 
-    The output gate is closed first: from then on no other thread can write anything but 0 V. Each step is tried even if
-    an earlier one failed, and is repeated once if it is interrupted (a second Ctrl-C). If 0 V cannot be written or the
-    amplifiers cannot be disabled, the watchdog is left to expire, which does both. If none of the three is confirmed,
-    the watchdog keeps running and the board stays open, because stopping or closing them could leave the motors under
-    current.
+    The output gate is closed first, after which no other thread can write anything but 0 V. Each step is tried even if
+    an earlier one failed, and is repeated once if it is interrupted (by a second Ctrl-C). If 0 V cannot be written or
+    the amplifiers cannot be disabled, the sequence waits until the watchdog expires, which does both. If none of these
+    is confirmed, the watchdog keeps running and the board stays open, because the motors might have current after they
+    are stopped or closed.
     """
     troubles: list[str] = []
     _try_step("closing the output gate", lambda: board.gate.close("the rig was shut down"), troubles)
@@ -467,7 +473,10 @@ def shut_down(board: Board) -> list[str]:
 
 
 def _try_step(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
-    """Try a shutdown step, again if it is interrupted; record a failure and return whether it succeeded."""
+    """Try a shutdown step, again if it is interrupted, and return whether it succeeded.
+
+    The message of a failure is appended to `troubles`.
+    """
     for _ in (1, 2):
         try:
             step()
@@ -483,7 +492,10 @@ def _try_step(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
 
 
 def _shut_down_and_restore(board: Board, signals: SignalHandlers) -> list[str]:
-    """Shut down the board and restore the signal handlers; holds no reference to the rig."""
+    """Shut down a board, restore the signal handlers, and return the error messages.
+
+    The function has no reference to the rig, so that it can run at garbage collection.
+    """
     try:
         return shut_down(board)
     finally:
@@ -500,17 +512,17 @@ class Rig:
     Parameters
     ----------
     board
-        The virtual board or the Q8-USB.
+        Virtual board, Q8-USB board, or user-defined board.
     rate
         Sampling rate [Hz].
     watchdog
         Watchdog timeout [s], 0.01 to 1.
     limit
-        Longest run [s]; no command is written after it.
+        Maximum duration of a run [s], after which no command is written.
     limits
         Safety limits of every command and sample.
     sensor_filter
-        Natural frequency [rad/s] and damping of a low-pass on both recorded deflections.
+        Natural frequency [rad/s] and damping ratio of a low-pass filter on both recorded deflections.
     """
 
     def __init__(
@@ -593,14 +605,14 @@ class Rig:
             raise RigFault(fault if fault.startswith(self.board.name) else f"{self.board.name}: {fault}")
 
     def run(self, commands: Floats) -> None:
-        """Apply commands, shape (n, 2) [A]; :meth:`take` returns the recorded rows.
+        """Apply commands [A], shape (n, 2), and record a sample for each; :meth:`take` returns the rows.
 
         Raises
         ------
         DataError
-            Commands of another shape, or no numbers.
+            If the commands have another shape or are not numbers.
         RigFault
-            A fault has latched; the motors stay at 0 V.
+            If a fault is latched. The motors stay at 0 V.
         """
         self._check()
         commands = as_floats("commands", commands)
@@ -628,12 +640,12 @@ class Rig:
         self._check()
 
     def fail(self, why: str, cause: BaseException | None = None) -> NoReturn:
-        """Latch a fault of the program and write 0 V immediately.
+        """Latch a fault of the program, write 0 V immediately, and raise RigFault.
 
         Raises
         ------
         RigFault
-            The first fault of the run, with its cause.
+            Always, with the first fault of the run and its cause.
         """
         self.guard.fail(why)
         with contextlib.suppress(Exception):
@@ -645,7 +657,7 @@ class Rig:
         raise RigFault(why) from cause
 
     def take(self) -> Floats:
-        """Return the rows since the last call, shape (n, 9): RIG_COLUMNS and the delay [s]."""
+        """Return the rows recorded since the last call, shape (n, 9): RIG_COLUMNS and the delay [s]."""
         return self.board.take()
 
 
@@ -659,14 +671,14 @@ WATCHDOG_EXPIRED_MESSAGE = "the watchdog expired: the program did not answer in 
 
 
 def check_rate(rate: float) -> None:
-    """Raise if the board does not support a sampling rate [Hz]."""
+    """Raise ModelError if the board does not support a sampling rate [Hz]."""
     low, high = SAMPLE_RATE_RANGE_HZ
     if not low <= rate <= high:
         raise ModelError(f"{setting('rate')} {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
 
 
 def check_watchdog(rate: float, seconds: float) -> None:
-    """Raise if the watchdog timeout [s] is shorter than two samples, so that it would expire between them."""
+    """Raise ModelError if the watchdog timeout [s] is shorter than two samples, so that it would always expire."""
     if seconds * rate < 2.0:
         raise ModelError(
             f"{setting('watchdog')} {seconds:g} s is shorter than two samples at {rate:g} Hz and would expire "
@@ -675,7 +687,7 @@ def check_watchdog(rate: float, seconds: float) -> None:
 
 
 def missing_expiration_state(*, analog: bool, digital: bool) -> str | None:
-    """Message on the watchdog expiration state that is not set; None if both are set."""
+    """Return a message on outputs that are not set for a watchdog expiration; None if all are set."""
     if not analog:
         return "the watchdog's expiration state of the analog outputs is not 0 V"
     if not digital:

@@ -1,4 +1,4 @@
-"""Virtual board: simulated arm with the access and watchdog rules of the real board."""
+"""Virtual board: the simulated arm behind the access and watchdog rules of the real board."""
 
 from __future__ import annotations
 
@@ -56,16 +56,16 @@ class VirtualBoard:
     real_time
         Whether to run in real time instead of as fast as possible.
     horizon
-        Longest run [s]; determines the size of the simulation history.
+        Maximum duration of a run [s], which determines the memory of the simulation.
     page
-        File of the output registers; by default a temporary one, which is deleted.
+        File of the output registers; by default a temporary file.
     inject
-        Injected faults: (name in FAULT_INJECTIONS, channel from 0, time [s], number).
+        Faults to inject for tests, each as (name in FAULT_INJECTIONS, channel from 0, time [s], number).
 
     Raises
     ------
     ModelError
-        An unknown fault, a channel that the arm does not have, or a time or number out of range.
+        If a fault or its channel is unknown, or its time or number is out of range.
     """
 
     parameters: ArmParameters = field(default_factory=lambda: PARAMETER_SETS["effective"])
@@ -94,7 +94,7 @@ class VirtualBoard:
             _checked_injection(fault)
 
     def open(self) -> None:
-        """Open the board: create the file of the output registers."""
+        """Open the board by creating the file of the output registers."""
         if self._page is not None:
             raise RigFault("virtual rig: the board is open already")
         self._page = watchdog.RegisterPage(self.page or watchdog.create_page_file(), create=True)
@@ -110,14 +110,14 @@ class VirtualBoard:
         self.write((0.0, 0.0))
 
     def set_expiration(self) -> None:
-        """Set the expiration states of the watchdog: 0 V and tristate."""
+        """Set the outputs that the watchdog applies when it expires: 0 V and tristate."""
         page = self._access()
         page.set("state1", 0.0)
         page.set("state2", 0.0)
         page.set("tristate", 1)
 
     def unsafe(self) -> str | None:
-        """Message on the expiration state that is not set; None if all are set."""
+        """Return a message if the outputs after a watchdog expiration are not set; None if all are set."""
         page = self._access()
         zero = all(page.get(f"state{k}") == 0.0 for k in (1, 2))
         return missing_expiration_state(analog=zero, digital=bool(page.get("tristate")))
@@ -137,7 +137,7 @@ class VirtualBoard:
         page.set("timeout", seconds if self.real_time else max(seconds, _MIN_FAST_WATCHDOG_S))
 
     def start(self, rate: float) -> None:
-        """Start the clock."""
+        """Start the clock of the samples."""
         self._require_arm().start(self.real_time)
         self._started = True
 
@@ -153,7 +153,7 @@ class VirtualBoard:
                 self._page.set("enabled", 0)
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Write output voltages; 0 V is always possible, without a heartbeat if nothing else is any more."""
+        """Write output voltages [V]; 0 V can always be written, after a fault without a heartbeat."""
         with self.gate.lock:
             page, closed = self._page, self.gate.reason is not None
             if volts == (0.0, 0.0) and page is not None and (closed or page.has_expired or self._has_lost_watchdog()):
@@ -162,17 +162,17 @@ class VirtualBoard:
                 self._output_volts(*volts)
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Sample with outputs at 0 V."""
+        """Record a number of samples with outputs at 0 V."""
         self._require_arm().rest(guard, self._random.standard_normal((samples, 4)), self._output_volts)
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Sample while applying commands, shape (n, 2) [A]."""
+        """Apply commands [A], shape (n, 2), and record a sample for each."""
         if not self._started:
             raise RigFault("virtual rig: the task is not started")
         self._require_arm().run(guard, commands, self._random.standard_normal((len(commands), 4)), self._output_volts)
 
     def take(self) -> Floats:
-        """Return the rows since the last call."""
+        """Return the rows recorded since the last call."""
         return np.empty((0, 9)) if self._arm is None else self._arm.take()
 
     def stop(self) -> None:
@@ -180,7 +180,7 @@ class VirtualBoard:
         self._started = False
 
     def let_expire(self) -> bool:
-        """Wait for the watchdog with the requested timeout; return whether it has expired with 0 V."""
+        """Wait for the timeout of the watchdog; return whether it has expired with outputs at 0 V."""
         page, process = self._page, self._process
         if page is None:
             return True
@@ -208,7 +208,7 @@ class VirtualBoard:
             self._process = None
 
     def close(self) -> None:
-        """Remove the output stage."""
+        """Close the board by removing the output registers."""
         with self.gate.lock:
             page, self._page = self._page, None
         if page is not None:
@@ -234,7 +234,7 @@ class VirtualBoard:
         return self._arm
 
     def _output_volts(self, volts1: float, volts2: float) -> tuple[tuple[float, float], bool]:
-        """Write output voltages; return them and whether the amplifiers are enabled."""
+        """Write output voltages [V]; return the applied ones, and whether the amplifiers are enabled."""
         with self.gate.lock:
             page = self._access()
             self.gate.check()
@@ -249,7 +249,7 @@ class VirtualBoard:
 
 
 def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Popen[bytes]:
-    """Start the watchdog process, which is not ready yet.
+    """Start the watchdog process, and return it before it is ready.
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Pop
     Raises
     ------
     OSError
-        The process could not be started.
+        If the process cannot be started.
     """
     # A separate session, and on Windows a console, so that Ctrl-C and Ctrl-Break do not reach the watchdog.
     return subprocess.Popen(
@@ -284,12 +284,12 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
     page
         Registers of the output stage.
     patience
-        Longest wait [s].
+        Maximum waiting time [s].
 
     Raises
     ------
     OSError
-        The process ended, or was not ready in time.
+        If the process ended, or was not ready in time.
     """
     until = time.monotonic() + patience
     try:
@@ -306,7 +306,7 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
 
 
 def _checked_injection(fault: object) -> tuple[str, int, float, float]:
-    """Return an injected fault; raise for an unknown name, or a channel, time or number out of range."""
+    """Return an injected fault as (name, channel, time [s], number); raise ModelError if it is invalid."""
     if not isinstance(fault, (tuple, list)) or len(fault) != 4:
         raise ModelError(f"inject has {short_repr(fault)}, which is not (name, channel, time [s], number)")
     name, channel, time_s, number = fault

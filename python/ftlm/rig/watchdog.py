@@ -1,9 +1,9 @@
-"""Output stage and watchdog of the virtual rig, in a separate process that stops the motors if the program ends.
+"""Output registers and watchdog process of the virtual rig, which stops the motors if the program ends.
 
-Run as a script with the path of a register file, it watches the heartbeat. It imports nothing of ftlm and no slow
-module. The rules are the board's: on expiry the analog outputs take their expiration states only if these are set and
-the digital lines are set to tristate; otherwise they keep their values. After an expiry the outputs stay locked until
-the watchdog is cleared.
+As a script with the path of a register file, the module watches the heartbeat. It imports nothing from ftlm and no slow
+module. Its rules are those of the board: on expiry, the analog outputs take their expiration states only if these are
+set and the digital lines are set to tristate. Otherwise they keep their values. After an expiry, the outputs stay
+locked until the watchdog is cleared.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ORPHAN_TIMEOUT_S = 30.0
 
 
 class RegisterPage:
-    """Registers of the output stage, in a file mapped by two processes.
+    """Registers of the output stage, in a file that two processes map into memory.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class RegisterPage:
         return self._map[PAGE_FIELDS["expired"][0]] != 0
 
     def write_heartbeat(self, beat: int, volts1: float, volts2: float) -> None:
-        """Write heartbeat and output voltages together."""
+        """Write the heartbeat counter and the output voltages [V] together."""
         _HEARTBEAT_FORMAT.pack_into(self._map, PAGE_FIELDS["beat"][0], beat, volts1, volts2)
 
     @property
@@ -98,7 +98,7 @@ class RegisterPage:
 
 
 def create_page_file() -> Path:
-    """Create a new file for registers, in shared memory if the system has it."""
+    """Create a new file for registers, in shared memory if the system has it, and return its path."""
     folder = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     descriptor, name = tempfile.mkstemp(prefix="ftlm-rig-", suffix=".page", dir=folder)
     os.close(descriptor)
@@ -106,7 +106,7 @@ def create_page_file() -> Path:
 
 
 def watch(path: str, *, keep: bool) -> None:
-    """Watch the heartbeat until the registers are closed, or the program has ended and the outputs are safe."""
+    """Watch the heartbeat until the registers are closed, or until the program has ended and the outputs are safe."""
     page = RegisterPage(path)
     parent = os.getppid()
     began = time.monotonic()
@@ -137,7 +137,7 @@ def watch(path: str, *, keep: bool) -> None:
 
 
 def trip(page: RegisterPage, now: float) -> None:
-    """Apply the expiration states by the board's rules; called repeatedly to override concurrent writes."""
+    """Apply the expiration states by the rules of the board; repeated calls override concurrent writes."""
     if not page.has_expired:
         page.set("tripped", now)
         page.set("expired", 1)

@@ -265,8 +265,13 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
 
     Parameters
     ----------
-    model The model. runs One run or several with the same names and units. m Number of block pulses per run for the
-    equation error; by default as in the identification, or fewer for shorter runs.
+    model
+        Model to compare.
+    runs
+        One run or several with the same names and units.
+    m
+        Number of block pulses per run for the equation error; by default as in the identification, or fewer for
+        shorter runs.
 
     Returns
     -------
