@@ -1,1 +1,1 @@
-"""Local web application: a browser session on 127.0.0.1 with one process per file read and per fit."""
+"""Local web application on 127.0.0.1, in which each file is read and each model fitted in a separate process."""

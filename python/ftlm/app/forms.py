@@ -1,4 +1,4 @@
-"""Form fields as a fit request, its execution, the equivalent Python script, and suggested structures."""
+"""Fit requests from form fields: their execution, the equivalent Python script, and suggested structures."""
 
 from __future__ import annotations
 
@@ -42,25 +42,25 @@ MAX_SCRIPT_LINE_CHARACTERS = 100
 
 
 class ProgressListener(Protocol):
-    """Receiver of progress reports."""
+    """Protocol of a receiver of progress reports."""
 
     def phase(self, words: str) -> None:
-        """Announce the next phase."""
+        """Report the start of the next phase."""
 
     def __call__(self, count: int, total: int) -> None:
-        """Report ``count`` of ``total`` parts."""
+        """Report that ``count`` of ``total`` parts are done."""
 
 
 @dataclass(frozen=True)
 class RunSource:
-    """File with the arguments of `ftlm.load` that turn it into a run.
+    """File of the page, with the arguments of `ftlm.load` that load it as a run.
 
     Parameters
     ----------
     file
         File name on the page.
     options
-        Options as `ftlm.open_file` returns them, the layout as a dictionary.
+        Arguments of `ftlm.load`, as `ftlm.open_file` returns them; the layout is a dictionary.
     path
         Path under which the page stores the file; "" for its name in the working folder.
     """
@@ -70,7 +70,7 @@ class RunSource:
     path: str = ""
 
     def run(self) -> Run:
-        """Load the run, named as if the file had its name on the page."""
+        """Load the run, whose name is that of the file on the page."""
         run = load(self.path or self.file, **self.options)
         if not self.path or run.name != base_name(Path(self.path)):
             return run
@@ -78,7 +78,7 @@ class RunSource:
         return run._with(name=name if is_run_name(name) else "run")
 
     def script(self, name: str) -> list[str]:
-        """Script lines that load the run."""
+        """Return the lines of a Python script that load the run into a variable."""
         return format_call(name, "ftlm.load", [format_string(self.file)], self.options)
 
 
@@ -91,13 +91,13 @@ class FitRequest:
     estimation
         Run that the model is fitted to.
     validation
-        Validation run; None without one, or if a part of the first run is used for validation.
+        Validation run; None without validation, or if a part of the first run is used for it.
     share
-        Share of the run, at its end, that is used for validation, from 0 (none) to 0.8.
+        Fraction of the run, at its end, that is used for validation, from 0 (none) to 0.8.
     structure
         Equations, or keys of :data:`NAMED_STRUCTURES`: several for ``"offered"``, none for ``"auto"``.
     way
-        One of :data:`SELECTION_MODES`.
+        Selection mode, one of :data:`SELECTION_MODES`.
     method, offset, loss
         Method and offset of :func:`ftlm.identify` and loss of :class:`ftlm.OutputError`; "" for the defaults.
     """
@@ -113,7 +113,7 @@ class FitRequest:
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> FitRequest:
-        """Build a request from the dictionary of :meth:`to_dict`."""
+        """Return the request from its dictionary; see :meth:`to_dict`."""
         other = fields["validation"]
         parts = {**fields, "structure": tuple(fields["structure"]), "estimation": RunSource(**fields["estimation"])}
         return cls(**{**parts, "validation": None if other is None else RunSource(**other)})
@@ -124,7 +124,7 @@ class FitRequest:
 
     @property
     def words(self) -> str:
-        """Structure of the request in one line."""
+        """Structure of the request as one line of text."""
         return {
             "fit": "; ".join(self.structure),
             "inside": f"chosen inside {'; '.join(self.structure)}",
@@ -133,16 +133,16 @@ class FitRequest:
         }[self.way]
 
     def settings(self) -> dict[str, str]:
-        """Options of the fit that the user gave, other than runs and structure."""
+        """Options of the fit that the user set, except runs and structure."""
         options = {"method": self.method, "offset": self.offset, "loss": self.loss}
         return {name: value for name, value in options.items() if value}
 
     def estimation_method(self) -> EstimationMethod:
-        """Method of the fit with its options."""
+        """Return the method of estimation with its options."""
         return method_with_options(self.method or METHOD_NAMES[0], {"loss": self.loss} if self.loss else {})
 
     def identify_arguments(self) -> list[str]:
-        """Arguments of `ftlm.identify` after runs and structure, as Python expressions."""
+        """Return the arguments of `ftlm.identify` after runs and structure, as Python expressions."""
         arguments = [f"method={format_string(self.method)}"] if self.method else []
         if self.loss:
             kind = type(self.estimation_method()).__name__
@@ -150,22 +150,22 @@ class FitRequest:
         return [*arguments, *([f"offset={format_string(self.offset)}"] if self.offset else [])]
 
     def structures(self) -> list[Structure]:
-        """Structures of the request.
+        """Return the structures of the request.
 
         Raises
         ------
         ModelError
-            An invalid equation.
+            If an equation is invalid.
         """
         return [structure_of(text) for text in self.structure]
 
     @property
     def is_choice(self) -> bool:
-        """Whether a structure is selected, which takes long enough to need a checkpoint."""
+        """Whether the request selects a structure, which takes so long that a checkpoint is useful."""
         return self.way != "fit"
 
     def fit_model(self, listener: ProgressListener, store: str | None = None) -> FittedModel:
-        """Fit the model.
+        """Fit the model, and return it with its runs and a script.
 
         Parameters
         ----------
@@ -177,7 +177,7 @@ class FitRequest:
         Raises
         ------
         DataError, ModelError, ConvergenceError
-            As :func:`ftlm.load`, :func:`ftlm.identify`, :func:`ftlm.select`.
+            In the cases of :func:`ftlm.load`, :func:`ftlm.identify` and :func:`ftlm.select`.
         """
         structures = self.structures()
         listener.phase("reading")
@@ -199,7 +199,7 @@ class FitRequest:
         )
 
     def _time_estimate(self, run: Run, structure: Structure) -> str:
-        """Time estimate of a fit as text; empty for a short fit."""
+        """Return an estimate of the duration of a fit as text; empty for a short fit."""
         numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
         seconds = estimate_duration(
             output_error_cost(run.length * len(structure.outputs), numbers), check_threads(None)
@@ -209,7 +209,7 @@ class FitRequest:
         return f", {format_time_left(seconds).removesuffix(' left')} in all"
 
     def _runs(self) -> tuple[Run, Run | None, float | None]:
-        """Estimation run, validation run, and the time at which one run was split [s]."""
+        """Return the estimation run, the validation run, and the time at which one run was split [s] (or None)."""
         run = self.estimation.run()
         if self.validation is not None:
             return run, self.validation.run(), None
@@ -219,7 +219,7 @@ class FitRequest:
         return run.window(None, cut), run.window(cut, None), cut
 
     def _script(self, cut: float | None) -> str:
-        """Python script of the whole fit."""
+        """Return a Python script that repeats the whole fit; `cut` is the time at which the run is split [s]."""
         stem = Path(self.estimation.file).stem
         lines = [
             f'"""A model of {sanitize_for_docstring(self.estimation.file)}, as made by the page of ftlm '
@@ -258,7 +258,7 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """Model of a fit with its runs and the script that reproduces it."""
+    """Model with its runs and the script that reproduces it."""
 
     result: Identification
     run: Run
@@ -269,12 +269,12 @@ class FittedModel:
 
 
 def structure_of(text: str) -> Structure:
-    """Return the structure of an equation or of a key of :data:`NAMED_STRUCTURES`."""
+    """Return the structure that an equation or a key of :data:`NAMED_STRUCTURES` denotes."""
     return NAMED_STRUCTURES[text]() if text in NAMED_STRUCTURES else equation(text)
 
 
 def parse_structures(recipe: FitRequest) -> list[Structure]:
-    """Return the structures of a request; raise for options that contradict each other."""
+    """Return the structures of a request; raise ModelError if options contradict each other."""
     for name, value, choices in (
         ("way", recipe.way, SELECTION_MODES),
         ("method", recipe.method, ("", *METHOD_NAMES)),
@@ -298,17 +298,17 @@ def parse_structures(recipe: FitRequest) -> list[Structure]:
 
 
 def split_time(rows: int, step: float, share: float) -> float:
-    """Time [s] at which a run is split so that this share of its samples comes after it."""
+    """Return the time [s] at which a run is split, so that the given fraction of its samples follows."""
     return float(f"{round(rows * (1.0 - share)) * step:.9g}")
 
 
 def structure_expression(structure: str) -> str:
-    """Python expression of a structure."""
+    """Return the Python expression of a structure."""
     return f"ftlm.{structure}" if structure in NAMED_STRUCTURES else f"ftlm.equation({format_string(structure)})"
 
 
 def format_call(target: str, function: str, values: list[str], keywords: Mapping[str, Any]) -> list[str]:
-    """Python call; one line per argument if one line is too long."""
+    """Return a Python call as lines of code, with one argument per line if one line would be too long."""
     parts = [*values, *(f"{name}={format_literal(value)}" for name, value in keywords.items())]
     line = f"{target} = {function}({', '.join(parts)})"
     if len(line) <= MAX_SCRIPT_LINE_CHARACTERS:
@@ -317,7 +317,7 @@ def format_call(target: str, function: str, values: list[str], keywords: Mapping
 
 
 def format_literal(value: Any) -> str:
-    """Python expression of a JSON value."""
+    """Return the Python expression of a JSON value."""
     if isinstance(value, str):
         return format_string(value)
     if isinstance(value, Mapping):
@@ -326,14 +326,14 @@ def format_literal(value: Any) -> str:
 
 
 def format_string(text: str) -> str:
-    """Python string literal in double quotes, without control characters of a terminal."""
+    """Return a Python string literal in double quotes, with escaped control characters."""
     if text.isprintable():
         return json.dumps(text, ensure_ascii=False)
     return repr(text).encode("ascii", "backslashreplace").decode()
 
 
 def sanitize_for_docstring(text: str) -> str:
-    """Return a file name reduced to characters that are safe inside a docstring."""
+    """Return a file name reduced to characters that are safe within a docstring."""
     return "".join(c if c.isalnum() or c in " ._-()" else "?" for c in text)[:100]
 
 
@@ -347,7 +347,7 @@ MAX_SIGNALS = 500
 
 
 def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert form fields to arguments; an empty field is omitted.
+    """Return arguments of `ftlm.open_file` from form fields; empty fields are omitted.
 
     Parameters
     ----------
@@ -358,7 +358,7 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
     Raises
     ------
     DataError
-        An unknown field, or a field without the number that it needs.
+        If a field is unknown, or a number in it is invalid.
     """
     options: dict[str, Any] = {}
     for name in ("step", "resample"):
@@ -380,7 +380,7 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _roles(columns: Any) -> dict[str, Any]:
-    """Time, inputs, outputs and units; empty without a list of columns."""
+    """Return time, inputs, outputs and units from the list of columns of a form; {} without a list."""
     if columns is None:
         return {}
     if not isinstance(columns, list) or len(columns) > MAX_SIGNALS:
@@ -408,7 +408,7 @@ def _roles(columns: Any) -> dict[str, Any]:
 
 
 def parse_number(name: str, text: str) -> float:
-    """Return the number of a form field."""
+    """Return the number in a form field; raise DataError if there is none."""
     try:
         return float(text)
     except ValueError:
@@ -416,7 +416,7 @@ def parse_number(name: str, text: str) -> float:
 
 
 def _parse_line_count(name: str, text: str) -> int:
-    """Return the number of lines in a form field."""
+    """Return the number of lines in a form field; raise DataError if it is invalid."""
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise DataError(f"{name}: {text[:40]!r} is not a number of lines; write one such as 2")
     return int(text)
@@ -438,7 +438,10 @@ MAX_DELAY_SHARE = 0.1
 
 
 def suggest_structures(inputs: Sequence[str], outputs: Sequence[str], duration: float) -> list[dict[str, str]]:
-    """Structures suggested for each output of a run of some duration [s]: name, purpose, equation, output."""
+    """Return suggested structures for each output of a run, each with name, purpose, equation and output.
+
+    `duration` is that of the run [s].
+    """
     suggestions: list[dict[str, str]] = []
     driven = list(inputs)[:MAX_SUGGESTED_SIGNALS]
     for output in list(outputs)[:MAX_SUGGESTED_SIGNALS]:

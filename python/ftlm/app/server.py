@@ -1,4 +1,4 @@
-"""HTTP server on 127.0.0.1: its socket, its start and its end."""
+"""HTTP server on 127.0.0.1: opening of its socket, start and end."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ READ_CHUNK_BYTES = 1 << 20
 
 
 def check_installed() -> None:
-    """Raise if a package of the server is not installed."""
+    """Raise ModelError if a package that the server requires is not installed."""
     for package in ("uvicorn", "starlette"):
         if importlib.util.find_spec(package) is None:
             raise ModelError(f"ftlm app needs {package}; run: pip install 'ftlm[app]'")
 
 
 def open_socket(port: int | None) -> tuple[socket.socket, str]:
-    """Open a socket on the loopback address; return it with a note about its port.
+    """Open a socket on the loopback address, and return it with a note on its port.
 
     Parameters
     ----------
     port
-        Port; None for the default, or for any free one if the default is taken.
+        Port number; None for the default port, or for any free one if the default is in use.
 
     Raises
     ------
     ModelError
-        A port out of range.
+        If the port is out of range.
     DataError
-        A port that is taken or not allowed.
+        If the port is in use or not allowed.
     """
     if port is not None and not 0 <= port <= 65535:
         raise ModelError(f"{setting('port')} {port} is not a valid port; take one from 1024 to 65535, or 0 for any")
@@ -69,7 +69,7 @@ def open_socket(port: int | None) -> tuple[socket.socket, str]:
 
 
 def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool = True) -> None:
-    """Serve the application until Ctrl-C.
+    """Run the web application until Ctrl-C.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ def serve(files: Sequence[str] = (), *, port: int | None = None, browser: bool =
     Raises
     ------
     DataError
-        A file that does not exist, or a port that is taken.
+        If a file does not exist, or the port is in use.
     ModelError
-        The server package is not installed.
+        If the server package is not installed.
     """
     check_installed()
     paths = [Path(file) for file in files]
@@ -148,7 +148,7 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
 
 
 async def _read_chunks(path: Path) -> AsyncIterator[bytes]:
-    """Yield the chunks of a file on this machine."""
+    """Yield the content of a local file in chunks."""
     with open(path, "rb") as stream:
         while piece := stream.read(READ_CHUNK_BYTES):
             yield piece

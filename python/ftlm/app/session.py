@@ -1,4 +1,4 @@
-"""Browser session: files in a private folder under their keys, models in a queue, and the limits of both."""
+"""State of a browser session: files in a private folder, a queue of models, and the limits of both."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ STATE_WAITING, STATE_RUNNING, STATE_MADE, STATE_FAILED, STATE_STOPPED = (
 
 @dataclass
 class File:
-    """File of the session.
+    """File that was uploaded to the session.
 
     Parameters
     ----------
     key, name, size
-        Identifier on the page and in the folder, name on the page, size in bytes.
+        Identifier on the page and in the folder, name on the page, and size in bytes.
     user_options
         Options set by the user, as arguments of `ftlm.open_file`.
     preview
         Description of the file; None while it is read or if it cannot be read.
     error
-        Reason why it cannot be read.
+        Reason why the file cannot be read; empty otherwise.
     version
         Number of changes.
     """
@@ -73,7 +73,7 @@ class File:
 
     @property
     def stored_name(self) -> str:
-        """Name in the folder: the key, with the extensions by which readers tell formats apart."""
+        """File name in the folder: the key and the original extensions, by which readers recognize formats."""
         suffixes = re.search(r"(\.[A-Za-z0-9]{1,10}){0,2}\Z", self.name)
         return self.key + (suffixes[0] if suffixes else "")
 
@@ -83,14 +83,14 @@ class File:
         return self.preview is not None and not self.preview["problem"]
 
     def run_source(self, folder: Path) -> RunSource:
-        """Return the file and the arguments of `ftlm.load`, all options included."""
+        """Return the file with all arguments of `ftlm.load`."""
         assert self.preview is not None
         return RunSource(self.name, self.preview["options"], str(folder / self.stored_name))
 
 
 @dataclass
 class Model:
-    """Model of the session.
+    """Model that was requested in the session.
 
     Parameters
     ----------
@@ -99,7 +99,8 @@ class Model:
     state
         ``"waiting"``, ``"running"``, ``"made"``, ``"failed"`` or ``"stopped"``.
     phase, share, started_at, phase_started_at, time_left, took
-        Current phase, finished share of it, start times of the fit and of the phase, time left as text, duration [s].
+        Current phase, finished fraction of it, start times of the fit and of the phase, remaining time as text, and
+        duration [s].
     description
         Content of the page about the model.
     error
@@ -153,7 +154,7 @@ class Session:
     # ------------------------------------------------------------------------------------------------------------ files
 
     def check_room(self, name: str, size: int | None) -> str:
-        """Return the name of a file on the page; refuse a file beyond the limits."""
+        """Return the name under which the page shows a file; raise DataError if the file exceeds a limit."""
         if len(self.files) >= MAX_FILES:
             raise DataError(f"{MAX_FILES} files are open, the maximum number; remove one")
         if size is not None:
@@ -180,12 +181,14 @@ class Session:
         return free
 
     async def take(self, name: str, size: int | None, chunks: AsyncIterator[bytes]) -> File:
-        """Store a file that arrives in chunks, and start to open it. Most files are open on return.
+        """Store a file that arrives in chunks, start to read its preview, and return it.
+
+        Most previews are ready on return.
 
         Raises
         ------
         DataError
-            The file exceeds a size limit, declared or not, or there are too many files.
+            If the file exceeds a size limit or there are too many files.
         """
         free = self.check_room(name, size)
         # Its name is taken from here on; a second one of that name gets another.
@@ -208,14 +211,14 @@ class Session:
         return file
 
     def _start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a background job and keep a reference to it."""
+        """Start a background task, keep a reference to it, and return it."""
         job = asyncio.create_task(work)
         self._jobs.add(job)
         job.add_done_callback(self._jobs.discard)
         return job
 
     async def open(self, file: File) -> None:
-        """Read the preview of a file with the user's options; an earlier reading is stopped."""
+        """Read the preview of a file with the user's options; an earlier reading of the file is stopped."""
         if file.task is not None:
             file.task.stop()
         request = {"do": "open", "file": str(self.folder / file.stored_name), "options": file.user_options}
@@ -231,12 +234,12 @@ class Session:
         file.version += 1
 
     def remove_file(self, key: str) -> None:
-        """Remove a file; models identified from it stay.
+        """Remove a file; models that were identified from it remain.
 
         Raises
         ------
         DataError
-            A queued or running model needs the file.
+            If a queued or running model requires the file.
         """
         file = self.files[key]
         if any(m.is_busy and file.name in _file_names(m.recipe) for m in self.models.values()):
@@ -250,12 +253,12 @@ class Session:
     # ----------------------------------------------------------------------------------------------------------- models
 
     def parse_request(self, fields: Mapping[str, Any]) -> FitRequest:
-        """Return the fit request of the page's form.
+        """Return the fit request that the form of the page defines.
 
         Raises
         ------
         DataError, ModelError
-            A file that is absent, still being read or no run; an unknown option; an invalid equation.
+            If a file is missing, still being read or not a run, an option is unknown, or an equation is invalid.
         """
         other = str(fields.get("validation") or "")
         share = real_number("share", fields.get("share", 0))
@@ -293,12 +296,12 @@ class Session:
         return file.run_source(self.folder)
 
     def start(self, recipe: FitRequest) -> Model:
-        """Queue a model.
+        """Add a model to the queue, and return it.
 
         Raises
         ------
         DataError
-            Too many models, or too many in the queue.
+            If there are too many models, or too many in the queue.
         """
         if len(self.models) >= MAX_MODELS:
             raise DataError(f"{MAX_MODELS} models are kept, the maximum number; remove one")
@@ -315,12 +318,14 @@ class Session:
             raise DataError(f"{MAX_QUEUED_MODELS} models wait already; stop one, or wait")
 
     def resume(self, key: str) -> Model:
-        """Continue a stopped model: a structure selection from its checkpoint, a fit from the beginning.
+        """Continue a stopped model, and return it.
+
+        A structure selection continues from its checkpoint, a fit from the beginning.
 
         Raises
         ------
         DataError
-            One of its files was removed, or the queue is full.
+            If one of its files was removed, or the queue is full.
         """
         model = self.models[key]
         if model.state not in (STATE_STOPPED, STATE_FAILED):
@@ -362,7 +367,7 @@ class Session:
             model.version += 1
 
     def stop(self, key: str) -> None:
-        """Stop a queued or running model; finished files stay."""
+        """Stop a queued or running model; files that it has written remain."""
         model = self.models[key]
         if model.is_busy:
             model.state = STATE_STOPPED
@@ -381,7 +386,7 @@ class Session:
     # ------------------------------------------------------------------------------------------------------------- both
 
     def without_paths(self, words: str) -> str:
-        """Return a message without folders of this machine, with the names of files on the page."""
+        """Return a message in which local paths are replaced by the names of files on the page."""
         folder = str(self.folder)
         words = words.replace(f"{folder}/", "").replace(f"{folder}\\", "").replace(folder, "the page's folder")
         for file in self.files.values():
@@ -389,7 +394,7 @@ class Session:
         return words
 
     def _with_names(self, answer: Any) -> Any:
-        """Return an answer of a task with :meth:`without_paths` applied to every text."""
+        """Return the answer of a task with :meth:`without_paths` applied to all its text."""
         if isinstance(answer, dict):
             return {key: self._with_names(value) for key, value in answer.items()}
         if isinstance(answer, list):
@@ -411,7 +416,7 @@ class Session:
 
 
 def _check_signals(structure: Structure, reading: RunSource) -> None:
-    """Raise if the run lacks a signal of the structure, before a process is started."""
+    """Raise an error if the run lacks a signal of the structure, before a process is started."""
     names = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
     for name in structure.signals:
         if name not in names:
@@ -426,7 +431,7 @@ def _file_names(recipe: FitRequest) -> set[str]:
 
 
 def _record_progress(model: Model, message: Mapping[str, Any]) -> None:
-    """Store a progress report of a task process in its model."""
+    """Store a progress report of a worker process in its model."""
     if "phase" in message:
         model.phase, model.share, model.time_left = str(message["phase"]), None, ""
         model.phase_started_at = time.monotonic()
@@ -444,7 +449,7 @@ def _record_progress(model: Model, message: Mapping[str, Any]) -> None:
 
 
 def safe_name(name: str) -> str:
-    """Return a file name without folders and without characters that a file system refuses."""
+    """Return a file name without folders and without characters that a file system rejects."""
     last = re.split(r"[/\\]", name)[-1]
     bare = "".join(c if c.isprintable() and c not in _RESERVED_CHARACTERS else "_" for c in last).strip(" .") or "file"
     stem, dot, suffix = bare.rpartition(".")

@@ -1,4 +1,4 @@
-"""Parent side of a task process: start it, read its messages line by line, and kill it."""
+"""Worker processes from the side of the server: their start, messages and end."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ MAX_ANSWER_LINE_BYTES = 64 << 20
 
 
 class TaskError(DataError):
-    """Task that ended without an answer; the message is for the page."""
+    """Error of a task that ended without an answer, with a message for the page."""
 
 
 class Task:
-    """Task in a process of its own.
+    """Task that runs in a separate worker process.
 
     Parameters
     ----------
     request
         Task for :mod:`ftlm.app.worker`, as JSON.
     listener
-        Called with each progress report.
+        Callback for each progress report.
     """
 
     def __init__(self, request: Mapping[str, Any], listener: Callable[[Mapping[str, Any]], None]) -> None:
@@ -52,7 +52,7 @@ class Task:
         Raises
         ------
         TaskError
-            The task reported an error, crashed, was stopped or exceeded the time limit.
+            If the task reports an error, crashes, is stopped or exceeds the time limit.
         """
         if self._ended:
             raise TaskError("stopped")
@@ -80,7 +80,7 @@ class Task:
             await process.wait()
 
     async def _read_answer(self, process: asyncio.subprocess.Process) -> dict[str, Any]:
-        """Return the answer of the process and forward its reports."""
+        """Return the answer of the process, after its progress reports are passed to the listener."""
         assert process.stdin is not None
         assert process.stdout is not None
         with contextlib.suppress(ConnectionError):
@@ -104,7 +104,7 @@ class Task:
             self._listener(message)
 
     def stop(self) -> None:
-        """Kill the task; :meth:`answer` then raises."""
+        """Kill the process; :meth:`answer` then raises TaskError."""
         self._ended = True
         self._kill()
 
@@ -121,7 +121,7 @@ class Task:
 
 
 def _describe_exit(code: int) -> str:
-    """Describe the exit of a process that gave no answer."""
+    """Return text on the exit of a process that gave no answer."""
     if code >= 0:
         return f"the process that worked on it ended with code {code}, without an answer; try a smaller file"
     return f"the process that worked on it crashed ({describe_crash(code)}); the page and all models are still here"

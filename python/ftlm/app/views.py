@@ -1,4 +1,4 @@
-"""HTML of the page, of its files and of its models; the templates escape all text from files and users."""
+"""HTML of the page and of its files and models; templates escape all text from files and users."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _VERDICT_RANKS = {"trust": 0, "with care": 1, "do not use": 2}
 
 
 def _field_label(match: re.Match[str]) -> str:
-    """Label of the form field of an argument, with its value."""
+    """Return the label of the form field of a matched argument, with its value."""
     name, value = match[1] or match[4], match[2] or match[3]
     label = "the role “time”" if name == "time" else f"the field “{_FIELD_LABELS.get(name, name)}”"
     return f"{label} {value}" if value else label
@@ -80,25 +80,25 @@ def _render_template(template: str, **context: Any) -> str:
 
 @cache
 def script() -> str:
-    """Return the script of the page, after that of its charts."""
+    """Return the JavaScript of the page, including that of charts."""
     return f"{chart_script()}\n{_read('app.js')}"
 
 
 @cache
 def style() -> str:
-    """Return the style of reports and of the page."""
+    """Return the style sheet of the page, including that of reports."""
     return f"{style_sheet()}\n{chart_css()}\n{_read('app.css')}"
 
 
 def page_words(text: str) -> str:
-    """Return an error message with form labels in place of Python arguments."""
+    """Return an error message in which Python arguments are replaced by form labels."""
     for pattern, words in _PHRASE_REPLACEMENTS:
         text = pattern.sub(words, text)
     return _ARGUMENT_PATTERN.sub(_field_label, text)
 
 
 def page(desk: Session) -> str:
-    """Return the whole page in its current state."""
+    """Return the HTML of the whole page in its current state."""
     parts = {
         "files": Markup("").join(Markup(file(f)) for f in desk.files.values()),  # escaped by its template
         "models": Markup("").join(Markup(model(m)) for m in reversed(desk.models.values())),
@@ -117,7 +117,7 @@ def page(desk: Session) -> str:
 
 
 def file(item: File) -> str:
-    """Return a file with its columns and assumptions."""
+    """Return the HTML of a file with its columns and assumptions."""
     preview = item.preview
     options = {} if preview is None else preview["options"]
     facts = {
@@ -143,12 +143,12 @@ def file(item: File) -> str:
 
 
 def model(item: Model) -> str:
-    """Return a model in any state."""
+    """Return the HTML of a model in any state."""
     return _render_template("model.html.j2", model=item, description=item.description, recipe=item.recipe)
 
 
 def comparison(desk: Session) -> str:
-    """Return a table of the models, the most trustworthy first."""
+    """Return an HTML table of the models, the best verdicts first."""
     models = [m for m in desk.models.values() if m.state == STATE_MADE and m.description is not None]
     models.sort(key=lambda m: (_VERDICT_RANKS.get((m.description or {})["verdict"]["level"], 3), -_worst_fit(m)))
     outputs = list(dict.fromkeys(f["output"] for m in models for f in (m.description or {})["fits"]))
@@ -157,13 +157,13 @@ def comparison(desk: Session) -> str:
 
 
 def _worst_fit(item: Model) -> float:
-    """Worst fit of a model, on validation data if there are any."""
+    """Return the smallest fit of a model in percent, on validation data if there are any."""
     fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (item.description or {})["fits"]]
     return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
 
 
 def state(desk: Session) -> dict[str, Any]:
-    """Return versions and progress of files and models, for polling by the page."""
+    """Return versions and progress of all files and models, which the page polls."""
     return {
         "files": {f.key: f.version for f in desk.files.values()},
         "models": {
@@ -185,7 +185,7 @@ MAX_FIGURES = 12
 
 
 def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
-    """Return the page content of a model; markup consists of escaped parts."""
+    """Return the content of the page on a model; all text in its markup is escaped."""
     result, checked = fitted_model.result, fitted_model.validation
     judgement = verdict(result, checked)
     warnings, rest = first_findings([*result.findings, *(checked.findings if checked else ())])
@@ -232,5 +232,5 @@ def figure_markup(figures: Sequence[Figure]) -> list[dict[str, str]]:
 
 
 def run_figures(run: Run) -> list[dict[str, str]]:
-    """Return charts of a run's signals over time, outputs first."""
+    """Return the markup of charts of a run's signals over time, outputs first."""
     return figure_markup(list(run.plot(*[*run.outputs, *run.inputs][:MAX_FIGURES])))

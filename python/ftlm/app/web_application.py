@@ -1,4 +1,4 @@
-"""Web application of the page on starlette: checks of each request, routes, responses, timeouts of connections."""
+"""Web application on starlette: checks of requests, routes, responses, and timeouts of connections."""
 
 from __future__ import annotations
 
@@ -55,17 +55,17 @@ MODEL_FILES = {
 
 
 def html_response(text: str) -> Response:
-    """Return a page, or a part of it."""
+    """Return an HTML response."""
     return Response(text.encode("utf-8", "replace"), media_type="text/html")
 
 
 def json_response(content: object, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    """Return an object as JSON."""
+    """Return a JSON response of an object."""
     return Response(json.dumps(content), status, headers, "application/json")
 
 
 async def read_json(request: Request) -> dict[str, Any]:
-    """Return the body of a request as a JSON object."""
+    """Return the body of a request as a JSON object; raise an HTTP error if it is none."""
     body = b""
     async for chunk in request.stream():
         body += chunk
@@ -88,11 +88,11 @@ class WebApplication:
     desk
         Session to serve.
     token
-        Secret part of the address.
+        Secret part of the address, without which requests are rejected.
     hosts
         Accepted host names with ports.
     key
-        Secret of the one-time address that redirects to the permanent one.
+        Secret of an address that can be used once, and redirects to the permanent address.
     """
 
     def __init__(self, desk: Session, token: str, hosts: tuple[str, ...], key: str = "") -> None:
@@ -156,7 +156,7 @@ class WebApplication:
         return view.page_words(self._desk.without_paths(str(error)))
 
     def _check_head(self, scope: Scope) -> str:
-        """Check the head of a request, and return its path without the token."""
+        """Check the head of a request, and return its path without the token; raise an HTTP error if it is invalid."""
         headers = Headers(scope=scope)
         for name in ("host", "origin", "content-length"):
             if len(headers.getlist(name)) > 1:
@@ -182,11 +182,14 @@ class WebApplication:
         return f"{slash}{rest}"
 
     def _redirection(self) -> HTTPException:
-        """Return the redirection to the permanent address."""
+        """Return the redirection to the permanent address, as an HTTP error to raise."""
         return HTTPException(303, headers={"location": f"/{self._token}/"})
 
     def _redeem_key(self, key: str) -> None:
-        """Redirect the first visitor with the one-time key. The key is visible in the command line of the browser."""
+        """Redirect the first visitor who has the one-time key; reject later ones.
+
+        The key is visible in the command line of the browser.
+        """
         good = bool(self._key) and secrets.compare_digest(key.encode("utf-8", "replace"), self._key.encode())
         if not good:
             raise HTTPException(404, "this address was good once; the one that lasts is in the terminal of ftlm app")
@@ -194,7 +197,7 @@ class WebApplication:
         raise self._redirection()
 
     async def _check(self, request: Request) -> Response:
-        """Return the error message of a fit request, or "" if it is valid."""
+        """Return the error message of a fit request, or "" if the request is valid."""
         request_body = await read_json(request)
         try:
             self._desk.parse_request(request_body)
@@ -248,7 +251,7 @@ class WebApplication:
         return html_response(view.model(self._desk.resume(model.key)))
 
     async def _download(self, request: Request) -> Response:
-        """Return a file of a model. Its path never comes from the request."""
+        """Return a file of a model; no part of its path comes from the request."""
         model = _find(self._desk.models, request, "model")
         if model.state != STATE_MADE or model.description is None:
             raise HTTPException(404, "this model is not made yet")
@@ -271,7 +274,7 @@ class WebApplication:
 
 
 def _view(make: Callable[[], str], media_type: str) -> Endpoint:
-    """Return the endpoint of a text that is made for each request."""
+    """Return the endpoint that responds with the text of a function, called for each request."""
 
     async def endpoint(_: Request) -> Response:
         return Response(make().encode("utf-8", "replace"), media_type=media_type)
@@ -280,7 +283,7 @@ def _view(make: Callable[[], str], media_type: str) -> Endpoint:
 
 
 def _find(items: Mapping[str, Item], request: Request, kind: str) -> Item:
-    """Return the file or model whose key is in the path."""
+    """Return the file or model whose key is in the path; raise an HTTP error if there is none."""
     item = items.get(request.path_params["key"])
     if item is None:
         raise HTTPException(404, f"this {kind} is no longer on the page")
@@ -292,9 +295,11 @@ CLIENT_TIMEOUT_S = 20.0
 
 
 class TimedConnection(H11Protocol):
-    """HTTP connection that checks its client twice per :data:`CLIENT_TIMEOUT_S`, and closes itself after a timeout.
+    """HTTP connection that closes itself if its client is inactive for :data:`CLIENT_TIMEOUT_S`.
 
-    The keep-alive limit of uvicorn only covers connections that are idle after an answer.
+    The client is checked twice within this time.
+
+    The keep-alive limit of uvicorn applies only to connections that are idle after an answer.
     """
 
     _since = 0.0
@@ -302,13 +307,13 @@ class TimedConnection(H11Protocol):
     _next: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the timeout."""
+        """Start the timeout of a new connection."""
         super().connection_made(transport)
         self._since = self.loop.time()
         self._schedule_check()
 
     def data_received(self, data: bytes) -> None:
-        """Restart the timeout at each part of a body, and at the end of a head."""
+        """Restart the timeout at each part of a request body, and at the end of a request head."""
         state_before = self.conn.their_state
         super().data_received(data)
         if self.conn.their_state is not state_before or state_before is h11.SEND_BODY:

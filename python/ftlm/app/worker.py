@@ -1,8 +1,10 @@
-"""Worker process that opens a file or fits a model, isolated from hostile files and long fits.
+"""Worker process that opens a file or fits a model, separate from the server.
 
-Run by path (`ftlm.utils.resources.python_child`). The first line of standard input is the task, a JSON object with
-absolute paths: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …,
-"report": …}``. The process ends when standard input ends. Standard output has one JSON object per line:
+Neither damaged files nor long fits can affect the server.
+
+`ftlm.utils.resources.python_child` runs this file by its path. The first line of standard input is the task, a JSON
+object with absolute paths: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …,
+"model": …, "report": …}``. The process ends when standard input ends. Standard output has one JSON object per line:
 ``{"phase": words}``, ``{"done": …, "total": …}`` and finally ``{"answer": …}`` or ``{"error": words}``.
 """
 
@@ -31,7 +33,7 @@ MAX_SHOWN_COLUMNS = 200
 
 
 class Reports(Progress):
-    """Progress reports on standard output, one line each; thread-safe."""
+    """Writer of progress reports to standard output, one line each; it is thread-safe."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__("", quiet=True)
@@ -40,14 +42,14 @@ class Reports(Progress):
         self._last = 0.0
 
     def send(self, **facts: Any) -> None:
-        """Write one line."""
+        """Write one line of JSON."""
         line = json.dumps(facts, allow_nan=False)
         with self._turn:
             self._stream.write(line + "\n")
             self._stream.flush()
 
     def phase(self, words: str) -> None:
-        """Announce the next phase."""
+        """Report the start of the next phase."""
         self.send(phase=words)
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
@@ -59,7 +61,7 @@ class Reports(Progress):
 
 
 def main() -> None:
-    """Run the task of standard input."""
+    """Run the task on standard input."""
     # What anything prints must not stand between the answers.
     stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -80,7 +82,7 @@ def main() -> None:
 
 
 def _end_with_parent() -> None:
-    """Exit when the parent process ends."""
+    """Exit when standard input ends, which it does when the parent process ends."""
     sys.stdin.read()
     os._exit(1)
 
@@ -119,7 +121,7 @@ def _run_preview(opened: OpenedFile) -> dict[str, Any]:
 
 
 def make_model(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
-    """Fit a model, write its files, and return its summary for the page."""
+    """Fit a model, write its files, and return a summary for the page."""
     fitted_model = FitRequest.of(task["recipe"]).fit_model(reports, task["store"])
     reports.phase("writing the report")
     fitted_model.result.model.save(task["model"])

@@ -1,4 +1,4 @@
-"""Figures for papers as matplotlib objects (``ax=`` in every function), and charts of reports as SVG (``svg_…``)."""
+"""Charts of results: matplotlib figures for papers (``ax=`` in every function), and SVG charts of reports."""
 
 from ftlm.estimation.cost_surface import correlated_orders
 from ftlm.estimation.cost_surface import output_error_landscape as svg_output_error_landscape

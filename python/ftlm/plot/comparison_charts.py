@@ -43,12 +43,12 @@ def comparison_charts(
     points: int = MAX_LINE_POINTS,
     bands: Mapping[str, Band] | None = None,
 ) -> list[LineChart]:
-    """Chart measured and simulated output, for every output of every run.
+    """Return a chart of measured and simulated values for every output of every run.
 
     Parameters
     ----------
     comparison
-        From :func:`ftlm.compare` or an identification.
+        Result of :func:`ftlm.compare`, or the comparison of an identification.
     units
         Units of the outputs.
     label
@@ -56,7 +56,7 @@ def comparison_charts(
     points
         Most points of a line.
     bands
-        Lower and upper end of a 95 % band of the simulated output of the only run, by output.
+        (lower, upper) edge of a 95 % band of the simulated output by output, if there is one run.
     """
     bands_by_output = bands or {}
     return [
@@ -78,21 +78,21 @@ def comparison_charts(
 
 
 def _behind_measured(band: Band) -> list[Band]:
-    """Return the bands of a chart of the measured and the simulated output; the measured one has none."""
+    """Return the bands of a chart of measured and simulated output; the measured line has an empty band."""
     none = np.full(band[0].size, np.nan)
     return [(none, none), band]
 
 
 @check_arguments
 def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = MAX_LINE_POINTS) -> list[LineChart]:
-    """Inputs of every run, to stand below its outputs.
+    """Return charts of the inputs of every run, which are placed below its outputs.
 
     Parameters
     ----------
     runs
         The runs.
     signals
-        Which inputs, as far as a run has them.
+        Names of the inputs; those that a run lacks are omitted.
     points
         Most points of a line.
     """
@@ -119,7 +119,7 @@ def signal_chart(run: Run, name: str, *, points: int = MAX_LINE_POINTS) -> LineC
 def residual_series(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[LineChart]:
-    """Chart residuals of the simulation over time and their histogram, for every output of every run.
+    """Return charts of simulation residuals over time and their histogram, for every output of every run.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def residual_series(
 def residual_rows(
     comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = MAX_LINE_POINTS
 ) -> list[list[LineChart]]:
-    """Return the charts of :func:`residual_series`, a row for every output of every run."""
+    """Return the charts of :func:`residual_series`, one row for every output of every run."""
     rows = []
     suffix = f", {label}" if label else ""
     for k, (run, _, _) in enumerate(comparison.per_run):
@@ -162,7 +162,7 @@ def residual_rows(
 def compared_bars(
     compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the simulation"
 ) -> list[BarChart]:
-    """Chart the fits of several models side by side, for every output.
+    """Return bar charts of the fits of several models side by side, one for every output.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def compared_bars(
     Raises
     ------
     DataError
-        No model, or models with other outputs or data than the first.
+        If there is no model, or a model has other outputs or data than the first.
     """
     if not compared:
         raise DataError("bars need at least one model; give (name, comparisons) pairs")
@@ -208,18 +208,18 @@ def error_chart(
     units: Mapping[str, str] | None = None,
     points: int = MAX_LINE_POINTS,
 ) -> LineChart:
-    """Chart the absolute simulation errors of several models on one run, as in the paper's Figure 4(a).
+    """Return a chart of the absolute simulation errors of several models on one run, as in the paper's Figure 4(a).
 
     Parameters
     ----------
     compared
-        (name of the model, its comparison); all on the same run with the same m.
+        (name of the model, its comparison) of each model, all on the same run with the same m.
     output
-        Whose error.
+        Name of the output.
     run
         Index of the run in the comparisons.
     title
-        Default: says what is shown.
+        Title; "" for a default title.
     units
         Units of the outputs.
     points
@@ -228,7 +228,7 @@ def error_chart(
     Raises
     ------
     DataError
-        No comparison, or no such output or run in one of them.
+        If there is no comparison, or one of them lacks the output or run.
     """
     if not compared:
         raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
@@ -253,19 +253,19 @@ def error_chart(
 
 
 def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
-    """Return the label of an axis with the unit of a signal, where it is known."""
+    """Return an axis label with the unit of a signal if it is known."""
     unit = (units or {}).get(name, "")
     return f"{text} [{unit}]" if unit else text
 
 
 @check_arguments
 def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
-    """Chart autocorrelation and cross-correlations of the residuals of every output, with 99 % bands.
+    """Return charts of autocorrelations and cross-correlations of the residuals of every output, with 99 % bands.
 
     Parameters
     ----------
     tests
-        From :func:`ftlm.resid`.
+        Result of :func:`ftlm.resid`.
     label
         Role of the data, such as "validation".
     """
@@ -273,7 +273,7 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
 
 
 def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label: str = "") -> LineChart:
-    """Return the chart of the correlations of an output's residual with a signal; an empty signal is itself."""
+    """Return the chart of the correlations of an output's residual with a signal; "" stands for the residual itself."""
     # Lag 0 of an autocorrelation is 1 and says nothing.
     keep = test.lags != 0 if not signal else np.ones(test.lags.size, dtype=bool)
     values = test.values[keep]
@@ -293,7 +293,10 @@ def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label:
 
 
 def _residual_caption(test: CorrelationTest, values: Floats, signal: str) -> str:
-    """Caption of the chart of one test: result and limit; an empty signal means the residual itself."""
+    """Return the caption of the chart of one residual test: its result and limit.
+
+    An empty `signal` stands for the residual itself.
+    """
     if not test.conclusive:
         why = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
         return f"Whether the residual follows {signal} is undecided: {why}."
@@ -336,8 +339,8 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
     Returns
     -------
     dict
-        Lower and upper end by output. Empty for a model without covariance or with friction, and if a simulation with
-        a changed parameter fails.
+        (lower, upper) edge of the band by output. Empty for a model without covariance or with friction, and if a
+        simulation with a changed parameter fails.
     """
     spread = covariance_of(model)
     if spread is None or model.structure.has_friction:

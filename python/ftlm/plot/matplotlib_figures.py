@@ -1,4 +1,4 @@
-"""Matplotlib figures and axes without pyplot, so that no global state is changed."""
+"""Plots as matplotlib figures, created without pyplot so that no global state changes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def figure_of(rows: int, columns: int = 1, *, row: float = ROW_HEIGHT_INCH, **op
     module = optional_module("matplotlib.figure", "matplotlib", "'ftlm[plot]'")
 
     class NotebookFigure(module.Figure):  # type: ignore[misc, name-defined]
-        """Figure that notebooks show although pyplot does not manage it."""
+        """Figure that notebooks show although it was not created by pyplot."""
 
         def _repr_png_(self) -> bytes:
             data = io.BytesIO()
@@ -73,7 +73,7 @@ def figure_of(rows: int, columns: int = 1, *, row: float = ROW_HEIGHT_INCH, **op
 
 
 def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """Return (figure, grid of rows by columns) from the given axes or a new figure."""
+    """Return a figure and a grid of axes with `rows` rows, from the given axes or a new figure."""
     if ax is None:
         return figure_of(rows, columns, **options)
     axes_given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
@@ -100,7 +100,7 @@ def draw_figure(rows: Sequence[Sequence[Figure]], ax: Any, **options: Any) -> An
 
 
 def escape_math(text: str) -> str:
-    """Return text for matplotlib, whose math mode is used for powers alone."""
+    """Return text escaped for matplotlib, whose math mode is used only for powers."""
     return re.sub(r"((?<!\w)\w|)\^([\d.]+)", r"$\1^{\2}$", text.replace("$", r"\$"))
 
 
@@ -155,7 +155,7 @@ def _draw_lines(axis: Any, chart: LineChart) -> None:
 
 
 def _label_axes(axis: Any, x_label: str, y_label: str, **legend: Any) -> None:
-    """Set the labels, the grid, and a legend of named lines."""
+    """Set the labels and the grid of axes, and a legend of named lines."""
     axis.set(xlabel=escape_math(x_label), ylabel=escape_math(y_label))
     axis.grid(visible=True, alpha=0.3)
     axis.set_axisbelow(True)
@@ -237,18 +237,18 @@ def fit(
     Parameters
     ----------
     result
-        A comparison; an identification (on its own runs unless others are given); or a model, which needs runs.
+        Comparison; identification, plotted on its own runs unless others are given; or model, which requires `runs`.
     runs
         Runs to compare with.
     inputs
-        Draw the inputs of each run below its outputs.
+        Whether the inputs of each run are plotted below its outputs.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Two axes for every output of every run, in SI units, and one for every input that was asked for.
+        Figure with two axes for every output of every run, in SI units, and one for every requested input.
 
     Raises
     ------
@@ -287,7 +287,7 @@ def fit(
 
 
 def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None) -> list[Run]:
-    """Return the runs of a comparison, for their inputs."""
+    """Return the runs of a comparison, whose inputs are plotted."""
     if runs is not None:
         return [runs] if isinstance(runs, Run) else list(runs)
     task = result.task if isinstance(result, Identification) else None
@@ -362,7 +362,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         An identification by output error or with an order search, or a landscape (``ftlm.report.landscape``,
         ``ftlm.report.output_error_landscape``), which may be of any two orders.
     output
-        Which search of an identification; by default its first.
+        Name of the search of an identification; by default the first.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -401,7 +401,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
     model
         A model or an identification.
     w
-        Frequencies [rad/s]; by default around the model's own.
+        Frequencies [rad/s]; by default a range around the corner frequencies of the model.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -461,7 +461,7 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
     model
         A model or an identification.
     time
-        Regular instants from 0 [s]; by default until the model has settled.
+        Uniform sample times from 0 [s]; by default up to the settling time.
     ax
         Axes to draw into, as many as the figure would have; by default those of a new figure.
 
@@ -537,7 +537,7 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
     Returns
     -------
     matplotlib.figure.Figure
-        Over time on the left, how often on the right, a row for every output of every run.
+        Residuals over time on the left, their histogram on the right, a row for every output of every run.
 
     Raises
     ------
@@ -591,7 +591,7 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
 
 @check_arguments
 def design(result: DesignedInput, *, ax: Any = None) -> Any:
-    """Plot a designed input, its predicted response beside that to a square wave, limits and spectrum.
+    """Plot a designed input, its predicted response and that of a square wave, with limits and spectrum.
 
     Parameters
     ----------
@@ -615,7 +615,7 @@ def design(result: DesignedInput, *, ax: Any = None) -> Any:
 
 
 def _designed_chart(result: DesignedInput, name: str) -> LineChart:
-    """Return the chart of a signal of the designed run, of the square wave and of its limits."""
+    """Return the chart of a signal in the designed run and in the square-wave run, with its limits."""
     run, square = result.run, result.reference
     lines = [("designed", run[name]), (square.name, square[name])]
     limit = next(r.limit for r in result.predicted_extremes if r.name == name)
@@ -625,7 +625,10 @@ def _designed_chart(result: DesignedInput, name: str) -> LineChart:
 
 
 def _spectrum_chart(result: DesignedInput) -> LineChart:
-    """Return the chart of the cumulative power, which separates line spectra better than the spectrum itself."""
+    """Return the chart of the cumulative power of a designed input over frequency.
+
+    It shows differences between line spectra better than the spectrum itself.
+    """
     rows, lines = result.run.length - 1, result.spectrum.lines.frequencies
     every = np.fft.rfftfreq(rows, result.step)
     shown = (every >= lines.min()) & (every <= lines.max())

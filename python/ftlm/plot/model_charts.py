@@ -1,4 +1,4 @@
-"""Bode, pole and response charts of a model."""
+"""Charts of a model: Bode plot, poles, step and impulse response."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ from ftlm.utils.validation import Complex, Floats, as_floats
 
 
 def response_frequencies(model: Model, step: float | None = None, duration: float | None = None) -> Floats:
-    """Default frequencies [rad/s] of a response: from one period per record to half the sampling rate."""
+    """Return default frequencies [rad/s] of a Bode plot.
+
+    They range from one period per record to the Nyquist frequency.
+    """
     if step is not None and duration is not None:
         return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
     corner = []
@@ -70,7 +73,7 @@ def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
 
 
 def pole_points(model: Model) -> tuple[float, Complex]:
-    """Order q of the plane s^q and the poles in it with their conjugates; empty for a model that is not linear."""
+    """Return the order q of the plane s^q, and the poles in this plane; empty for a nonlinear model."""
     q = plane_order(model)
     model_modes = modes(model) if model.structure.is_linear else ()
     points = []
@@ -85,9 +88,9 @@ def pole_points(model: Model) -> tuple[float, Complex]:
 
 @check_arguments
 def pole_charts(model: Model) -> list[PlaneChart]:
-    """Return the pole chart in the plane of s^q, q the highest order over the next integer, with the unstable sector.
+    """Return the pole chart in the plane of s^q with the unstable sector; [] for friction or without poles.
 
-    Empty for a model with friction or without poles.
+    The order q is the highest order divided by the next integer.
 
     Parameters
     ----------
@@ -120,7 +123,7 @@ def pole_charts(model: Model) -> list[PlaneChart]:
 
 
 def plane_order(model: Model) -> float:
-    """Order q of the pole plane s^q: 1 for integer orders, else between 0.5 and 1."""
+    """Return the order q of the pole plane s^q: 1 for integer orders, otherwise between 0.5 and 1."""
     orders = [e.order.constant for e in model.equations]
     orders += [t.order.constant for e in model.equations for t in e.terms]
     highest = max(orders)
@@ -130,7 +133,7 @@ def plane_order(model: Model) -> float:
 
 @dataclass(frozen=True)
 class BodeCurve:
-    """Gain [dB] and phase [degrees] of one output from one input, with half-widths of 95 % bands or None."""
+    """Gain [dB] and phase [degrees] of the response of one output to one input, with half-widths of 95 % bands."""
 
     output: str
     input: str
@@ -141,7 +144,7 @@ class BodeCurve:
 
 
 def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
-    """Return the curves of all connected pairs of input and output; Coulomb friction is omitted."""
+    """Return the Bode curves of all pairs of input and output with a nonzero response; friction inputs are omitted."""
     response = frequency_response(model, omega)
     spread = None if covariance_of(model) is None else response_deviation(model, omega)
     inputs = response_inputs(model, coupled=True)
@@ -163,7 +166,7 @@ def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
 
 @dataclass(frozen=True)
 class Bode:
-    """Frequency response with charts, the result of :meth:`ftlm.Model.bode`.
+    """Result of :meth:`ftlm.Model.bode`: frequency response with its charts.
 
     Parameters
     ----------
@@ -217,7 +220,7 @@ def response_charts(result: Response, *, units: Mapping[str, str] | None = None)
 
 
 def response_chart(found: Response, i: int, j: int, units: Mapping[str, str]) -> LineChart:
-    """Return the chart of the response of output i to input j, with its 95 % band."""
+    """Return the chart of the response of the output with index i to the input with index j, with its 95 % band."""
     output, values = found.outputs[i], found.values[i, j]
     bands, shade = [], "No covariance, so there is no band."
     if found.deviation is not None:
@@ -238,7 +241,7 @@ def response_chart(found: Response, i: int, j: int, units: Mapping[str, str]) ->
 
 @dataclass(frozen=True)
 class TimeResponse(Response):
-    """Step or impulse response with charts, the result of :meth:`ftlm.Model.step`.
+    """Result of :meth:`ftlm.Model.step` or `impulse`: a response with its charts.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""SVG and HTML drawing, independent of results: charts, tables, pages."""
+"""SVG charts and HTML pages from plain data, independent of identification results."""

@@ -1,4 +1,4 @@
-"""Histogram, bar chart, chart of the complex plane, heat maps."""
+"""Charts as SVG: histogram, bar chart, complex plane, and heat maps."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     Parameters
     ----------
     values
-        Shape (N,); non-finite values are left out and counted in the caption.
+        Values of shape (N,). Nonfinite values are omitted, and the caption states their number.
     title, x_label
         Text, with units.
     caption
@@ -56,7 +56,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     Raises
     ------
     DataError
-        Fewer than two finite values.
+        If there are fewer than two finite values.
     """
     every = as_floats("values", values, gaps=True).ravel()
     finite = every[np.isfinite(every)]
@@ -107,7 +107,7 @@ class BarChart(Figure):
     names
         Group names, from top to bottom.
     groups
-        (series name, one value per group name), at most five.
+        (series name, one value per group name) of each series, at most five.
     title, x_label
         Text, with units.
     low, high
@@ -120,7 +120,7 @@ class BarChart(Figure):
     Raises
     ------
     DataError
-        Nothing to draw, more than five series, or a series without one value per name.
+        If there is nothing to draw, there are more than five series, or a series does not have one value per name.
     """
 
     names: Sequence[str]
@@ -157,7 +157,7 @@ class BarChart(Figure):
         return self.low, end if end > self.low else self.low + 1.0
 
     def draw(self, *, narrow: bool) -> Markup:
-        """Return the drawing."""
+        """Return the chart as SVG markup, for a wide or a narrow screen."""
         tables, names, width = self.tables, self.names, NARROW_WIDTH_PX if narrow else self.width
         described = f"Bars, {self.x_label}. " + " ".join(
             f"{thing}: " + ", ".join(f"{group} {number(float(v[k]), 3)}" for group, v in tables) + "."
@@ -220,25 +220,26 @@ PLANE_MARGIN_FACTOR, LOCUS_MARGIN_SHARE = 1.18, 0.06
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class PlaneChart(Figure):
-    """Chart of the complex plane with equal axis units: poles as crosses, or a measured locus and a model's curve.
+    """Chart of the complex plane with equal axis scales: poles as crosses, or a measured locus and a model's curve.
 
     Parameters
     ----------
     points
-        Finite values; both members of a conjugate pair are given.
+        Finite complex values, including both members of each conjugate pair.
     title, x_label, y_label
         Text, with units.
     sector
         Half-angle [rad] of the shaded unstable sector around the positive axis.
     curve
-        Curve of a model. The points are then measured values, drawn as dots; the axes fit them, without a sector.
+        Complex curve of a model. The points are then measured values, drawn as dots. They determine the axis limits,
+        and no sector is drawn.
     caption
         Sentence below.
 
     Raises
     ------
     DataError
-        A point that is not finite, a sector outside (0, pi), or a curve without points.
+        If a point is not finite, the sector is outside (0, pi), or there is a curve without points.
     """
 
     points: Sequence[complex] | Complex
@@ -261,7 +262,7 @@ class PlaneChart(Figure):
 
     @cached_property
     def values(self) -> Complex:
-        """Points."""
+        """Complex values of the points."""
         return as_complex("points", self.points)
 
     @cached_property
@@ -272,7 +273,7 @@ class PlaneChart(Figure):
 
     @property
     def corners(self) -> tuple[complex, complex]:
-        """Lower left and upper right corner of what is drawn; a curve that strays from the dots leaves it."""
+        """Lower left and upper right corner of the plotted region, which may cut off parts of the curve."""
         if self.line is None:
             far = float(np.max(np.abs(self.values), initial=0.0)) or 1.0
             return complex(-far, -far) * PLANE_MARGIN_FACTOR, complex(far, far) * PLANE_MARGIN_FACTOR
@@ -282,14 +283,14 @@ class PlaneChart(Figure):
         return low - complex(pad, pad), high + complex(pad, pad)
 
     def sector_outline(self, reach: float) -> list[complex]:
-        """Return the corners of the sector, beyond a square of this half-width around 0."""
+        """Return the corners of the sector, extended beyond a square of half-width `reach` around 0."""
         edge = 8 * reach
         arm = edge * complex(math.cos(self.sector), math.sin(self.sector))
         # Beyond a right angle the sector also covers what lies above and below its arms' ends.
         return [0, arm.conjugate(), edge * (1 - 1j), edge * (1 + 1j), arm]
 
     def draw(self, *, narrow: bool) -> Markup:
-        """Return the drawing: grid, the axes through zero, and clipped curves."""
+        """Return the chart as SVG markup: grid, axes through zero, points and clipped curves."""
         width = NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX
         low, high = self.corners
         upward = ticks(low.imag, high.imag, 5)
@@ -343,13 +344,13 @@ class PlaneChart(Figure):
 
 
 def _dot(x: float, y: float) -> Markup:
-    """Return a measured point."""
+    """Return a measured point as SVG markup."""
     dot = Markup('<circle class="line0" fill="none" stroke="{}" stroke-width="1.6" cx="{:.1f}" cy="{:.1f}" r="{}"/>')
     return dot.format(LINE_STYLES[0][0], x, y, DOT_RADIUS_PX)
 
 
 def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
-    """Points of complex values [px]; far outside of the plot it no longer matters where."""
+    """Return the pixel coordinates of complex values; those far outside the plot are limited."""
     points = np.asarray(values, dtype=np.complex128)
     xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(points.real), plot.y_pixels(points.imag)))
     return list(zip(xs, ys, strict=True))
@@ -366,18 +367,20 @@ NO_SCORE = "#9aa3ad"
 
 @dataclass(frozen=True, eq=False)
 class Landscape(Figure):
-    """Scores over two orders, the other orders fixed at the best model: a heat map whose best scores are dark.
+    """Heat map of scores over two orders, in which the best scores are dark.
+
+    The other orders are fixed at those of the best model.
 
     Parameters
     ----------
     names
-        The two orders, horizontal and vertical.
+        Names of the orders on the horizontal and the vertical axis.
     x, y
-        Their values, ascending.
+        Ascending values of these orders.
     scores
-        Shape (y, x); infinite for pairs that are not candidates or whose simulation diverges.
+        Scores of shape (y, x); infinite for pairs that are not candidates or whose simulation diverges.
     other_orders_note
-        Treatment of the other parameters, as text.
+        Text on how the other parameters are treated.
     score
         Name of the score.
     correlation
@@ -394,13 +397,13 @@ class Landscape(Figure):
 
     @property
     def title(self) -> str:  # type: ignore[override]
-        """Both orders."""
+        """Title, which names both orders."""
         across, upward = map(symbol, self.names)
         return f"Score over {across} and {upward}"
 
     @cached_property
     def valid_scores(self) -> Floats:
-        """Scores, NaN for pairs without one."""
+        """Scores with NaN for pairs that have none."""
         scores = np.where(np.isfinite(self.scores) & (self.scores > 0), self.scores, np.nan)
         if np.all(np.isnan(scores)):
             raise DataError("no candidate of this order grid has a finite score; widen it")
@@ -419,7 +422,7 @@ class Landscape(Figure):
 
     @property
     def caption(self) -> str:  # type: ignore[override]
-        """Place of the best score, and what the colors mean."""
+        """Sentences on the location of the best score and on the meaning of the colors."""
         parts = [
             f"Best: {self._best_orders()} (ring). Dark is good; colours are steps of the logarithm.",
             self.other_orders_note,
@@ -431,7 +434,7 @@ class Landscape(Figure):
         return " ".join(parts)
 
     def draw(self, *, narrow: bool) -> Markup:
-        """Return the drawing."""
+        """Return the chart as SVG markup, for a wide or a narrow screen."""
         ends = float(np.nanmin(self.valid_scores)), float(np.nanmax(self.valid_scores))
         described = (
             f"Heat map of {self.score}. Best {number(ends[0])} at {self._best_orders()}; worst {number(ends[1])}."
@@ -475,7 +478,7 @@ class Landscape(Figure):
 
 
 def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
-    """Color class of each score on a logarithmic scale; -1 without a score."""
+    """Return the color class of each score on a logarithmic scale; -1 for pairs without a score."""
     first, span = math.log(low), math.log(high) - math.log(low)
     with np.errstate(divide="ignore", invalid="ignore"):
         place = (np.log(scores) - first) / (span if span > 0 else 1.0)
@@ -484,14 +487,14 @@ def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
 
 
 def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Markup:
-    """Return a cell, slightly enlarged to hide seams."""
+    """Return a heat-map cell as SVG markup, slightly enlarged to hide gaps."""
     return Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{}" fill="{}"/>').format(
         x, y, width + 0.3, height, colour
     )
 
 
 def _label_indices(count: int, most: int) -> list[int]:
-    """Indices of the cells that get a label, first and last included."""
+    """Return the indices of the cells that get a label, including the first and the last."""
     return sorted({round(k) for k in np.linspace(0, count - 1, most).tolist()})
 
 
@@ -515,7 +518,7 @@ class CorrelationMap(Figure):
     names
         Names of the rows and columns.
     values
-        Shape (N, N), from -1 to 1; NaN has a gray cell.
+        Correlations of shape (N, N), from -1 to 1. NaN gives a gray cell.
     title
         Title.
     caption
@@ -524,7 +527,7 @@ class CorrelationMap(Figure):
     Raises
     ------
     DataError
-        A matrix that is not square or does not fit the names, or values beyond 1.
+        If the matrix is not square or does not match the names, or a magnitude exceeds 1.
     """
 
     names: Sequence[str]
@@ -544,7 +547,7 @@ class CorrelationMap(Figure):
 
     @cached_property
     def matrix(self) -> Floats:
-        """Correlations."""
+        """Correlation matrix as an array."""
         return as_floats("values", self.values, gaps=True)
 
     def _describe(self) -> str:
@@ -555,7 +558,7 @@ class CorrelationMap(Figure):
         return f"Correlations of {', '.join(names)}. The largest: {farthest}."
 
     def draw(self, *, narrow: bool) -> Markup:
-        """Return the drawing."""
+        """Return the chart as SVG markup, for a wide or a narrow screen."""
         names, matrix = self.names, self.matrix
         width, count = (NARROW_WIDTH_PX if narrow else SMALL_WIDTH_PX), len(names)
         labels = [truncate_text(symbol(n), MAX_COLUMN_NAME_CHARACTERS) for n in names]

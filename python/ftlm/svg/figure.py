@@ -1,4 +1,4 @@
-"""Figure, SVG elements, axes and ticks."""
+"""Base classes of charts, and elements of SVG drawings: text, axes and ticks."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ LETTER_WIDTH_PX, LINE_HEIGHT_PX = 6.7, 15
 
 
 class Figure(ABC):
-    """Chart that draws itself as SVG; :mod:`ftlm.plot` draws most kinds with matplotlib.
+    """Base class of charts that can be drawn as SVG; :mod:`ftlm.plot` draws most of them with matplotlib.
 
     Attributes
     ----------
     title, caption
-        Title, and a sentence below.
+        Title, and a sentence below the chart.
     """
 
     title: str
@@ -39,21 +39,21 @@ class Figure(ABC):
 
     @abstractmethod
     def draw(self, *, narrow: bool) -> Markup:
-        """Return the drawing, trusted markup, for wide or for narrow screens."""
+        """Return the chart as SVG markup, for a wide or a narrow screen."""
 
     @cached_property
     def svg(self) -> Markup:
-        """Drawing for wide screens."""
+        """SVG markup for wide screens."""
         return self.draw(narrow=False)
 
     @cached_property
     def narrow(self) -> Markup:
-        """Drawing for narrow screens, or empty."""
+        """SVG markup for narrow screens; empty if the wide one is sufficient."""
         return self.draw(narrow=True)
 
     @property
     def note(self) -> str:
-        """Caption, followed by what the drawing cannot show, such as non-finite values."""
+        """Caption, followed by notes on values that the chart cannot show, such as nonfinite ones."""
         return self.caption
 
     def _repr_html_(self) -> str:
@@ -62,7 +62,7 @@ class Figure(ABC):
 
 @dataclass(frozen=True)
 class StaticFigure(Figure):
-    """Chart that is drawn already, once for wide and once for narrow screens."""
+    """Chart with two finished SVG drawings, for wide and for narrow screens."""
 
     title: str
     wide: Markup
@@ -70,12 +70,12 @@ class StaticFigure(Figure):
     caption: str = ""
 
     def draw(self, *, narrow: bool) -> Markup:
-        """Return one of the drawings."""
+        """Return the SVG markup for a wide or a narrow screen."""
         return self.small if narrow else self.wide
 
 
 class Figures(tuple[Figure, ...]):
-    """Tuple of charts; notebooks show them, :func:`print` lists their titles."""
+    """Tuple of charts, which notebooks show as drawings and :func:`print` as titles."""
 
     __slots__ = ()
 
@@ -96,7 +96,7 @@ def svg(
     narrow: bool,
     attributes: str = "",
 ) -> Markup:
-    """Return a drawing with its description for screen readers."""
+    """Return an SVG drawing of the given size [px] and parts, with a description for screen readers."""
     return Markup(
         '<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}"{}>'
         "<title>{}</title><desc>{}</desc>{}</svg>"
@@ -114,12 +114,12 @@ def svg(
 
 
 def svg_text(x: float, y: float, text: str, anchor: str) -> Markup:
-    """Return text whose start, middle or end is at a point."""
+    """Return text as SVG markup; `anchor` is the part of the text ("start", "middle", "end") at the point (x, y)."""
     return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(x, y, anchor, text)
 
 
 def text_width(text: str) -> float:
-    """Approximate width of a text [px]."""
+    """Return the approximate width of a text [px]."""
     return LETTER_WIDTH_PX * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
 
 
@@ -133,7 +133,7 @@ MAX_STRAY_HEIGHTS = 3.0
 
 @dataclass(frozen=True)
 class Ticks:
-    """Ticks of an axis: values, labels, and their common power of ten, as ×10⁻³ and as -3."""
+    """Ticks of an axis: values, labels, and their common power of ten as text and as a number."""
 
     values: list[float]
     labels: list[str]
@@ -149,7 +149,7 @@ TENTHS_PER_PIXEL = 10
 
 @dataclass(frozen=True)
 class PlotArea:
-    """Plot area in the drawing [px] and its axis limits: left, right, bottom, top."""
+    """Plot area of a drawing [px], with its axis limits left, right, bottom and top."""
 
     left: float
     top: float
@@ -158,17 +158,17 @@ class PlotArea:
     frame: tuple[float, float, float, float]
 
     def x_pixels(self, x: Floats | float) -> Floats:
-        """Return horizontal places [px]."""
+        """Return the horizontal pixel coordinates of values."""
         low, high, _, _ = self.frame
         return np.asarray(self.left + self.width * (np.asarray(x) - low) / (high - low))
 
     def y_pixels(self, y: Floats | float) -> Floats:
-        """Return vertical places [px]."""
+        """Return the vertical pixel coordinates of values."""
         _, _, low, high = self.frame
         return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
 
     def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
-        """Coordinates in integer tenths of a pixel, clipped near the plot to keep them short."""
+        """Return pixel coordinates of points in integer tenths of a pixel, clipped near the plot."""
         down = np.clip(self.y_pixels(y) - self.top, -self.height, 2 * self.height)
         xs, ys = (
             np.rint(places * TENTHS_PER_PIXEL).astype(np.int64).tolist()
@@ -177,7 +177,7 @@ class PlotArea:
         return xs, ys
 
     def grid(self, across: Ticks, upward: Ticks) -> list[Markup]:
-        """Grid lines, left and lower axis."""
+        """Return grid lines and the left and lower axis as SVG markup."""
         along, up = Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>'), Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>')
         axes = Markup(
             '</g><path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>'
@@ -190,7 +190,7 @@ class PlotArea:
         ]
 
     def labels(self, axes: tuple[Ticks, Ticks], names: tuple[str, str], width: int) -> list[Markup]:
-        """Tick labels and names of the horizontal and the vertical axis, in a drawing of this width."""
+        """Return tick labels and names of both axes as SVG markup, in a drawing of the given width [px]."""
         across, upward = axes
         bottom = self.top + self.height
         out = [Markup('<g class="ticks">')]
@@ -211,12 +211,12 @@ class PlotArea:
 
 
 def ticks(low: float, high: float, most: int = 6) -> Ticks:
-    """Return multiples of 1, 2 or 5 times a power of ten within an interval.
+    """Return ticks within an interval, at multiples of 1, 2 or 5 times a power of ten.
 
     Parameters
     ----------
     low, high
-        Ends, low < high.
+        Ends of the interval, low < high.
     most
         Approximate number of ticks; at least two are returned.
     """
@@ -240,7 +240,7 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
 
 
 def log_ticks(low: float, high: float, most: int) -> Ticks:
-    """Ticks between 10**low and 10**high: powers of ten, or a 1-2-5 series if there are few powers."""
+    """Return ticks between 10**low and 10**high: powers of ten, or a 1-2-5 series if there are few powers."""
     every = max(1, math.ceil((high - low) / most))
     first, last = math.ceil(low / every - 1e-9), math.floor(high / every + 1e-9)
     powers = [k * every for k in range(first, last + 1)]
@@ -258,19 +258,19 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
 
 
 def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
-    """Return indices of points that represent a line: the ends of constant stretches, or the extremes of blocks.
+    """Return indices of points that represent a line: ends of constant intervals, or extremes of blocks.
 
     Parameters
     ----------
     y
-        Values; non-finite values are left out.
+        Values of the line; nonfinite ones are omitted.
     most
-        Largest number of indices, at least 4.
+        Maximum number of indices, at least 4.
 
     Returns
     -------
     ndarray of int
-        Ascending indices. All finite values if they are no more than ``most``.
+        Ascending indices; those of all finite values if there are at most ``most``.
     """
     values = as_floats("y", y, gaps=True)
     finite = np.flatnonzero(np.isfinite(values))
@@ -291,7 +291,7 @@ def decimate(y: ArrayLike, most: int = MAX_LINE_POINTS) -> NDArray[np.intp]:
 
 
 def limits(values: list[Floats], margin: float) -> tuple[float, float]:
-    """Return distinct axis limits for these values with a margin."""
+    """Return axis limits (low, high) that include all values, with a relative margin; low < high."""
     finite = np.concatenate(values) if values else np.empty(0)
     if finite.size == 0:
         return 0.0, 1.0
@@ -303,6 +303,6 @@ def limits(values: list[Floats], margin: float) -> tuple[float, float]:
 
 
 def snap_limits(low: float, high: float) -> tuple[float, float]:
-    """Extend limits to a near tick: block pulses begin half a step after 0 and end half a step before 10."""
+    """Return limits extended to a nearby tick, such as 0 and 10 for block pulses with centers just inside."""
     values = ticks(low - 0.01 * (high - low), high + 0.01 * (high - low), 9).values
     return min(low, values[0]), max(high, values[-1])

@@ -1,4 +1,4 @@
-"""Table of plain data and its HTML."""
+"""HTML pages, sections and tables of reports, from plain data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOT_IN_MODEL = "–"
 
 
 def cell_html(value: Cell) -> Markup:
-    """Return the content of a cell; a number carries its full precision in an attribute."""
+    """Return the HTML of a table cell; a number has its full precision in an attribute."""
     if value is None:
         return Markup(NOT_IN_MODEL)
     if isinstance(value, str):
@@ -46,20 +46,20 @@ class Table:
     title
         Caption.
     columns
-        Column heads. The first column names the row.
+        Column headers. The first column names the row.
     rows
-        Cells: text (escaped, unless it is ``Markup``), numbers (shown with five significant digits, stored in full), or
-        None for values that a model does not have.
+        Cells of each row: text (escaped unless it is ``Markup``), numbers (shown with five significant digits, stored
+        in full), or None for values that a model does not have.
     groups
-        Heads above the column heads, as (text, number of columns) from left to right; an empty text has no head.
+        Headers of groups of columns, as (text, number of columns) from left to right; empty text gives no header.
     headings
-        Headings across the table, by the index of the row below.
+        Headings across the table, by the index of the row below each.
     note
         Sentence below the table.
     wrap
-        Whether text in cells wraps; otherwise every row is one line.
+        Whether text in cells is wrapped; otherwise every row is one line.
     stacked
-        Whether the cells of a row stand below one another on narrow screens.
+        Whether the cells of a row are placed below one another on narrow screens.
     """
 
     title: str
@@ -75,14 +75,14 @@ class Table:
     def from_groups(
         cls, title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **options: Any
     ) -> Table:
-        """Return a table whose rows are given by the heading above them; the options are those of a table."""
+        """Return a table from rows by heading; options are those of the class."""
         starts = accumulate((len(each) for each in rows.values()), initial=0)
         flat = [row for each in rows.values() for row in each]
         return cls(title, columns, flat, headings=dict(zip(starts, rows, strict=False)), **options)
 
     @property
     def is_numeric(self) -> list[bool]:
-        """Whether each column is numeric and right-aligned."""
+        """Whether each column is numeric, and therefore right-aligned."""
         columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
         return [
             bool(cells)
@@ -93,7 +93,7 @@ class Table:
 
     @property
     def starts_group(self) -> list[bool]:
-        """Whether each column starts a group."""
+        """Whether each column is the first of its group."""
         starts, at = [False] * len(self.columns), 0
         for text, width in self.groups:
             if text and at < len(starts):
@@ -106,7 +106,7 @@ class Table:
         return [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
 
     def to_html(self) -> Markup:
-        """Return the table in a container that scrolls horizontally on narrow screens."""
+        """Return the table as HTML, in a container that scrolls horizontally on narrow screens."""
         classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
         # The title is outside the scrolling container, so that it wraps; the label repeats it for screen readers.
         dense = " dense" if len(self.columns) >= DENSE_MIN_COLUMNS else " wrap" if self.wrap else ""
@@ -160,7 +160,7 @@ class Section:
     tables, figures
         See :class:`ftlm.report.Table` and ``line_figure``.
     small
-        Whether two figures stand side by side on wide screens.
+        Whether two figures are placed side by side on wide screens.
     more
         Further warnings in a collapsed list.
     fold
@@ -197,19 +197,19 @@ def _template() -> Template:
 
 @cache
 def style_sheet() -> Markup:
-    """Common style sheet of all pages."""
+    """Return the style sheet of all pages."""
     return Markup(resources.files("ftlm.svg").joinpath("style.css").read_text("utf-8"))  # our own file
 
 
 @cache
 def chart_script() -> str:
-    """Script for zooming charts and reading them out by sliders."""
+    """Return the JavaScript for zooming charts and reading values with a slider."""
     return resources.files("ftlm.svg").joinpath("charts.js").read_text("utf-8")
 
 
 @cache
 def _script() -> tuple[Markup, str]:
-    """Return the script and its hash for the content security policy."""
+    """Return the script element and its hash for the content security policy."""
     text = chart_script()
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return Markup(text), f"sha256-{digest}"  # our own file
@@ -224,7 +224,7 @@ def write_page(
     force: bool = False,
     verdict: str = "",
 ) -> Path:
-    """Write sections as one HTML file.
+    """Write sections to an HTML file, and return its path.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def write_page(
     Raises
     ------
     DataError
-        The file exists and ``force`` is not set, or cannot be written.
+        If the file exists and ``force`` is False, or it cannot be written.
     """
     script, digest = _script()
     page = _template().render(
@@ -277,13 +277,13 @@ class Page:
 
 
 class ReportMixin(ABC):
-    """Mixin of results with an HTML report of their own."""
+    """Mixin class of results that can write an HTML report."""
 
     @abstractmethod
     def _page(self) -> Page:
-        """Content of the report."""
+        """Return the content of the report."""
 
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the result as one HTML file; arguments and errors as in :meth:`ftlm.Identification.report`."""
+        """Write the result to an HTML file; arguments and errors are those of :meth:`ftlm.Identification.report`."""
         page = self._page()
         return write_page(path, title=page.title, sections=page.sections, lead=page.lead, force=force)

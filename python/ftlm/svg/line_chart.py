@@ -1,4 +1,4 @@
-"""Readout data of a chart's slider: sampled line values in a compact form."""
+"""Line charts as SVG, with the data for a slider that reads out values."""
 
 from __future__ import annotations
 
@@ -48,24 +48,24 @@ READOUT_LEVELS = 1e5
 def slider_readout(
     x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = SLIDER_POSITIONS
 ) -> str:
-    """Return line values at the slider positions as JSON of integers.
+    """Return line values at the positions of a slider, as JSON of integers.
 
     Parameters
     ----------
     x
-        Shape (N,), ascending.
+        Ascending values of the horizontal axis, shape (N,).
     lines
-        (name, style, values of shape (N,)); NaN marks a missing value.
+        (name, style, values of shape (N,)) of each line; NaN marks a missing value.
     x_label, y_label
         Text with a unit in brackets at its end.
     places
-        Approximate largest number of positions.
+        Approximate maximum number of positions.
 
     Returns
     -------
     str
-        Every position is a sample. The position of the largest difference between the first two lines is included and
-        marked.
+        JSON text. Every position is a sample. The position of the largest difference between the first two lines is
+        included and marked.
     """
     rows_present = np.flatnonzero(np.isfinite(x))
     if not rows_present.size or not lines:
@@ -97,7 +97,7 @@ def _split_unit(label: str) -> tuple[str, str]:
 
 
 def _scaled_integers(values: Floats) -> list[object]:
-    """Return a power of ten and integers whose product is the values; null for missing ones."""
+    """Return a power of ten and the integers whose product with it gives the values; None for missing values."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return [0, [None] * values.size]
@@ -148,39 +148,39 @@ class LineChart(Figure):
     Parameters
     ----------
     x
-        Shape (N,).
+        Values of the horizontal axis, shape (N,).
     lines
-        (name, values of shape (N,)); a single line may have an empty name. A line whose name begins with "measured",
-        "simulated arm" or "designed" has the neutral style; the others get colors and dashes in the given order.
+        (name, values of shape (N,)) of each line; a single line may have an empty name. Lines whose name begins with
+        "measured", "simulated arm" or "designed" have the neutral style; the others get colors and dashes in sequence.
     title, x_label, y_label
         Text, with units.
     caption
-        Sentence below; omitted values are added to it.
+        Sentence below the chart, to which a note on omitted values is added.
     bands
-        Shaded bands (low, high) behind the first lines, in order; edges of shape (N,).
+        Shaded bands (low, high) behind the first lines, in sequence; each edge has shape (N,).
     log_x, log_y
-        Logarithmic axes.
+        Whether the axis is logarithmic.
     stems
-        Draw every value as a stem from 0 instead of a line.
+        Whether every value is drawn as a stem from 0 instead of a line.
     steps
-        Hold every value until the next one.
+        Whether every value is constant until the next one.
     dots
         Names of lines that are drawn as dots.
     bars
-        Edges of bars that stand on 0, shape (M + 1,), and their heights, shape (M,).
+        Edges of bars that start at 0, shape (M + 1,), and their heights, shape (M,).
     width, height
         Size of the wide drawing [px]; it scales.
     points
-        Most points of a line.
+        Maximum number of points of a line.
     slider
-        Include data for a slider that reads out the lines sample by sample; only on linear axes.
+        Whether data for a slider that reads out the samples are included; only on linear axes.
     description
         Sentences for screen readers; by default the range of every line.
 
     Raises
     ------
     DataError
-        No line, or a line or band not of the length of x.
+        If there is no line, or a line or band has another length than x.
     """
 
     x: ArrayLike
@@ -208,7 +208,7 @@ class LineChart(Figure):
 
     @cached_property
     def content(self) -> tuple[list[_Line], list[str]]:
-        """Lines ready to draw, and notes about values that cannot be drawn."""
+        """Lines that are ready to draw, and notes on values that cannot be drawn."""
         if not self.lines:
             raise DataError("a chart needs at least one line; give (name, values) pairs")
         across = as_floats("x", self.x, gaps=True).copy()
@@ -235,7 +235,7 @@ class LineChart(Figure):
         return drawn, notes
 
     def _corners(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Return the corners of a line."""
+        """Return the corner points of a line; each step of a staircase has two."""
         return (x.repeat(2)[1:], y.repeat(2)[:-1]) if self.steps else (x, y)
 
     def _edge(self, name: str, edge: ArrayLike, x: Floats) -> Floats:
@@ -248,7 +248,7 @@ class LineChart(Figure):
 
     @cached_property
     def frame(self) -> tuple[float, float, float, float]:
-        """Axis limits: left, right, bottom, top; logarithms on logarithmic axes."""
+        """Axis limits left, right, bottom and top; logarithms of them on logarithmic axes."""
         lines = self.content[0]
         x_low, x_high = limits([lines[0].x[np.isfinite(lines[0].x)]], 0.02 if self.stems else 0.0)
         if self.bars is not None:
@@ -263,7 +263,7 @@ class LineChart(Figure):
 
     @cached_property
     def _y_limits(self) -> tuple[float, float, list[tuple[str, float]]]:
-        """Limits of the vertical axis, and lines that exceed them with their farthest values."""
+        """Return the limits of the vertical axis, and (name, extreme value) of lines that exceed them."""
         lines = self.content[0]
         every = [line.y[np.isfinite(line.y)] for line in lines]
         # Bands widen the axis and are never said to have left it.
@@ -285,7 +285,7 @@ class LineChart(Figure):
 
     @property
     def note(self) -> str:
-        """Caption, followed by values and lines that are not drawn."""
+        """Caption, followed by notes on values and lines that are not drawn."""
         strays = [
             f"{name} leaves the axis (to {number(10.0**far if self.log_y else far, 3)})."
             for name, far in self._y_limits[2]
@@ -293,17 +293,17 @@ class LineChart(Figure):
         return " ".join(part for part in (self.caption, *self.content[1], *strays) if part)
 
     def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
-        """Ticks of the horizontal and the vertical axis."""
+        """Return the ticks of the horizontal and the vertical axis."""
         x_low, x_high, y_low, y_high = self.frame
         across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
 
     def small(self, height: int = 220) -> LineChart:
-        """Return a copy as wide as charts that stand side by side; `height` is in pixels."""
+        """Return a copy with the width of charts that are placed side by side; `height` is in pixels."""
         return replace(self, width=SMALL_WIDTH_PX, height=height)
 
     def draw(self, *, narrow: bool) -> Markup:
-        """Return the drawing."""
+        """Return the chart as SVG markup, for a wide or a narrow screen."""
         lines = self.content[0]
         width, height = (NARROW_WIDTH_PX, 240) if narrow else (self.width, self.height)
         across, upward = self.ticks(narrow=narrow)
@@ -335,14 +335,14 @@ class LineChart(Figure):
         return svg(width, height, self.title, described, parts, narrow=narrow, attributes=told)
 
     def _describe(self) -> str:
-        """Describe the axes and the range of every line."""
+        """Return sentences on the axes and the range of every line, for screen readers."""
         described = f"Line chart. {self.y_label} against {self.x_label}"
         described += "; logarithmic vertical axis" if self.log_y else ""
         described += "; logarithmic horizontal axis. " if self.log_x else ". "
         return described + " ".join(_describe_line(line, self.log_y) for line in self.content[0])
 
     def _curves(self, plot: PlotArea, *, narrow: bool) -> list[Markup]:
-        """Bars, bands and lines in a nested drawing, which clips them and has integer coordinates."""
+        """Return bars, bands and lines as SVG markup, in a nested drawing that clips them."""
         points = max(4, self.points // 2) if narrow else self.points
         out = [
             Markup(
@@ -388,7 +388,7 @@ def line_styles(names: Iterable[str]) -> list[int]:
 
 
 def _logarithms(values: Floats) -> Floats:
-    """Coordinates on a logarithmic axis; NaN for values that are not positive."""
+    """Return logarithms of values; NaN for values that are not positive."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log10(np.where(values > 0, values, np.nan))
 
@@ -403,7 +403,7 @@ def _describe_line(line: _Line, log_y: bool) -> str:
 
 
 def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> Markup:
-    """Attributes for the zoom script: axis limits, plot area, powers of ten of the labels."""
+    """Return attributes for the zoom script: axis limits, plot area, and powers of ten of the labels."""
     frame = " ".join(repr(float(v)) for v in plot.frame)
     place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
     return Markup(' data-frame="{}" data-plot="{}" data-powers="{} {}"').format(
@@ -412,7 +412,7 @@ def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> Markup:
 
 
 def _outline(line: _Line, plot: PlotArea, points: int) -> str:
-    """Polygon of a band where both edges are finite."""
+    """Return the SVG path data of a band, with gaps where an edge is not finite."""
     if line.band is None:
         return ""
     low, high = line.band
@@ -446,19 +446,19 @@ def _stroke(style: int, *, dots: bool = False) -> Markup:
 
 
 def path_data(places: Iterable[tuple[float, float]]) -> str:
-    """Path data of straight lines through points [px]."""
+    """Return the SVG path data of straight lines through points [px]."""
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
 
 
 def stroke_path(style: int, places: Iterable[tuple[float, float]], width: float = 1.5, dashes: str = "") -> Markup:
-    """Path through points [px] in the color of a style."""
+    """Return the SVG path through points [px] in the color of a style."""
     dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
     path = Markup('<path class="line{}" fill="none" stroke="{}" stroke-width="{}"{} d="{}"/>')
     return path.format(style, LINE_STYLES[style][0], width, dash, path_data(places))
 
 
 def _path(line: _Line, plot: PlotArea, points: int) -> str:
-    """Path data in integer tenths of a pixel, relative to the previous point, restarted after every gap."""
+    """Return SVG path data in integer tenths of a pixel, each point relative to the previous one, with gaps."""
     rows = decimate(line.y, points)
     if rows.size == 0:
         return ""
@@ -473,13 +473,13 @@ def _path(line: _Line, plot: PlotArea, points: int) -> str:
 
 
 def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
-    """Sample of a line's style beside its name."""
+    """Return a sample of a line's style as SVG markup, for a label."""
     at, reach = (x + length / 2, 0) if line.dots else (x, length)
     return Markup('<path {} d="M{:.1f} {:.1f}h{}"/>').format(_stroke(line.style, dots=line.dots), at, y, reach)
 
 
 def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
-    """Swatch and name at the end of every line, moved apart where lines end together."""
+    """Return a sample and the name of every line at its end as SVG markup; overlapping labels are moved apart."""
     x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
     ends = []
     for line in lines:
@@ -502,7 +502,7 @@ def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
 
 
 def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
-    """Position of every legend entry above a narrow chart: (line, x, row)."""
+    """Return the position of every legend entry above a narrow chart, as (line, x, row)."""
     entries, x, row = [], 4.0, 0
     for line in lines:
         needed = 26 + text_width(truncate_text(line.name, 2 * MAX_LABEL_CHARACTERS)) + 14
@@ -523,7 +523,7 @@ def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
 
 
 def chart_css() -> Markup:
-    """CSS rules of the line colors, light and dark."""
+    """Return the CSS rules of the line colors, for light and dark mode."""
     light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINE_STYLES))
     dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINE_STYLES))
     rules = "".join(
