@@ -27,7 +27,7 @@ __all__ = list(
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name or module, such as `ftlm.rig`, on first use."""
+    """Return a public name or module, such as `ftlm.rig`, which is imported on first use."""
     if name not in _MODULE_BY_NAME:
         raise AttributeError(f"module 'ftlm' has no attribute {name!r}")
     module = _MODULE_BY_NAME[name]
@@ -39,5 +39,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """Public names, imported or not."""
+    """Return all public names, imported or not."""
     return sorted({*globals(), *_MODULE_BY_NAME})

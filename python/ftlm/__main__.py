@@ -1,4 +1,4 @@
-"""Entry point of ``ftlm`` and ``python -m ftlm``; an interrupt during its imports ends it cleanly."""
+"""Entry point of ``ftlm`` and ``python -m ftlm``; an interrupt during its imports ends the program cleanly."""
 
 import gc
 import os

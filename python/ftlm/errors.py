@@ -1,4 +1,7 @@
-"""Exception classes. Messages name the object, the first bad index, the count and the remedy."""
+"""Exception classes of ftlm.
+
+Messages name the object, the first bad index, the number of errors and a remedy.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,22 @@ class FtlmError(Exception):
 
 
 class DataError(FtlmError, ValueError):
-    """Unusable data: a file, a column, a sample, a unit."""
+    """Error for invalid data: a file, a column, a sample or a unit."""
 
 
 class ModelError(FtlmError, ValueError):
-    """Unusable model, equation, order, order grid or option."""
+    """Error for an invalid model, equation, order, order grid or option."""
 
 
 class ConvergenceError(FtlmError):
-    """Estimation that ended without a reliable result."""
+    """Error for an estimation that ended without a reliable result."""
 
 
 class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say
-    """Fault of the rig; `run` holds the samples recorded until then, if there were at least three."""
+    """Error for a fault of the rig; `run` has the samples recorded until then, if there are at least three."""
 
     run: Any = None
 
 
 class InternalError(FtlmError):
-    """Defect of ftlm itself; please report it with the message."""
+    """Error for a defect of ftlm itself; please report it with its message."""

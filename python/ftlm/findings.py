@@ -1,4 +1,4 @@
-"""Findings about data, fits and models: their records, and the catalogue of their sentences."""
+"""Findings about data, fits and models, and the catalogue of their sentences."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ VALIDATION_ROLE = "validation"
 
 @dataclass(frozen=True)
 class Topic:
-    """Topic of findings that share a remedy and stand together in a summary.
+    """Topic that groups findings with the same remedy; a summary shows them together.
 
     Parameters
     ----------
     what
-        Summary of such findings.
+        Summary of the findings of this topic.
     remedy
         Template of the recommended action.
     alternative, method
-        Template of an action that uses another method, and the method that it recommends. Left out of the remedy of a
-        finding on that method.
+        Template of an action that uses another method, and the name of that method. The action is omitted if the
+        finding is about a fit by that method.
     has_rule
-        Whether rules of the verdict cover it, so that its findings alone are no reasons: a test of whiteness may fail
-        by rounding alone, and a parameter may be uncertain, but not by much.
+        Whether rules of the verdict decide when findings of this topic are reasons. A whiteness test may fail only
+        because of rounding, for example.
     """
 
     what: str
@@ -74,7 +74,7 @@ _PLAIN_REMEDY = "see the warning"
 
 @dataclass(frozen=True)
 class FindingKind:
-    """Entry of the catalogue: topic, level and templates of one code.
+    """Entry of the catalogue for one code: topic, level and templates of the sentences.
 
     Parameters
     ----------
@@ -83,18 +83,19 @@ class FindingKind:
     level
         ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``.
     template
-        Template of the sentence after the prefix. A bar marks the end of its first clause. ``{remedy}`` is replaced
+        Template of the sentence after the prefix. A bar marks the end of its first clause, and ``{remedy}`` is replaced
         by the remedy.
     reason
-        Template of the reason in a verdict; ``{sentence}`` for the sentence, empty for topic and first clause.
+        Template of the reason in a verdict, in which ``{sentence}`` is the sentence. If it is empty, the reason
+        consists of topic and first clause.
     remedy
         Template of the remedy; empty for that of the topic.
     prefix
-        Template of the beginning that names the run; a page about that run omits it.
+        Template of the beginning of the sentence, which names the run. It is omitted on a page about that run.
     names_missing_part
-        Whether it names what a model lacks, and is reported before the residuals that show it.
+        Whether the finding names a missing part of the model. It is reported before findings on residuals.
     judges_whole_run
-        Whether it is about the simulation of a whole run, which an unstable plant does not allow.
+        Whether the finding is about the simulation of a whole run, which diverges for an unstable plant.
     """
 
     topic: str
@@ -108,12 +109,12 @@ class FindingKind:
 
     @property
     def states_remedy(self) -> bool:
-        """Whether the sentence itself states the remedy."""
+        """Whether the sentence itself contains the remedy."""
         return "remedy" in {name for _, name, _, _ in string.Formatter().parse(self.template)}
 
 
 class Catalogue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Topics and kinds of findings as their file has them.
+    """Topics and kinds of findings, as read from the catalogue file.
 
     Parameters
     ----------
@@ -129,12 +130,12 @@ class Catalogue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def finding_catalogue() -> Catalogue:
-    """Return the catalogue, which is read from its file at the first call."""
+    """Return the catalogue of findings, which is read from its file at the first call."""
     return msgspec.toml.decode(resources.files("ftlm").joinpath("findings.toml").read_bytes(), type=Catalogue)
 
 
 class _Reference:
-    """References to parameters in templates: ``{ask[offset]}``, ``{ask[offset is none]}``."""
+    """Formatter of references to parameters in templates, such as ``{ask[offset]}`` or ``{ask[offset is none]}``."""
 
     def __getitem__(self, key: str) -> str:
         name, _, value = key.partition(" is ")
@@ -142,34 +143,34 @@ class _Reference:
 
 
 class _Choice:
-    """Texts in templates that differ between Python and the command line: ``{choose[validate]}``."""
+    """Formatter of texts in templates that differ between Python and command line, such as ``{choose[validate]}``."""
 
     def __getitem__(self, key: str) -> str:
         return choose_text(*INTERFACE_TEXTS[key])
 
 
 class _Sentence(string.Formatter):
-    """Formatter of templates. A number that was stored as text, such as inf, is inserted unchanged."""
+    """Formatter of templates, which inserts numbers that were stored as text (such as inf) unchanged."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         return value if isinstance(value, str) else str(format(value, format_spec))
 
 
 class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Record of one finding about data, a fit or a model.
+    """Finding about data, a fit or a model: a code with the subjects and numbers of its sentence.
 
     Parameters
     ----------
     code
-        Code in the catalogue.
+        Code of the finding in the catalogue.
     run, output, input, parameter, method
-        Subject of the finding, where it applies; several names are joined by commas.
+        Names that the finding is about, empty if not applicable; several names are joined by commas.
     role
         ``"validation"`` for a run that the model was not identified from.
     numbers
-        Numbers and texts that are inserted in its sentence, by name.
+        Numbers and texts by name, which are inserted into the sentence.
     written
-        Sentence as stored in the file of a model, for versions that do not know the code.
+        Sentence that is stored in a model file, for versions of ftlm that do not know the code.
     """
 
     code: str
@@ -184,40 +185,40 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def kind(self) -> FindingKind:
-        """Entry in the catalogue. A code that this version does not know has the level "with care"."""
+        """Entry of the code in the catalogue; a code that this version does not know has the level "with care"."""
         return finding_catalogue().kinds.get(self.code) or FindingKind(
             "other", LEVEL_WITH_CARE, "{written}", "{written}"
         )
 
     @property
     def topic(self) -> Topic:
-        """Group of the catalogue: findings that share a remedy and stand together in a summary."""
+        """Topic of the finding, which groups findings with the same remedy."""
         return finding_catalogue().topics[self.kind.topic]
 
     @property
     def level(self) -> str:
-        """``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``."""
+        """Level: ``"do not use"``, ``"with care"``, ``"fact"`` or ``"note"``."""
         return self.kind.level
 
     @property
     def signal(self) -> str:
-        """Output or input that it is about; empty if it concerns the whole run."""
+        """Name of the output or input that the finding is about; empty if it is about the whole run."""
         return self.output or self.input
 
     @property
     def sentence(self) -> str:
-        """Sentence without the name of the run."""
+        """Sentence of the finding, without the name of the run."""
         return self._render(self.kind.template.replace("|", ""))
 
     @property
     def text(self) -> str:
-        """Sentence, with the name of the run if the finding concerns a single run."""
+        """Sentence of the finding, with the name of the run if it is about a single run."""
         prefix = "validation run {run}: " if self.role == VALIDATION_ROLE else self.kind.prefix if self.run else ""
         return self._render(prefix) + self.sentence
 
     @property
     def reason(self) -> str:
-        """Sentence in a verdict."""
+        """Sentence of the finding as a reason of a verdict."""
         kind = self.kind
         if kind.reason == SAME_REASON:
             return self.sentence
@@ -225,7 +226,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     @property
     def remedy(self) -> str:
-        """Remedy for the method that was used; empty if the catalogue has none."""
+        """Remedy that suits the method of the fit; empty if the catalogue has none."""
         if self.kind.remedy:
             return self._render(self.kind.remedy)
         topic = self.topic
@@ -245,7 +246,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
             return self.written or self.code
 
     def to_file(self) -> Finding:
-        """Return the finding as it is stored: with its sentence, and numbers that are not finite as text."""
+        """Return the finding as a file stores it: with its sentence, and nonfinite numbers as text."""
         numbers = {n: _storable(v) for n, v in self.numbers.items()}
         return msgspec.structs.replace(self, numbers=numbers, written=self.text)
 
@@ -261,14 +262,14 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
 
 def _storable(value: float | str) -> float | int | str:
-    """Return a value for JSON; a number that is not finite as text."""
+    """Return a value for JSON; a nonfinite number is returned as text."""
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else str(float(value))
     return value if isinstance(value, str) else int(value)
 
 
 def make_finding(code: str, **words: Any) -> Finding:
-    """Return a finding from its code in the catalogue; subject and numbers are keyword arguments."""
+    """Return a finding with a code of the catalogue; keyword arguments give its subjects and numbers."""
     subject = {n: words.pop(n) for n in SUBJECT_FIELDS if n in words}
     return Finding(code, **subject, numbers=words)
 
@@ -289,30 +290,30 @@ def unique(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 @dataclass(frozen=True)
 class FindingGroup:
-    """Findings of one topic and level.
+    """Group of findings with the same topic and level.
 
     Parameters
     ----------
     findings
-        The findings, at least one.
+        Findings of the group, at least one.
     """
 
     findings: tuple[Finding, ...]
 
     @property
     def first_finding(self) -> Finding:
-        """First finding."""
+        """First finding of the group."""
         return self.findings[0]
 
     @property
     def count(self) -> str:
-        """Number of findings beyond the first, as text; empty for a single finding."""
+        """Text on the number of findings after the first; empty for a single finding."""
         more = len(self.findings) - 1
         return f" (and {more} more alike)" if more else ""
 
     @property
     def remedy(self) -> str:
-        """Remedy; empty if the sentence states it."""
+        """Remedy of the group; empty if the sentence contains it."""
         return (
             ""
             if self.first_finding.kind.states_remedy or self.first_finding.topic.remedy == _PLAIN_REMEDY
@@ -321,7 +322,7 @@ class FindingGroup:
 
 
 def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
-    """Group findings by topic, most serious first; each finding of the topic "other" is a group of its own."""
+    """Return findings grouped by topic, most serious first; each finding of the topic "other" forms a group."""
     order = list(finding_catalogue().topics)
     by: dict[tuple[int, int, int], list[Finding]] = {}
     for place, item in enumerate(unique(findings)):
@@ -332,6 +333,6 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
 
 
 def hidden_findings_text(groups: Sequence[FindingGroup]) -> str:
-    """Return the number of findings that a summary omits, as text; empty if it omits none."""
+    """Return text on the number of findings that a summary omits; empty if it omits none."""
     count = sum(len(g.findings) for g in groups) - len(groups[:MAX_SUMMARY_FINDINGS])
     return f"{count} more warning{'' if count == 1 else 's'}" if count else ""

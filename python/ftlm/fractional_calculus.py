@@ -21,20 +21,22 @@ def fractional_integral(
     rule: Literal["block-pulse", "trapezoidal", "grunwald-letnikov"] = "block-pulse",
     axis: int = -1,
 ) -> NDArray[np.float64]:
-    """Riemann-Liouville fractional integral of uniformly sampled signals, lower limit at the first sample.
+    """Return the Riemann-Liouville fractional integral of uniformly sampled signals.
+
+    Its lower limit is the first sample.
 
     Parameters
     ----------
     x
-        Signals along ``axis``: means over pulses for ``"block-pulse"``, point samples otherwise.
+        Signals along ``axis``: means over block pulses for ``"block-pulse"``, point samples otherwise.
     order
         Order of the integral, in [0, 10].
     step
         Sampling step or pulse width [s], positive.
     rule
-        ``"block-pulse"``: means in, means out, paper (31)-(32), second order in the step. ``"trapezoidal"``: point
-        samples, exact for the linear interpolant (doi:10.1023/A:1016592219341), second order.
-        ``"grunwald-letnikov"``: point samples, paper (2) with a negative order, first order.
+        Quadrature rule. ``"block-pulse"``: from means to means by equations (31)-(32) of the paper, second order in the
+        step. ``"trapezoidal"``: point samples, exact for the linear interpolant (doi:10.1023/A:1016592219341), second
+        order. ``"grunwald-letnikov"``: point samples, equation (2) with a negative order, first order.
     axis
         Axis of time.
 
@@ -68,7 +70,7 @@ def fractional_derivative(
     initial: ArrayLike | None = None,
     axis: int = -1,
 ) -> NDArray[np.float64]:
-    """Fractional derivative of uniformly sampled signals, lower limit at the first sample.
+    """Return the fractional derivative of uniformly sampled signals; its lower limit is the first sample.
 
     Parameters
     ----------
@@ -79,13 +81,13 @@ def fractional_derivative(
     step
         Sampling step [s], positive.
     definition
-        ``"grunwald-letnikov"``: paper (2), first order in the step for signals that start at zero.
-        ``"caputo"``: paper (5) with m = ceil(order), L1 formula on the highest whole derivative (second-order
-        differences), order min(2, 2 - frac). ``"riemann-liouville"``: paper (3), Caputo's plus the power functions
-        of the initial values; infinite at the first sample where an initial value is not zero.
+        ``"grunwald-letnikov"``: equation (2) of the paper, first order in the step for signals that start at zero.
+        ``"caputo"``: equation (5) with m = ceil(order), by the L1 formula on the highest integer derivative
+        (second-order differences), order min(2, 2 - frac). ``"riemann-liouville"``: equation (3), Caputo's derivative
+        plus power functions of the initial values; infinite at the first sample if an initial value is not zero.
     initial
-        x(0), x'(0), ... where known, along the last axis (other axes as ``x`` without its time axis, or one set for
-        all signals). What is not given is taken from one-sided differences.
+        Known initial values x(0), x'(0), ... along the last axis. The other axes are those of ``x`` without its time
+        axis, or there is one set for all signals. Missing values are estimated by one-sided differences.
     axis
         Axis of time.
 
@@ -121,12 +123,14 @@ def fractional_derivative(
 
 @check_arguments
 def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
-    """Haar coefficients, coarse to fine, of pulse means: the orthogonal matrix of paper (29) applied in O(m).
+    """Return the Haar coefficients of block-pulse means, coarse to fine.
+
+    The orthogonal matrix of equation (29) is applied in O(m) operations.
 
     Parameters
     ----------
     x
-        Pulse means along ``axis``, a power of two of them.
+        Block-pulse means along ``axis``, whose length is a power of two.
     axis
         Axis of time.
 
@@ -145,12 +149,12 @@ def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
 
 @check_arguments
 def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
-    """Pulse means from Haar coefficients: the transpose of :func:`haar_transform`.
+    """Return the block-pulse means with given Haar coefficients, the inverse of :func:`haar_transform`.
 
     Parameters
     ----------
     x
-        Haar coefficients along ``axis``, a power of two of them.
+        Haar coefficients along ``axis``, whose length is a power of two.
     axis
         Axis of the coefficients, coarse to fine.
 
@@ -169,7 +173,7 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
 
 @check_arguments
 def haar_matrix(m: int) -> NDArray[np.float64]:
-    """Orthogonal Haar matrix (paper (27), (29)).
+    """Return the orthogonal Haar matrix, equations (27) and (29) of the paper.
 
     Parameters
     ----------
@@ -184,16 +188,16 @@ def haar_matrix(m: int) -> NDArray[np.float64]:
     Raises
     ------
     ModelError
-        Another m.
+        If m is not a power of two, or too large.
     """
     return _core.haar_matrix(check_pulses(m))
 
 
 @check_arguments
 def block_pulse_matrix(order: float, m: int, *, step: float) -> NDArray[np.float64]:
-    """Fractional integration matrix of block pulses (paper (32)), upper triangular.
+    """Return the fractional integration matrix of block pulses, equation (32) of the paper; it is upper triangular.
 
-    A row vector of pulse means times this matrix is the row vector of the means of its integral.
+    A row vector of block-pulse means, multiplied by this matrix, gives the means of the fractional integral.
 
     Parameters
     ----------
@@ -220,7 +224,9 @@ def block_pulse_matrix(order: float, m: int, *, step: float) -> NDArray[np.float
 
 @check_arguments
 def operational_matrix(order: float, m: int, *, step: float) -> NDArray[np.float64]:
-    """Fractional integration matrix of Haar wavelets (paper (37)), by the two-sided fast Haar transform, O(m^2).
+    """Return the fractional integration matrix of Haar wavelets, equation (37) of the paper.
+
+    The two-sided fast Haar transform takes O(m^2) operations.
 
     Parameters
     ----------

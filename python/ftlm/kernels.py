@@ -1,9 +1,11 @@
-"""Operators of the core on arrays: pulse means, fractional integrals, Toeplitz systems, Haar transform, estimator (44).
+"""Operators of the core on arrays: block-pulse means, fractional integrals, Toeplitz systems and estimators.
 
-:class:`Candidates` scores order tuples of one equation, :class:`Recursion` estimates its coefficients sample by sample.
+:class:`Candidates` scores tuples of orders of one equation. :class:`Recursion` estimates its coefficients sample by
+sample.
 
-Time is the last axis, and leading axes broadcast as in NumPy's universal functions. Arrays are real numbers of any type
-and strides. They are never changed, and results are new float64 arrays. Other threads run meanwhile.
+Time is the last axis, and leading axes broadcast as in NumPy's universal functions. Arguments are arrays of real
+numbers with any type and strides, and are not changed. Results are new float64 arrays. The functions release the global
+interpreter lock. Equation numbers are those of the paper.
 """
 
 from __future__ import annotations
@@ -52,16 +54,17 @@ __all__ = [
 
 @check_arguments
 def pulse_means(samples: ArrayLike, m: int | None = None, *, hold: bool = False) -> NDArray[np.float64]:
-    """Return the means of sampled signals over m equal pulses (paper (39)).
+    """Return the means of sampled signals over m block pulses of equal width, equation (39).
 
     Parameters
     ----------
     samples
-        Shape (..., n), n samples at the ends of n - 1 sampling intervals.
+        Samples of shape (..., n), at the ends of n - 1 sampling intervals.
     m
         Number of pulses; by default n - 1.
     hold
-        Whether a signal holds each sample until the next one, as commands do. Otherwise it is linear in between.
+        Whether signals are constant between samples (zero-order hold), as commands are. Otherwise they are linear
+        between samples.
 
     Returns
     -------
@@ -77,7 +80,7 @@ def pulse_means(samples: ArrayLike, m: int | None = None, *, hold: bool = False)
 
     Notes
     -----
-    O(n + m) a signal.
+    The cost is O(n + m) per signal.
     """
     rows, lead = _rows("samples", samples)
     pulses = rows.shape[1] - 1 if m is None else check_pulses(m)
@@ -86,7 +89,7 @@ def pulse_means(samples: ArrayLike, m: int | None = None, *, hold: bool = False)
 
 @check_arguments
 def block_pulse_kernel(order: ArrayLike, m: int, *, step: float, derivative: bool = False) -> NDArray[np.float64]:
-    """Return the first row of the fractional integration matrix of block pulses (paper (31), (32)).
+    """Return the first row of the fractional integration matrix of block pulses, equations (31) and (32).
 
     Parameters
     ----------
@@ -111,7 +114,7 @@ def block_pulse_kernel(order: ArrayLike, m: int, *, step: float, derivative: boo
 
     Notes
     -----
-    O(m) an order.
+    The cost is O(m) per order.
     """
     orders, pulses = finite_floats("order", order), check_pulses(m)
     kernels = _core.block_pulse_kernels(orders.ravel(), pulses, real_number("step", step), derivative=derivative)
@@ -120,15 +123,15 @@ def block_pulse_kernel(order: ArrayLike, m: int, *, step: float, derivative: boo
 
 @check_arguments
 def integrate(x: ArrayLike, order: ArrayLike, *, step: float) -> NDArray[np.float64]:
-    """Return the means of the fractional integrals of signals from their means over pulses (paper (32)).
+    """Return the block-pulse means of fractional integrals of signals, from the means of the signals, equation (32).
 
     Parameters
     ----------
     x
         Pulse means, shape (..., m).
     order
-        Orders in [0, 10]; their shape broadcasts with the leading axes of ``x``. ``integrate(x[:, None], orders,
-        step=h)`` has every integral of every signal.
+        Orders in [0, 10], whose shape broadcasts with the leading axes of ``x``. ``integrate(x[:, None], orders,
+        step=h)`` returns every integral of every signal.
     step
         Pulse width [s].
 
@@ -146,8 +149,8 @@ def integrate(x: ArrayLike, order: ArrayLike, *, step: float) -> NDArray[np.floa
 
     Notes
     -----
-    O(m log m) an integral. Signals of one order share their kernel and its spectrum.
-    Memory beyond the result is about one byte a value, and once more the result's if ``x`` is broadcast.
+    The cost is O(m log m) per integral; signals of one order share a kernel and its spectrum. In addition to the
+    result, about one byte per value is required, and the memory of the result again if ``x`` is broadcast.
     """
     values, orders = finite_floats("x", x), finite_floats("order", order)
     m = _length("x", values)
@@ -181,7 +184,8 @@ def toeplitz_apply(kernel: ArrayLike, x: ArrayLike) -> NDArray[np.float64]:
 
     Notes
     -----
-    O(m log m) a vector, as ``scipy.linalg.matmul_toeplitz``. Vectors of one kernel share its spectrum.
+    The cost is O(m log m) per vector, as that of ``scipy.linalg.matmul_toeplitz``. Vectors with one kernel share its
+    spectrum.
     """
     return _with_kernels(_core.toeplitz_apply, kernel, "x", x)
 
@@ -207,11 +211,11 @@ def toeplitz_solve(kernel: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     DataError
         Values that are not finite real numbers (with the first index and the count), or shapes that do not broadcast.
     ModelError
-        A kernel that begins with zero, whose matrix is singular.
+        If a kernel begins with zero, so that its matrix is singular.
 
     Notes
     -----
-    O(m log^2 m) a system; ``scipy.linalg.solve_toeplitz`` takes O(m^2).
+    The cost is O(m log^2 m) per system; that of ``scipy.linalg.solve_toeplitz`` is O(m^2).
     """
     return _with_kernels(_solve_rows, kernel, "b", b)
 
@@ -225,16 +229,16 @@ def multi_innovation(
     prior_covariance: ArrayLike,
     trace: bool = False,
 ) -> NDArray[np.float64]:
-    """Return the multi-innovation least-squares estimate of X in m = Q X (paper (42)-(44)), from X = 0.
+    """Return the multi-innovation least-squares estimate of X in m = Q X, equations (42)-(44), starting from X = 0.
 
     Parameters
     ----------
     Q
-        Regressors, shape (..., M, k), rows in the sequence of the recursion.
+        Regressors, shape (..., M, k), with rows in the sequence of the recursion.
     m
         Outputs, shape (..., M).
     p
-        Innovation length: number of rows of a step.
+        Innovation length: number of rows in each step.
     prior_covariance
         Initial covariance of the coefficients, a number or shape (k,), in units of their squares.
     trace
@@ -256,8 +260,8 @@ def multi_innovation(
 
     Notes
     -----
-    Without ``trace`` the estimate is computed in closed form by QR, O(M k^2): row i of M has the weight
-    min(p, M - i + 1).
+    Without ``trace`` the estimate is computed in closed form by a QR factorization of cost O(M k^2), in which row i of
+    M has the weight min(p, M - i + 1).
     """
     regressors, outputs = finite_floats("Q", Q), finite_floats("m", m)
     if regressors.ndim < 2 or outputs.ndim < 1 or regressors.shape[-2] != outputs.shape[-1] or not outputs.shape[-1]:
@@ -283,7 +287,7 @@ def multi_innovation(
 
 @check_arguments
 def errors(measured: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
-    """Return the error (45), RMSE (46), NR (47) and fit of predictions, as :func:`ftlm.metrics` does of one.
+    """Return the error (45), RMSE (46), NR (47) and fit of predictions; see :func:`ftlm.metrics`.
 
     Parameters
     ----------
@@ -293,8 +297,8 @@ def errors(measured: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
     Returns
     -------
     numpy.ndarray
-        Shape (..., 4): sum of absolute errors, root mean square error, that divided by the standard deviation of the
-        measurement, and 100 (1 - NR) percent.
+        Shape (..., 4): sum of absolute errors, root mean square error, NR (the RMSE divided by the standard deviation
+        of the measurement), and fit 100 (1 - NR) percent.
 
     Raises
     ------
@@ -318,9 +322,11 @@ MIN_CORRELATION_EIGENVALUE = 1e-12
 
 
 class Candidates:
-    """Order tuples of one equation D^alpha y = sum of c_j D^order_j x_j on pulse means, from rest (paper (22)-(45)).
+    """Evaluation of many tuples of orders of one equation D^alpha y = sum of c_j D^order_j x_j, from rest.
 
-    Integrals and their inner products are kept between calls, so that tuples of one order grid share them.
+    It follows equations (22)-(45).
+
+    Fractional integrals and their inner products are cached between calls, so that tuples of one order grid share them.
 
     Parameters
     ----------
@@ -338,7 +344,7 @@ class Candidates:
     DataError
         Values that are not finite real numbers (with the first index and the count), or no table of signals.
     ModelError
-        A row that the signals do not have, no term, or a step that is not positive.
+        If a row does not exist, there is no term, or the step is not positive.
 
     Examples
     --------
@@ -372,7 +378,7 @@ class Candidates:
         prior_covariance: ArrayLike = math.inf,
         rows: Literal["haar", "time"] = "haar",
     ) -> NDArray[np.float64]:
-        """Return the equation-error coefficients of order tuples, by least squares or multi-innovation (44).
+        """Return the coefficients of each tuple of orders, by least squares or multi-innovation of the equation error.
 
         Parameters
         ----------
@@ -383,7 +389,7 @@ class Candidates:
         prior_covariance
             Initial covariance of the coefficients, a number or shape (k,); infinite for no prior.
         rows
-            Coordinates of (42) in which the innovation runs: ``"haar"``, for which M is a power of two, or ``"time"``.
+            Basis of the rows in equation (42): ``"haar"``, for which M is a power of two, or ``"time"``.
 
         Returns
         -------
@@ -395,11 +401,13 @@ class Candidates:
         DataError
             Orders that are not finite, or of another shape; an M that is not a power of two, for Haar rows.
         ModelError
-            An order of a term above alpha or below 0, an alpha above 10, or a p or prior covariance out of range.
+            If an order of a term is above alpha or below 0, alpha is above 10, or p or the prior covariance is out of
+            range.
 
         Notes
         -----
-        O(K M log M + K^2 M + N k^3) for K distinct integrals. Normal equations with unit columns.
+        The cost is O(K M log M + K^2 M + N k^3) for K distinct integrals. Normal equations with columns of unit norm
+        are solved.
         """
         table = self._orders(orders)
         length = check_integer("p", p, 0)
@@ -434,7 +442,7 @@ class Candidates:
         limit: float = math.inf,
         threads: int = 1,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the output errors (45) of simulations from rest, and the coefficients of each order tuple.
+        """Return the output error of simulations from rest, and the coefficients, for each tuple of orders.
 
         Parameters
         ----------
@@ -463,7 +471,8 @@ class Candidates:
 
         Notes
         -----
-        O(k M + M log^2 M) a candidate beyond its coefficients, and a fraction of it with a limit that few reach.
+        In addition to the coefficients, the cost is O(k M + M log^2 M) per candidate, and a fraction of it if most
+        candidates exceed the limit.
         """
         table = self._orders(orders)
         check_choice("norm", norm, ("l1", "l2"))
@@ -483,7 +492,7 @@ class Candidates:
 
     @check_arguments
     def free_run(self, orders: ArrayLike, coefficients: ArrayLike) -> NDArray[np.float64]:
-        """Return the simulated outputs of order tuples from rest.
+        """Return the outputs simulated from rest for each tuple of orders.
 
         Parameters
         ----------
@@ -502,7 +511,7 @@ class Candidates:
 
         Notes
         -----
-        O(k M log M) a tuple and O(M log^2 M) for its own terms.
+        The cost per tuple is O(k M log M), and O(M log^2 M) for the terms of the output.
         """
         table = self._orders(orders)
         numbers = self._check_shape(finite_floats("coefficients", coefficients), len(table))
@@ -520,7 +529,7 @@ class Candidates:
 
     @cached_property
     def _points(self) -> dict[str, _core.Points]:
-        """Evaluators of the core by norm."""
+        """Return evaluators of the core, by norm."""
         inputs = [row != self._output for row in range(len(self._signals))]
         record = (self._step, self._signals, None)
         return {
@@ -529,7 +538,7 @@ class Candidates:
         }
 
     def _check_shape(self, coefficients: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-        """Return the coefficients of so many order tuples; raise for another shape."""
+        """Return the coefficients of `count` tuples of orders; raise DataError for another shape."""
         if coefficients.shape != (count, len(self._terms)):
             raise DataError(
                 f"coefficients has shape {coefficients.shape}; give ({count}, {len(self._terms)}), one row per tuple"
@@ -537,7 +546,7 @@ class Candidates:
         return coefficients
 
     def _orders(self, orders: ArrayLike) -> NDArray[np.float64]:
-        """Return order tuples as a table."""
+        """Return tuples of orders as an array of shape (N, 1 + k); raise DataError for another shape."""
         table = finite_floats("orders", orders)
         width = 1 + len(self._terms)
         if table.ndim != 2 or table.shape[1] != width:
@@ -551,7 +560,7 @@ class Candidates:
         return table
 
     def _places(self, orders: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return the column of each term of each tuple in the bank of integrals, after the output in column 0."""
+        """Return the column of each term of each tuple in the matrix of integrals, where column 0 is the output."""
         gaps = np.round(orders[:, :1] - orders[:, 1:], 9)
         # Pairs as complex numbers: NumPy sorts these faster than columns of a table.
         distinct, inverse = np.unique((self._terms + 1j * gaps).ravel(), return_inverse=True)
@@ -571,7 +580,7 @@ class Candidates:
         return at[inverse.ravel()].reshape(gaps.shape)
 
     def _gram(self, p: int, rows: str) -> NDArray[np.float64]:
-        """Return inner products of the output and all integrals, with the weights min(p, M - i + 1) of rows i."""
+        """Return inner products of the output and all integrals, in which row i has the weight min(p, M - i + 1)."""
         key = f"{rows} {p}" if p else "least squares"
         if key not in self._bank:
             bank = self._bank["time"]
@@ -583,7 +592,7 @@ class Candidates:
 
 
 class Recursion:
-    """Multi-innovation recursion (44) of one equation D^alpha y = sum of c_j D^order_j x_j, sample by sample.
+    """Multi-innovation recursion (44) of one equation D^alpha y = sum of c_j D^order_j x_j, one sample at a time.
 
     Parameters
     ----------
@@ -596,18 +605,18 @@ class Recursion:
     step
         Sampling interval [s].
     hold
-        For each of s signals: True for zero-order hold, as of commands; False for linear interpolation.
+        Whether each of s signals is a zero-order hold, as commands are; otherwise it is interpolated linearly.
     p
         Innovation length: number of most recent regression equations in each update.
     prior_covariance
         Initial covariance of the coefficients; by default 1e10 over the sum of squares of a regressor so far.
     forgetting
-        Factor in (0, 1] by which earlier rows count less with every row; 1 forgets nothing.
+        Forgetting factor in (0, 1]: weight of a row relative to that of the next row; 1 for no forgetting.
     initial
-        Exponents above -1 of powers of t that nonzero initial conditions add to the terms, or ``"caputo"`` for those
-        of the initial values of Caputo derivatives.
+        Exponents above -1 of powers of t that are added as terms for nonzero initial conditions, or ``"caputo"`` for
+        those of Caputo's initial values.
     longest
-        Largest number of samples minus one.
+        Maximum number of samples minus one.
     fixed
         Coefficient of each term, None for a free one; by default all are free.
 
@@ -620,8 +629,9 @@ class Recursion:
 
     Notes
     -----
-    A sample costs about 1 us, whatever came before: the past is a sum of some hundred decaying exponentials a signal,
-    exact to rounding. After every sample the coefficients are those of :func:`multi_innovation` with all rows so far.
+    A sample takes about 1 us, independent of the number of earlier samples. A sum of some hundred decaying exponentials
+    per signal represents the past, exactly up to rounding. After every sample the coefficients equal those of
+    :func:`multi_innovation` for all rows so far.
 
     Examples
     --------
@@ -676,7 +686,7 @@ class Recursion:
 
     @check_arguments
     def push(self, samples: ArrayLike) -> NDArray[np.float64]:
-        """Process samples of all signals; return the coefficients after each.
+        """Update the estimate with samples of all signals, and return the coefficients after each sample.
 
         Parameters
         ----------
@@ -693,9 +703,9 @@ class Recursion:
         DataError
             Values that are not finite (with the first index and the count), or another number of signals.
         ModelError
-            More pulses than ``longest``.
+            If there are more samples than ``longest`` allows.
         ConvergenceError
-            A covariance that is no longer positive by rounding.
+            If the covariance is no longer positive because of rounding.
         """
         table = finite_floats("samples", samples)
         if table.ndim != 2 or table.shape[1] != self._count:
@@ -714,7 +724,7 @@ class Recursion:
 
 
 def _signal_rows(terms: Sequence[int], output: int, count: int) -> list[int]:
-    """Return the rows of the signals of terms, checked together with that of the output."""
+    """Return the rows of the signals of terms; raise ModelError if one of them or that of the output does not exist."""
     if not len(terms):
         raise ModelError(f"{parameter('terms')} is empty; give the row of the signal of each term")
     for name, row in [("output", output), *(("terms", term) for term in terms)]:
@@ -725,7 +735,7 @@ def _signal_rows(terms: Sequence[int], output: int, count: int) -> list[int]:
 
 
 def _rows(name: str, values: ArrayLike) -> tuple[NDArray[np.float64], tuple[int, ...]]:
-    """Return signals as rows of a table, and the shape of their leading axes."""
+    """Return signals as rows of a two-dimensional array, and the shape of their leading axes."""
     array = finite_floats(name, values)
     return array.reshape(-1, _length(name, array)), array.shape[:-1]
 
@@ -738,7 +748,7 @@ def _length(name: str, array: NDArray[np.float64]) -> int:
 
 
 def _broadcast(shapes: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
-    """Return the common shape of leading axes."""
+    """Return the shape to which leading axes broadcast; raise DataError if they do not."""
     try:
         return np.broadcast_shapes(*shapes.values())
     except ValueError:
@@ -747,7 +757,7 @@ def _broadcast(shapes: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
 
 
 def _solve_rows(columns: NDArray[np.float64], rows: NDArray[np.float64], groups: list[int]) -> NDArray[np.float64]:
-    """Return the solutions of the Toeplitz systems of rows; raise for a first column that begins with zero."""
+    """Return the solutions of lower triangular Toeplitz systems; raise ModelError for a singular one."""
     zero = np.flatnonzero(columns[:, 0] == 0.0)
     if zero.size:
         raise ModelError(
@@ -763,7 +773,7 @@ def _with_kernels(
     name: str,
     vectors: ArrayLike,
 ) -> NDArray[np.float64]:
-    """Apply ``work(kernels, rows, number of the kernel of each row)`` to broadcast kernels and vectors."""
+    """Return the result of ``work(kernels, rows, index of the kernel of each row)`` for broadcast arguments."""
     columns, of = _rows("kernel", kernel)
     values = finite_floats(name, vectors)
     m = _length(name, values)
@@ -775,5 +785,5 @@ def _with_kernels(
 
 
 def _broadcast_to(array: NDArray[Scalar], shape: tuple[int, ...]) -> NDArray[Scalar]:
-    """Return a view of a shape; NumPy's own function takes 7 us even where there is nothing to do."""
+    """Return a view of an array with another shape; NumPy's function takes 7 us even if the shape is unchanged."""
     return array if array.shape == shape else np.broadcast_to(array, shape)

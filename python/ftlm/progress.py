@@ -1,4 +1,4 @@
-"""Progress of long computations on standard error: bars with rate and time left on terminals, cancellation."""
+"""Progress of long computations on standard error, as bars on terminals, and cancellation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS, WIDE_TERMINAL_COLUMNS = 10, 12, 100
 
 
 class ShareTotal(int):
-    """Total that stands for a whole: the bar shows a percentage instead of a count."""
+    """Total for which the bar shows a percentage instead of a count."""
 
 
 #: Total of work without a natural count.
@@ -31,7 +31,7 @@ TOTAL_PARTS = ShareTotal(1000)
 
 
 def format_time_left(seconds: float) -> str:
-    """Return the time left as text with one digit."""
+    """Return a remaining time [s] as text with one digit."""
     if seconds < 90:
         return f"about {round_coarsely(seconds):g} s left"
     if seconds < 5400:
@@ -50,18 +50,18 @@ def format_duration_estimate(least: float, most: float) -> str:
 
 
 def round_coarsely(value: float) -> float:
-    """Round to 1, 2, 3, 5 or 7 times a power of ten, at least 1."""
+    """Return a value rounded to 1, 2, 3, 5 or 7 times a power of ten, at least 1."""
     power = 10.0 ** max(math.floor(math.log10(max(value, 1.0))), 0)
     return power * min((1, 2, 3, 5, 7, 10), key=lambda digit: abs(digit * power - value))
 
 
 class ShareTracker:
-    """Share of completed work with independent parts; it never decreases.
+    """Fraction of completed work with independent parts, which never decreases.
 
     Parameters
     ----------
     listener
-        Called with (parts done, ``TOTAL_PARTS``); None for no reports.
+        Callback with (parts done, ``TOTAL_PARTS``); None for no reports.
     """
 
     def __init__(self, listener: Callable[[int, int], None] | None) -> None:
@@ -70,7 +70,7 @@ class ShareTracker:
         self._reported_parts = -1
 
     def advance_to(self, share: float) -> None:
-        """Report that this share of the whole is done."""
+        """Report that a fraction of the whole work is done."""
         self.reached = max(self.reached, min(share, 1.0))
         parts = round(TOTAL_PARTS * self.reached)
         if self._listener is not None and parts > self._reported_parts:
@@ -78,9 +78,9 @@ class ShareTracker:
             self._listener(parts, TOTAL_PARTS)
 
     def subtask(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
-        """Return a callback (done, total) for a part of the work that ends at this share of the whole.
+        """Return a callback (done, total) for a part of the work; the part ends at a fraction `share` of the whole.
 
-        If the part restarts its count, each pass takes the same share of the remainder.
+        If the part restarts its count, each pass takes the fraction `sweep` of the remainder.
         """
         first, last = self.reached, 0.0
 
@@ -96,7 +96,7 @@ class ShareTracker:
 
 
 def _start_bar() -> RichProgress:
-    """Return a bar on the terminal without a label, a total and figures yet."""
+    """Return a progress bar on the terminal, without label, total and figures."""
     from rich.console import Console  # noqa: PLC0415 — only a terminal needs it
     from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
@@ -120,7 +120,7 @@ def _start_bar() -> RichProgress:
 
 
 class Progress:
-    """Progress bar, a context manager to be called with (done, total) or (done, total, pruned).
+    """Progress bar: a context manager that is called with (done, total) or (done, total, pruned).
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class Progress:
             self._stop()
 
     def so_far(self, count: int, total: int) -> None:
-        """Show progress of work whose total is not known."""
+        """Show the progress of work whose total is only known so far."""
         passed = time.monotonic() - self._start
         if self._quiet or passed < BAR_DELAY_S:
             return
@@ -170,7 +170,7 @@ class Progress:
         return self._quiet
 
     def expect(self, what: str, least: float, most: float | None = None) -> None:
-        """Announce the estimated duration, or its range [s], of long work."""
+        """Show the estimated duration [s], or its range, of long work."""
         most = least if most is None else most
         if not self._quiet and most >= ANNOUNCEMENT_THRESHOLD_S:
             print(f"{what} takes {format_duration_estimate(least, most)}; Ctrl-C ends it", file=sys.stderr)
@@ -186,7 +186,7 @@ class Progress:
             print(label, file=sys.stderr)
 
     def _current_bar(self) -> RichProgress:
-        """Return the bar, which starts with the first figures."""
+        """Return the bar, which is created when the first figures are shown."""
         with self._lock:
             self._bar = self._bar or _start_bar()
             return self._bar
@@ -211,14 +211,14 @@ class Progress:
 
 
 class Stoppable(Progress):
-    """Progress forwarded from another thread, with cancellation of that thread's work.
+    """Progress callback that another thread calls, and that can cancel the work of that thread.
 
     Parameters
     ----------
     listener
         Receiver of the reports.
     stop
-        Event that ends the work with KeyboardInterrupt at its next report; signals reach the main thread only.
+        Event that ends the work with KeyboardInterrupt at its next report. Signals reach only the main thread.
     """
 
     def __init__(self, listener: Callable[[int, int], None] | None, stop: threading.Event) -> None:
@@ -227,7 +227,7 @@ class Stoppable(Progress):
         self._ended = stop
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
-        """Forward a report, or raise KeyboardInterrupt."""
+        """Forward a report to the listener, or raise KeyboardInterrupt if the work is cancelled."""
         if self._ended.is_set():
             raise KeyboardInterrupt
         if isinstance(self._listener, Progress):

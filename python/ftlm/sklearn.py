@@ -1,4 +1,4 @@
-"""FractionalRegressor: scikit-learn estimator of fractional-order models."""
+"""scikit-learn estimator of fractional-order models."""
 
 from __future__ import annotations
 
@@ -29,38 +29,39 @@ MAX_INDEX_JITTER_SHARE = 0.02
 
 
 class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.BaseEstimator):  # type: ignore[misc, name-defined]
-    """scikit-learn estimator of a fractional-order model; a prediction is a simulation.
+    """scikit-learn estimator of a fractional-order model, whose predictions are simulations.
 
     Parameters
     ----------
     structure
-        An equation in words, a structure, or ``"auto"``: D^alpha y0 = a0 y0 + b0_0 u0 + b0_1 u1 …, one alpha for all
-        outputs. Columns of several inputs or outputs are taken by name from a data frame, otherwise in the order in
-        which the signals appear in the structure. ``"auto"`` takes columns in their order.
+        Equation as text, structure, or ``"auto"`` for D^alpha y0 = a0 y0 + b0_0 u0 + b0_1 u1 … with one alpha for all
+        outputs. Columns of several inputs or outputs are selected by name from a data frame, otherwise in the sequence
+        in which the signals appear in the structure. ``"auto"`` uses columns in their sequence.
     step
         Time between rows [s].
     orders
-        Free orders by name: a number fixes one, ``"0.5:1.5:0.05"`` is its lattice; see :func:`ftlm.equation`.
+        Values of free orders by name: a number fixes the order, ``"0.5:1.5:0.05"`` is its grid; see
+        :func:`ftlm.equation`.
     method
         Name of a method, or a method with its options, such as :class:`ftlm.OutputError`; see :func:`ftlm.identify`.
     offset
-        As of :func:`ftlm.identify`; it belongs to the fitted rows and is not part of a prediction.
+        Offset as in :func:`ftlm.identify`. It is estimated for the fitted rows and is not part of a prediction.
     continues
-        Rows that are predicted follow the fitted ones without a gap, as those of ``TimeSeriesSplit`` do without
-        ``gap``: the simulation goes through the fitted inputs first. Rows that are the fitted ones themselves are
-        predicted from their start. If not, every prediction starts from rest. The index of a data frame shows a gap,
-        which is refused. An array shows none, so that ``gap`` must be 0 with arrays.
+        Whether predicted rows follow the fitted ones without a gap, as those of ``TimeSeriesSplit`` without ``gap`` do.
+        The simulation then begins with the fitted inputs. The fitted rows themselves are predicted from their start. If
+        False, every prediction starts from rest. A gap in the index of a data frame raises an error. Arrays have no
+        index, so ``gap`` must be 0 with them.
     threads
-        Threads of a fit; one, for scikit-learn runs several fits at once.
+        Number of threads of a fit; one by default, because scikit-learn runs several fits in parallel.
 
     Attributes
     ----------
     identification_ : Identification
-        What was found; its ``verdict`` says whether to trust it.
+        Identification, whose ``verdict`` states whether the model can be trusted.
     model_ : Model
         The model.
     n_features_in_ : int
-        Inputs.
+        Number of inputs.
     """
 
     @check_arguments
@@ -90,15 +91,16 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         Parameters
         ----------
         X
-            Inputs, shape (n, inputs), a row an instant; a data frame's index of numbers or dates increases by one step.
+            Inputs, shape (n, inputs), one row per sample. The index of a data frame, of numbers or dates, must increase
+            by the step.
         y
             Outputs, shape (n,) or (n, outputs).
 
         Raises
         ------
         ValueError
-            What scikit-learn refuses of arrays; numbers of columns that are not those of the structure, or names of
-            several.
+            If scikit-learn rejects an array, the number of columns differs from that of the structure, or the names of
+            several columns do.
         DataError, ModelError, ConvergenceError
             See :func:`ftlm.identify`.
         """
@@ -126,7 +128,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
 
     @check_arguments
     def predict(self, X: Any) -> Floats:
-        """Simulate rows of inputs; returns shape (n,) or (n, outputs), as y had."""
+        """Simulate rows of inputs, and return outputs of shape (n,) or (n, outputs), as those of y."""
         _validation.check_is_fitted(self)
         as_array("X", X)
         index = _check_index(_index(X))
@@ -173,7 +175,7 @@ def _columns(table: Any) -> list[str] | None:
 
 
 def _in_order(what: str, signals: tuple[str, ...], columns: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the signal of each column: by name if there are several named ones, otherwise by position."""
+    """Return the signal of each column, by name for several named columns, otherwise by position."""
     if columns is None or len(signals) < 2:
         return signals
     names = tuple(map(str, columns))
@@ -186,7 +188,7 @@ def _in_order(what: str, signals: tuple[str, ...], columns: Sequence[str] | None
 
 
 def _index(table: Any) -> Floats | None:
-    """Return the index of a data frame as numbers; None if it has none of numbers or dates."""
+    """Return the index of a data frame as numbers; None without an index of numbers or dates."""
     index = getattr(table, "index", None)
     kind = getattr(getattr(index, "dtype", None), "kind", "")
     if kind == "M":
@@ -195,7 +197,7 @@ def _index(table: Any) -> Floats | None:
 
 
 def _check_index(index: Floats | None, fit_rows: int = 0) -> Floats | None:
-    """Return the index of rows; raise if it does not increase by one step."""
+    """Return the index of rows; raise ValueError if it does not increase by one step."""
     steps = np.diff(index) if index is not None else np.zeros(0)
     usual = float(np.median(steps)) if steps.size else 1.0
     bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_SHARE * usual)))

@@ -308,7 +308,7 @@ def design_input(
 
 
 def _sizes(option: str, texts: list[str] | None) -> float | dict[str, float] | None:
-    """Return one number for all inputs, or numbers by name."""
+    """Return one number for all inputs, or numbers by name, from the texts of an option; None without texts."""
     if texts and len(texts) == 1 and "=" not in texts[0]:
         try:
             return float(texts[0])

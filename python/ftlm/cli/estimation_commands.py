@@ -66,9 +66,9 @@ LIST_TIME_FACTORS, STEPWISE_TIME_FACTORS = (1.0, 8.0), (1.5, 20.0)
 
 
 def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure | None:
-    """Return the first structure, None for ``auto``; raise for structures that are invalid whatever the runs are.
+    """Return the first structure, or None for ``auto``; raise ModelError for structures that no run can make valid.
 
-    ``auto`` stands alone, with --delay and --only.
+    ``auto`` must be the only one, and can be combined with --delay and --only.
     """
     if "auto" not in texts:
         parsed = [shape.structure(text) for text in texts]
@@ -92,7 +92,10 @@ def select_structure(
     store: str | None = None,
     quiet: bool,
 ) -> Selection:
-    """Select a structure with a progress bar; ``"auto"`` takes the delays and the output of the options."""
+    """Return the selection of a structure, with a progress bar.
+
+    ``"auto"`` uses the delays and the output of the options.
+    """
     automatic, listed = isinstance(candidates, str), isinstance(candidates, list)
     drivers = {name: text.split(",") for name, text in pairs("--driven-by", driven_by).items()}
     if automatic and shape.only is not None:
@@ -120,7 +123,7 @@ def select_structure(
 
 
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
-    """Time estimate [s] of output-error fits of all parameters, the runs distributed among the fits."""
+    """Return the expected time [s] of output-error fits of all parameters, among which the runs are distributed."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
     numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
     return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
@@ -129,7 +132,7 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
 def validation_runs(
     reading: ReadingOptions, file: str | None, window: str | None, equation: Structure | None
 ) -> list[Run]:
-    """Load the validation run, if there is one, from its own window: --window is that of the runs that are fitted."""
+    """Return the validation run in a list, or [] without one; --validation-window applies to it, not --window."""
     if file is None:
         if window is not None:
             raise ModelError("--validation-window is a part of the run that --validation names; name its file, too")
@@ -337,7 +340,7 @@ def certify(
 
 
 def check_order_names(grid: OrderGrid, structure: Structure) -> None:
-    """Raise for an order of the grid that is not free in any equation."""
+    """Raise ModelError for an order of the grid that is not free in any equation."""
     for name in grid.orders:
         if name not in {"alpha", *structure.order_names}:
             free = ", ".join(structure.order_names) or "none"
@@ -345,7 +348,7 @@ def check_order_names(grid: OrderGrid, structure: Structure) -> None:
 
 
 def restrict_grid(grid: OrderGrid, part: Structure) -> OrderGrid:
-    """Return the part of an order grid that concerns one structure."""
+    """Return the part of an order grid that applies to one structure."""
     return replace(grid, orders={n: v for n, v in grid.orders.items() if n == "alpha" or n in part.order_names})
 
 
@@ -359,7 +362,7 @@ def show_by_output(results: Mapping[str, Any], *, as_json: bool) -> None:
 
 @contextlib.contextmanager
 def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
-    """Print after Ctrl-C how to resume from the checkpoint, if there is one."""
+    """On Ctrl-C within the block, print how to resume from the checkpoint file, if there is one."""
     try:
         yield
     except KeyboardInterrupt:
@@ -455,7 +458,7 @@ class ResponseOptions:
     sheet: str | None = None
 
     def load(self, file: str) -> FrequencyData:
-        """Load one file."""
+        """Return the frequency response in a file."""
         columns: dict[str, Any] | None = pairs("--columns", self.columns) or None
         return load_frequency(
             file,

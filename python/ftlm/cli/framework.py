@@ -1,4 +1,4 @@
-"""Commands from functions: options from records, help in panels, compound values, errors and exit codes."""
+"""Framework of the command line: commands made from functions, help in panels, values, errors and exit codes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ftlm.utils.resources import duration_bounds, estimate_duration
 
 
 def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
-    """Parse NAME=VALUE options; a bare NAME stands for NAME=NAME."""
+    """Return {NAME: VALUE} from NAME=VALUE options; NAME alone means NAME=NAME. Raise ModelError for other text."""
     values: dict[str, str] = {}
     for item in texts or []:
         name, equals, value = item.partition("=")
@@ -48,7 +48,7 @@ def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
 
 
 def numbers(option: str, texts: list[str] | None) -> dict[str, float]:
-    """Parse NAME=NUMBER options."""
+    """Return {NAME: number} from NAME=NUMBER options; raise ModelError for other text."""
     values = {}
     for name, value in pairs(option, texts).items():
         try:
@@ -59,7 +59,7 @@ def numbers(option: str, texts: list[str] | None) -> dict[str, float]:
 
 
 def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[float, float]]:
-    """Parse INPUT=NUMBER options, or INPUT=LOW:HIGH for a number to estimate."""
+    """Return numbers, or (low, high) bounds of estimates, by input, from INPUT=NUMBER or INPUT=LOW:HIGH options."""
     what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
     for name, value in pairs(option, texts).items():
@@ -71,7 +71,7 @@ def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[floa
 
 
 def interval(text: str, option: str, example: str) -> tuple[float | None, float | None]:
-    """Parse FROM:TO with optional ends."""
+    """Return (from, to) from FROM:TO, with None for an empty end; raise ModelError for other text."""
     parts = text.split(":")
     try:
         if len(parts) != 2:
@@ -83,7 +83,7 @@ def interval(text: str, option: str, example: str) -> tuple[float | None, float 
 
 
 def parse_numbers(option: str, text: str, *counts: int) -> list[float]:
-    """Parse numbers joined by a colon; raise unless there are as many as allowed."""
+    """Return numbers that are joined by colons; raise ModelError unless their count is one of `counts`."""
     values = split_numbers(text)
     if len(values) not in counts:
         raise ModelError(f"{option} {text!r} is not {' or '.join(str(c) for c in counts)} numbers joined by a colon")
@@ -91,7 +91,7 @@ def parse_numbers(option: str, text: str, *counts: int) -> list[float]:
 
 
 def split_numbers(text: str) -> list[float]:
-    """Parse numbers joined by a colon; empty if one is invalid."""
+    """Return numbers that are joined by colons; [] if one is invalid."""
     try:
         return [float(part) for part in text.split(":")]
     except ValueError:
@@ -119,15 +119,15 @@ OTHER_PANEL = "Options"
 
 
 class Command(TyperCommand):
-    """Command with help in panels, which suggests the right option for a common alias."""
+    """Command with help in panels, which suggests the correct option for a common alias."""
 
     @property
     def methods_by_field(self) -> dict[str, tuple[str, ...]]:
-        """Methods that use an option, by its name; options that are not listed apply to all."""
+        """Names of the methods that use an option, by option; options that are not listed apply to all methods."""
         return getattr(self.callback, "methods_by_field", {})
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse options; raise for an alias with the option that is meant."""
+        """Parse options; an alias raises an error that names the correct option."""
         names = {name for parameter in self.params for name in parameter.opts}
         for option_name in (a.partition("=")[0] for a in args):
             if option_name not in names and OPTION_ALIASES.get(option_name) in names:
@@ -139,7 +139,7 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
     def _chosen_method(self, args: Sequence[str]) -> str | None:
-        """Return the method of a command line, or the default one; None if the command has none."""
+        """Return the method that a command line selects, or the default one; None if the command has no methods."""
         option: Any = next((p for p in self.params if not set(METHOD_FLAGS).isdisjoint(p.opts)), None)
         if option is None:
             return None
@@ -151,7 +151,7 @@ class Command(TyperCommand):
         return str(choice)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments and options by panel; of the options of methods those of the chosen one."""
+        """Write arguments and options by panel; options of other methods than the selected one are omitted."""
         method = ctx.meta.get("method")
         panels: dict[str, list[tuple[str, str]]] = {
             "Arguments": [],
@@ -186,11 +186,11 @@ class OptionDetails:
     flags
         Flags; by default those of `OPTION_FLAGS`, or the name.
     min
-        Least integer.
+        Minimum of an integer.
     is_output
-        Whether it is a file to write; a command refuses a path that it cannot write before it computes.
+        Whether the option is a file to write. A path that cannot be written is rejected before the computation.
     help_entry
-        Name of its entry in the shared help; by default its own name.
+        Name of the option's entry in the shared help; by default the name of the option.
     """
 
     flags: tuple[str, ...] = ()
@@ -217,7 +217,7 @@ OPTION_FLAGS = {
 
 @dataclass(frozen=True)
 class OptionText:
-    """Help of an option: its panel, the type of its value in words, and the help itself."""
+    """Help of an option: its panel, a word for the type of its value, and the text."""
 
     panel: str | None
     metavar: str | None
@@ -225,10 +225,10 @@ class OptionText:
 
 
 def parse_option_texts(docstring: str | None) -> tuple[str, dict[str, OptionText]]:
-    """Return the text of a docstring before its first section, and the options that its sections describe.
+    """Return the text of a docstring before its first section, and the help of the options in its sections.
 
-    A section is a panel of the help; its entries have the form of numpydoc, with the type of a value in words after a
-    colon. Options of the section ``Options`` have no panel.
+    Each section is a panel of the help. Its entries have the form of numpydoc, with a word for the type of the value
+    after a colon. Options in the section ``Options`` have no panel.
     """
     summary, *parts = re.split(r"^(\w+)\n-+\n", inspect.cleandoc(docstring or ""), flags=re.MULTILINE)
     texts = {}
@@ -243,13 +243,13 @@ SHARED_TEXTS = parse_option_texts(cli.__doc__)[1]
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:
-    """Turn a function into a command.
+    """Return a command that is made from a function.
 
-    Positional parameters are arguments, keyword-only ones are options, and docstrings have their help: that of the
-    function, or the docstring of ``ftlm.cli`` for options that commands share. A dataclass parameter expands to its
-    fields: each becomes an option at that place, and the function receives the dataclass. Its `methods_of`, if it has
-    one, returns the methods that use an option. Errors become one line on standard error and an exit code. Existing
-    files of `OutputFile` are refused unless `force` is set.
+    Positional parameters become arguments, and keyword-only ones become options. Their help is in the docstring of the
+    function, or in that of ``ftlm.cli`` for options that commands share. A dataclass parameter is expanded: each field
+    becomes an option, and the function receives the dataclass. Its `methods_of`, if any, returns the methods that use
+    an option. Errors become one line on standard error and an exit code. Existing files of type `OutputFile` raise an
+    error unless `force` is set.
     """
     records: dict[str, type[Any]] = {}
     options: list[inspect.Parameter] = []
@@ -315,7 +315,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
 def _option(
     name: str, hint: Any, default: Any, texts: Mapping[str, OptionText], *, positional: bool = False
 ) -> inspect.Parameter:
-    """Return a parameter as typer reads it, from its name, type, default and help."""
+    """Return a parameter in the form that typer reads, from its name, type, default and help."""
     kind, details = get_args(hint) if get_origin(hint) is Annotated else (hint, OptionDetails())
     text = texts.get(name) or SHARED_TEXTS.get(details.help_entry or name) or OptionText(None, None, "")
     metavar = text.metavar or ("FILE" if details.is_output else _type_label(kind))
@@ -333,7 +333,7 @@ def _option(
 
 
 def _type_label(kind: Any) -> str | None:
-    """Return the type of an option's value in plain words; None for a switch."""
+    """Return the type of an option's value in plain words; None for a switch without a value."""
     if get_origin(kind) is Literal:
         return f"<{'|'.join(get_args(kind))}>"
     # An optional value or a list has the label of its value.
@@ -342,7 +342,7 @@ def _type_label(kind: Any) -> str | None:
 
 
 def exit_code(error: FtlmError) -> int:
-    """Exit code of an error: 1 internal, 2 usage, 3 data, 5 rig."""
+    """Return the exit code of an error: 1 internal, 2 usage, 3 data, 5 rig."""
     if isinstance(error, InternalError):
         return EXIT_INTERNAL
     if isinstance(error, ModelError):
@@ -359,7 +359,7 @@ def show(result: Any, *, as_json: bool) -> None:
 
 
 def print_text(text: str, end: str = "\n") -> None:
-    """Print text, wrapped between words at the width of the terminal.
+    """Print text, wrapped between words to the width of the terminal.
 
     Table rows and commands to copy are not wrapped.
     """
@@ -384,12 +384,12 @@ def show_json(document: Any) -> None:
 
 
 def print_outcome(sentence: str, *, as_json: bool, **facts: Any) -> None:
-    """Print an outcome as a sentence or as one line of JSON."""
+    """Print an outcome as a sentence, or its facts as one line of JSON."""
     print(json.dumps(facts, ensure_ascii=False) if as_json else sentence)
 
 
 def _to_json_value(value: Any) -> Any:
-    """Convert NumPy scalars and arrays for JSON."""
+    """Return NumPy scalars and arrays as values for JSON."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
@@ -398,7 +398,7 @@ FIGURE_FORMATS = ("png", "pdf", "svg")
 
 
 def check_ending(path: str | None, ending: str, why: str = "") -> None:
-    """Raise for a file name with another extension; None is skipped."""
+    """Raise ModelError for a file name with another extension; None is ignored."""
     if path is not None and Path(path).suffix.lower() != ending:
         raise ModelError(f"{path} does not end in {ending}{why}; name it so")
 
@@ -412,14 +412,14 @@ def figure_kind(path: str | None) -> str:
 
 
 def write_figure(figure: Any, path: str, *, force: bool) -> None:
-    """Write a matplotlib figure."""
+    """Write a matplotlib figure to a file, in the format of its extension."""
     data = io.BytesIO()
     figure.savefig(data, format=figure_kind(path), dpi=200)
     write_atomically(path, data.getvalue(), force=force)
 
 
 def say_written(*paths: str | None) -> None:
-    """Print the paths of written files; None is skipped."""
+    """Print the paths of written files; None is ignored."""
     for path in paths:
         if path is not None:
             print(f"written: {path}")
@@ -433,7 +433,7 @@ DESIGN_TIME_S, LOOP_ANALYSIS_TIME_S = {"pid": 0.1, "lqg": 1.2}, {"pid": 0.005, "
 
 
 def announce_reading(files: Sequence[str]) -> None:
-    """Announce the duration of reading these files, if it is long."""
+    """Print the expected duration of reading files if it is long."""
     size = 0
     for file in files:
         try:
@@ -448,7 +448,7 @@ def announce_reading(files: Sequence[str]) -> None:
 
 
 def announce_simulation(runs: Sequence[Run], outputs: int, *, quiet: bool) -> None:
-    """Announce the duration of simulating a model on these runs, if it is long."""
+    """Print the expected duration of simulating a model on runs if it is long."""
     samples = outputs * sum(run.length for run in runs)
     if SIMULATION_TIME_PER_SAMPLE_S * samples > 0.2:
         Progress("", quiet=quiet).expect(
@@ -458,6 +458,6 @@ def announce_simulation(runs: Sequence[Run], outputs: int, *, quiet: bool) -> No
 
 
 def announce_design(design: str, samples: int) -> None:
-    """Announce the duration of a design with so many parameter samples, if it is long."""
+    """Print the expected duration of a design with a number of parameter samples if it is long."""
     seconds = DESIGN_TIME_S[design] + LOOP_ANALYSIS_TIME_S[design] * max(samples, 0)
     Progress("").expect("designing", *duration_bounds(estimate_duration(seconds, 1), DURATION_FACTORS))

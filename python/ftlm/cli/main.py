@@ -1,4 +1,4 @@
-"""Program `ftlm`: list of its commands in the order of the help."""
+"""Program `ftlm`: its commands, in the sequence of the help."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ COMMAND_HELP = {
 
 
 class CommandTable(UserDict[str, Any]):
-    """Commands by name; the module of a command is imported when the command is looked up."""
+    """Mapping from command names to commands; the module of a command is imported on access."""
 
     def __getitem__(self, name: str) -> TyperCommand:
-        """Return a command."""
+        """Return the command with a name."""
         module, short = super().__getitem__(name)
         commands = importlib.import_module(f"ftlm.cli.{module}_commands")
         # `open` would hide a builtin function.
@@ -63,7 +63,7 @@ class CommandTable(UserDict[str, Any]):
 
 
 class Program(TyperGroup):
-    """Group of commands whose modules are imported when they are called."""
+    """Command group whose modules are imported only when a command is called."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**{**attributes, "commands": CommandTable(COMMAND_HELP)})

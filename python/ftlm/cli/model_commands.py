@@ -36,7 +36,7 @@ from ftlm.utils.files import write_atomically
 def _with_runs(
     model: str, reading: ReadingOptions, files: Sequence[str] | None, *, quiet: bool
 ) -> tuple[Model, list[Run]]:
-    """Load a saved model and its runs."""
+    """Return a saved model and the runs of files."""
     loaded = load_model(model)
     runs = reading.runs(files, loaded.structure)
     announce_simulation(runs, len(loaded.outputs), quiet=quiet)

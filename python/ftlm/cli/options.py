@@ -26,7 +26,7 @@ LINK_OPTIONS = ("cross_stage", "cross_sensitivity", "cross_damping", "friction",
 
 
 class MethodOptions:
-    """Base of options of methods of estimation; None stands for an option that is not given."""
+    """Base class of options of estimation methods; None marks an option that is not given."""
 
     @staticmethod
     def methods_of(option: str) -> tuple[str, ...]:
@@ -124,7 +124,7 @@ class StructureOptions:
         return built.with_orders(numbers("--orders", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
 
     def structure_for_runs(self, text: str, runs: Sequence[Run]) -> Structure:
-        """Return the structure of `text` for runs: one link alone if no run contains the other stage."""
+        """Return the structure of `text` for runs: a single link if no run contains signals of the other joint."""
         stage = re.fullmatch("arm:([12])", text)
         if stage is not None:
             other = f"theta{3 - int(stage[1])}"
@@ -135,12 +135,12 @@ class StructureOptions:
         return self.structure(text)
 
     def given_options(self) -> list[str]:
-        """Options with values other than their defaults."""
+        """Names of options whose values differ from the defaults."""
         usual = StructureOptions()
         return [parameter(f.name) for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)]
 
     def _check_equation(self, count: int) -> None:
-        """Raise for options of the flexible link, given the number of equations."""
+        """Raise ModelError for options of the flexible link that do not apply to an equation in words."""
         wrong = self._flags(*LINK_OPTIONS, *(["coupling"] if count == 1 else []))
         if wrong:
             owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
@@ -151,11 +151,11 @@ class StructureOptions:
             )
 
     def _flags(self, *names: str) -> list[str]:
-        """Flags of those of some options that are given."""
+        """Return the flags of those of some options that the user set."""
         return [flag_of(name) for name in names if getattr(self, name)]
 
     def _sensor(self) -> SensorFilter | None:
-        """Sensor filter of signals in equations."""
+        """Return the sensor filter of signals in an equation; None without one."""
         if not self.filtered_signals:
             if self.sensor_filter is not None:
                 raise ModelError(
@@ -173,11 +173,13 @@ class StructureOptions:
             ) from None
 
     def _arm(self, text: str, alone: bool) -> Structure:
-        """Deflections of the real arm with all angles as inputs, integer orders but that of the links' elasticity.
+        """Return the structure of the real arm's deflections, with all angles as inputs.
+
+        Orders are integer except that of the elasticity of the links.
 
         For a single link the order of the damping is free instead, which improved the fit on validation runs
-        significantly. A strain gauge measures the deflection, and its zero is an offset of each run. A spring-pot of
-        nearly integer order has hardly any memory. So runs start from the link's angle and velocity unless a history is
+        significantly. A strain gauge measures the deflection, and its zero is an offset of each run. Terms of nearly
+        integer order have hardly any memory, so runs start from the link's angle and velocity unless a history is
         requested.
         """
         wrong = self._flags(*LINK_OPTIONS, "coupling", "sensor_filter", "filtered_signals")
@@ -259,7 +261,7 @@ class OrderGridOptions(MethodOptions):
     increment: float | None = None
 
     def grid(self) -> OrderGrid | None:
-        """Order grid of the search; None without options."""
+        """Return the order grid of the search; None without options."""
         if self.increment is None and not self.order_grid:
             return None
         axes: dict[str, Any] = dict(pairs("--order-grid", self.order_grid))

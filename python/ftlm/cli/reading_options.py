@@ -21,7 +21,7 @@ from ftlm.structure.structure import Structure
 
 
 def layout_options(record: object) -> dict[str, Any]:
-    """Layout options that a dataclass has and the user has set."""
+    """Return the layout options that the user has set in a dataclass, by name."""
     options = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
     return {name: value for name, value in options.items() if value is not None}
 
@@ -86,7 +86,7 @@ class ReadingOptions:
     def runs(
         self, files: Sequence[str] | None, structure: Structure | None = None, *, apart: bool = False
     ) -> list[Run]:
-        """Load each file as a run, detrended if requested; each group with a time of an HDF5 file is one.
+        """Return the runs of files, detrended if requested; each group of an HDF5 file with a time column is a run.
 
         .mat files with one signal each form one run unless `apart`. Columns that no option names are the signals of
         `structure`, if the files have them.
@@ -118,7 +118,7 @@ class ReadingOptions:
         return load_selection(path, *self._selection(), signals)
 
     def _selection(self) -> tuple[ColumnSelection, LoadOptions]:
-        """Columns, layout and further arguments of :func:`ftlm.load`."""
+        """Return column selection, layout and further arguments of :func:`ftlm.load`."""
         selection = select_columns(
             self.columns,
             self.time,
@@ -133,7 +133,7 @@ class ReadingOptions:
         return selection, LoadOptions(window, self.resample, None, self.time_unit, self.missing)
 
     def preview_file(self, file: str) -> OpenedFile:
-        """Preview a file that is not loaded as a run."""
+        """Return the preview of a file, which is not loaded as a run."""
         if self.detrend is not None:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
         announce_reading([file])

@@ -127,7 +127,7 @@ class LiveOptions:
 
     @property
     def settings(self) -> SearchSettings:
-        """Settings of the estimate after the last sample."""
+        """Return the settings of the estimate after the last sample."""
         options = {
             n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance") and v is not None
         }
@@ -270,7 +270,7 @@ def record(
 
 
 def live_reporter(stream: Streaming | None, rate: float, progress: Progress) -> Callable[[int, int], None]:
-    """Return a callback that updates the bar and prints the live estimate once per second of the run."""
+    """Return a callback that updates the progress bar, and prints the live estimate once per second of the run."""
     due = 1.0
 
     def report_progress(count: int, total: int) -> None:

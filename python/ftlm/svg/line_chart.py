@@ -382,7 +382,7 @@ class LineChart(Figure):
 
 
 def line_styles(names: Iterable[str]) -> list[int]:
-    """Return the style of each line: 0, the neutral one, by the beginning of its name, else the next of the others."""
+    """Return the style number of each line: 0 (neutral) for names of measured lines, otherwise 1, 2, … in sequence."""
     others = cycle(range(1, len(LINE_STYLES)))
     return [0 if name.startswith(NEUTRAL_PREFIXES) else next(others) for name in names]
 

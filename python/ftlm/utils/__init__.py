@@ -1,1 +1,1 @@
-"""Helpers of all packages: argument checks, statistics, linear algebra, files, resources, formatting."""
+"""Helper functions of all packages: argument checks, statistics, linear algebra, files, resources, formatting."""

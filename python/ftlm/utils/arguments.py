@@ -1,4 +1,4 @@
-"""Error messages for arguments of a wrong type: the type found, and the type that the annotation asks for."""
+"""Error messages for arguments of a wrong type, which name the actual type and the type of the annotation."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ _MAX_NUMBER = 2.0**62
 
 
 def check_arguments(decorated: Decorated) -> Decorated:
-    """Decorate a function or a class: an exception that a wrong argument causes becomes a :class:`ModelError`.
+    """Decorate a function or a class such that an exception caused by a wrong argument becomes a ModelError.
 
-    The arguments are compared with their annotations only after the call failed, so that a call that succeeds costs
-    nothing. Messages that the function raises itself are kept. A range with too many values is refused before the call.
+    The arguments are compared with their annotations only after a call has failed, so successful calls take no
+    additional time. Errors of ftlm itself are not changed. A range with too many values is rejected before the call.
     """
     if inspect.isclass(decorated):
         type.__setattr__(decorated, "__init__", check_arguments(decorated.__init__))
@@ -77,7 +77,7 @@ def check_arguments(decorated: Decorated) -> Decorated:
 
 
 def _check_range(function: Callable[..., Any], args: Any, kwargs: Any) -> None:
-    """Raise for the first argument that is a range with more values than can be read."""
+    """Raise ModelError for the first argument that is a range with too many values."""
     for name, value in inspect.signature(function).bind_partial(*args, **kwargs).arguments.items():
         if isinstance(value, range) and value and abs((value[-1] - value[0]) // value.step) >= MAX_SEQUENCE_LENGTH:
             raise ModelError(
@@ -86,7 +86,7 @@ def _check_range(function: Callable[..., Any], args: Any, kwargs: Any) -> None:
 
 
 def _is_raised_by_caller(error: BaseException) -> bool:
-    """Whether an exception comes from code of the caller that ftlm called: a callback, a controller, a board."""
+    """Whether an exception comes from user code that ftlm called: a callback, a controller or a board."""
     trace = error.__traceback__
     while trace is not None:
         package = str(trace.tb_frame.f_globals.get("__name__")).partition(".")[0]
@@ -115,34 +115,34 @@ def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, erro
 
 
 class _UnknownType:
-    """Type of a name that only a type checker imports."""
+    """Placeholder for a type that only type checkers import."""
 
     def __class_getitem__(cls, item: object) -> type[_UnknownType]:
         return cls
 
 
 class _Names(dict[str, Any]):
-    """Names of a module and public names of ftlm; others are unknown types."""
+    """Mapping from names of a module and public names of ftlm to objects; other names are unknown types."""
 
     def __missing__(self, name: str) -> Any:
         return getattr(builtins, name, None) or getattr(sys.modules.get("ftlm"), name, _UnknownType)
 
 
 def _annotation(annotation: Any, names: _Names) -> Any:
-    """Return the type that an annotation names."""
+    """Return the type that the text of an annotation denotes."""
     owner = types.SimpleNamespace(__annotations__={"value": annotation})
     return _UnknownType if annotation is inspect.Parameter.empty else get_type_hints(owner, {}, names)["value"]
 
 
 def _alternatives(annotation: Any) -> tuple[Any, ...]:
-    """Return the members of a union."""
+    """Return the member types of a union, or the type itself."""
     if get_origin(annotation) in (Union, types.UnionType):
         return tuple(kind for member in get_args(annotation) for kind in _alternatives(member))
     return (annotation,)
 
 
 def _describe_type(kind: Any) -> str:
-    """Describe a type that is not a union."""
+    """Return text on a type that is not a union."""
     if get_origin(kind) is Literal:
         return ", ".join(map(repr, get_args(kind)))
     kind = get_origin(kind) or kind

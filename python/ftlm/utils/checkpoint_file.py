@@ -8,10 +8,11 @@ The only table has the name of the computation (``search`` or ``selection``) and
 ``digest``   BLAKE2b of the previous digest (nothing for the first record) and the payload, 16 bytes
 ===========  ========================================================================================================
 
-Records are only appended. The rollback journal of SQLite makes an append complete or void, whatever ends the process,
-and is deleted at the end of each append: the file alone holds all records. A write-ahead log would keep the last in a
-second file after a kill. SQLite does not detect changed bytes of a page, so that every digest covers all records
-up to its own: a record that was lost, moved or changed is reported as damage, and no record after it is used.
+Records are only appended. The rollback journal of SQLite makes every append complete or void, however the process ends,
+and is deleted at the end of each append, so the file alone contains all records. (After a kill, a write-ahead log would
+contain the last records in a second file.) SQLite does not detect changed bytes of a page. Every digest therefore
+covers all records up to its own. A record that was lost, moved or changed is reported as damage, and no later record is
+used.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ LOCK_PAUSE_S = 0.01
 
 
 def encode_numpy(value: object) -> object:
-    """Convert NumPy numbers to Python numbers, an array to its shape and little-endian doubles, a tuple to itself."""
+    """Return a NumPy number as a Python number, and an array as its shape and little-endian doubles."""
     if isinstance(value, np.ndarray):
         return value.shape, np.ascontiguousarray(value, "<f8").tobytes()
     if isinstance(value, (np.floating, np.integer, np.bool_)):
@@ -58,7 +59,7 @@ def encode_numpy(value: object) -> object:
 
 
 def decode_array(_: type, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Convert the shape and the bytes of an array to the array."""
+    """Return the array with a given shape and bytes."""
     shape, data = msgspec.convert(value, tuple[tuple[int, ...], bytes])
     return np.frombuffer(data, "<f8").astype(np.float64).reshape(shape)
 
@@ -82,14 +83,15 @@ def _insert(connection: sqlite3.Connection, kind: Kind, payloads: Sequence[bytes
 
 
 class CheckpointFile:
-    """Open checkpoint file.
+    """Checkpoint file that is open for reading or writing.
 
     Parameters
     ----------
     path, kind
-        File, and the computation whose records it holds.
+        Path of the file, and the kind of computation whose records it contains.
     access
-        Whether the file is read, which other processes may do too, resumed by its only writer, or also created.
+        Whether the file is only read (also by other processes), resumed by its single writer, or created if it does not
+        exist.
     """
 
     def __init__(
@@ -128,7 +130,7 @@ class CheckpointFile:
             raise
 
     def _status(self, access: str) -> os.stat_result | None:
-        """Return the status of the file, or None for a file that can be created."""
+        """Return the status of the file; None if it does not exist and can be created."""
         try:
             return self.path.stat()
         except FileNotFoundError:
@@ -138,7 +140,7 @@ class CheckpointFile:
             return None
 
     def _lock(self) -> None:
-        """Lock the file against other writers until it is closed; readers are let in between appends."""
+        """Lock the file against other writers until it is closed; readers have access between appends."""
         run = self._connection.execute
         run("PRAGMA busy_timeout = 0")
         run("PRAGMA journal_mode = DELETE")
@@ -153,7 +155,7 @@ class CheckpointFile:
         run(f"PRAGMA busy_timeout = {round(1000 * READER_TIMEOUT_S)}")
 
     def _check_kind(self) -> None:
-        """Raise DataError if the database is that of another kind of computation, or of another program."""
+        """Raise DataError if the database belongs to another kind of computation or to another program."""
         statements = [str(sql) for (sql,) in self._connection.execute("SELECT sql FROM sqlite_master")]
         self._is_empty = not statements
         other: Kind = "selection" if self.kind == "search" else "search"
@@ -168,7 +170,7 @@ class CheckpointFile:
         return DataError(f"{self.path} is not an ftlm {self.kind} store; give a file written with {parameter('store')}")
 
     def _opening_error(self, error: sqlite3.Error, verb: str) -> DataError:
-        """Return the error of a file that SQLite does not open."""
+        """Return the error for a file that SQLite cannot open."""
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         if code == sqlite3.SQLITE_BUSY:
             return DataError(
@@ -187,7 +189,7 @@ class CheckpointFile:
         return self._foreign_error()
 
     def read(self) -> tuple[list[bytes], str | None]:
-        """Return the payloads of all intact records, and a description of the damage after them."""
+        """Return the payloads of all intact records, and text on any damage after them (or None)."""
         payloads: list[bytes] = []
         digest, damage = b"", None
         if self._is_empty:
@@ -209,7 +211,7 @@ class CheckpointFile:
         return payloads, damage
 
     def append(self, payloads: Sequence[bytes]) -> None:
-        """Append records and flush them to disk: all, or none and DataError."""
+        """Append all records and flush them to disk, or append none and raise DataError."""
         try:
             if not self._connection.in_transaction:
                 self._connection.execute("BEGIN IMMEDIATE")
@@ -222,7 +224,10 @@ class CheckpointFile:
             ) from error
 
     def recover(self, payloads: Sequence[bytes]) -> Path:
-        """Replace a damaged file by one of its intact records, close it, and return the path of a copy of it."""
+        """Replace a damaged file by one with the given intact records, and close it.
+
+        Returns the path of a copy of the damaged file.
+        """
         self.close()
         copy = write_atomically(self.path.with_name(self.path.name + ".damaged"), self.path.read_bytes(), force=False)
         with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as fresh:

@@ -1,4 +1,4 @@
-"""Files: paths in messages, atomic writing, versioned JSON documents, and the logger ``ftlm``."""
+"""Files: atomic writing, versioned JSON documents, TOML files, paths in messages, and the logger ``ftlm``."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ _NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY",
 
 @dataclass(frozen=True)
 class FileMessages:
-    """Wording of errors about a file that cannot be written.
+    """Wording of error messages on files that cannot be written.
 
     Parameters
     ----------
     quotes_path
-        Whether the path stands in quotes.
+        Whether the path is in quotes.
     folder
-        Remedy if a folder has that name; empty if a folder counts as an existing file.
+        Remedy if a folder has the name of the file; empty if a folder is treated like an existing file.
     failure
-        Message of a failure, with a placeholder for its reason.
+        Message on a failure, with a placeholder for its reason.
     """
 
     quotes_path: bool = False
@@ -65,7 +65,7 @@ COMMAND_MESSAGES = FileMessages(folder="name a file in it")
 
 
 def check_new(path: str | os.PathLike[str], *, force: bool, words: FileMessages = DEFAULT_MESSAGES) -> Path:
-    """Raise for the name of a folder, or of an existing file without ``force``."""
+    """Return a path; raise DataError if it is a folder, or an existing file and ``force`` is False."""
     file = Path(path)
     if words.folder and file.is_dir():
         raise DataError(f"{words.format_path(file)} is a folder; {words.folder}")
@@ -85,7 +85,7 @@ def check_new(path: str | os.PathLike[str], *, force: bool, words: FileMessages 
 
 
 def _link_status(file: Path) -> os.stat_result | None:
-    """Return the status of a path without following links; None if it does not exist."""
+    """Return the status of a path without following symbolic links; None if it does not exist."""
     try:
         return file.lstat()
     except (OSError, ValueError):
@@ -93,7 +93,7 @@ def _link_status(file: Path) -> os.stat_result | None:
 
 
 def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: FileMessages = DEFAULT_MESSAGES) -> None:
-    """Raise before the computation for paths that could not be written after it; None is skipped."""
+    """Raise DataError, before a computation, for paths that could not be written after it; None is ignored."""
     for path in paths:
         if path is None:
             continue
@@ -109,7 +109,7 @@ def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: FileMe
 
 
 def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
-    """Create a folder, and raise before the computation for files in it that could not be written."""
+    """Create a folder; raise DataError, before a computation, for files in it that could not be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -125,12 +125,14 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
 def write_atomically(
     path: str | os.PathLike[str], content: bytes, *, force: bool, words: FileMessages = DEFAULT_MESSAGES
 ) -> Path:
-    """Write a temporary file, flush it to disk and rename it: readers see the old content or the new one.
+    """Write a file atomically, and return its path; readers see either the old or the new content.
+
+    A temporary file is written, flushed to disk and renamed.
 
     Raises
     ------
     DataError
-        The file exists and ``force`` is not set, or it cannot be written.
+        If the file exists and ``force`` is False, or it cannot be written.
     """
     file = check_new(path, force=force, words=words)
     try:
@@ -176,7 +178,7 @@ def write_atomically(
 
 
 def _move_exclusively(beside: Path, file: Path) -> None:
-    """Rename a file to a name that must not exist; raise if it was created meanwhile, and leave nothing there."""
+    """Rename a file to a name that must not exist; raise an error if it was created in the meantime."""
     try:
         os.link(beside, file, follow_symlinks=False)
     except FileExistsError:
@@ -202,7 +204,7 @@ _READ_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK
 
 
 def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_bytes: int) -> bytes:
-    """Return the bytes of a regular file within a size limit; a pipe or a device is refused, not waited for.
+    """Return the bytes of a regular file within a size limit; pipes and devices are rejected.
 
     Parameters
     ----------
@@ -216,7 +218,7 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
     Raises
     ------
     DataError
-        A file that cannot be read, is not a regular file, or is too large.
+        If the file cannot be read, is not a regular file, or is too large.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path = {short_repr(path)} is not the path of a file; give {source}")
@@ -259,7 +261,7 @@ def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F
     Raises
     ------
     DataError
-        A file that cannot be read, is too large, is not TOML, or has another content.
+        If the file cannot be read, is too large, is not TOML, or has other content.
     """
     content = read_small_file(path, what, source, MAX_SMALL_FILE_BYTES)
     try:
@@ -272,7 +274,7 @@ def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F
 
 
 def _field_names(kind: type[msgspec.Struct]) -> list[str]:
-    """Return the keys of a schema and of its tables."""
+    """Return the keys of a schema and of its nested tables."""
     names = []
     for field in msgspec.structs.fields(kind):
         tables = [
@@ -283,7 +285,7 @@ def _field_names(kind: type[msgspec.Struct]) -> list[str]:
 
 
 class SchemaRecord(Protocol):
-    """Content of a versioned document."""
+    """Protocol of the content of a versioned document."""
 
     schema: int
 
@@ -292,7 +294,7 @@ T = TypeVar("T", bound=SchemaRecord)
 
 
 class FileHeader(msgspec.Struct):
-    """Header of every document, readable in files of later versions, too."""
+    """Header of every document, which this version can read even in files of later versions."""
 
     format: str
     schema: int
@@ -321,12 +323,12 @@ class JsonFormat(Generic[T]):
     latest_schema: int
 
     def read(self, path: str | os.PathLike[str]) -> T:
-        """Read and decode a file.
+        """Return the content of a file.
 
         Raises
         ------
         DataError
-            A file that cannot be read, is too large, has another format, or is of a later version.
+            If the file cannot be read, is too large, has another format, or is of a later version.
         """
         content = read_small_file(path, self.what, self.source, MAX_SMALL_FILE_BYTES)
         file = Path(path)
@@ -339,7 +341,7 @@ class JsonFormat(Generic[T]):
             ) from error
 
     def _check_later(self, file: Path, content: bytes) -> None:
-        """Raise if a file that cannot be decoded comes from a later version."""
+        """Raise DataError if a file that cannot be decoded comes from a later version."""
         try:
             head = msgspec.json.decode(content, type=FileHeader)
         except (msgspec.MsgspecError, ValueError, RecursionError):
@@ -356,12 +358,14 @@ class JsonFormat(Generic[T]):
         )
 
     def check_schema(self, path: str | os.PathLike[str], read: SchemaRecord, of: int) -> None:
-        """Raise if the schema is later than this version, or than the content needs.
+        """Raise DataError if the schema number is later than this version reads, or higher than the content requires.
+
+        `of` is the smallest schema number that can represent the content.
 
         Raises
         ------
         DataError
-            A schema beyond the latest that this version reads, or beyond that of the content.
+            In these cases.
         """
         if read.schema > self.latest_schema:
             raise self._newer_version_error(path, read.schema, getattr(read, "written_by", ""))
@@ -377,7 +381,7 @@ def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:
     Raises
     ------
     ModelError
-        pandas is not installed.
+        If pandas is not installed.
     """
     pandas = optional_module("pandas", "pandas", "pandas")
     return pandas.DataFrame.from_records(list(rows)).set_index(list(index))

@@ -1,4 +1,4 @@
-"""Formatting: Greek symbols, subscripts, significant digits, word wrap, control characters, values for JSON."""
+"""Formatting of text: Greek symbols, significant digits, word wrap, control characters, and values for JSON."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SYMBOL_PATTERN = re.compile(rf"({'|'.join(GREEK_LETTERS)}|[A-Za-z])_?(\d*)", re.
 
 
 def symbol(name: str) -> str:
-    """Return a name as a symbol: ``theta12`` becomes θ₁₂; other names are unchanged."""
+    """Return a name as a symbol, such as θ₁₂ for ``theta12``; other names are returned unchanged."""
     match = SYMBOL_PATTERN.fullmatch(name)
     if not match:
         return name
@@ -46,7 +46,7 @@ def symbol(name: str) -> str:
 
 
 def symbol_html(name: str) -> Markup:
-    """Return the symbol with an HTML subscript, escaped."""
+    """Return a name as a symbol with an HTML subscript; the text is escaped."""
     match = SYMBOL_PATTERN.fullmatch(name)
     if not match:
         return Markup("<i>{}</i>").format(name)
@@ -55,14 +55,14 @@ def symbol_html(name: str) -> Markup:
 
 
 class Exact(float):
-    """Number that was chosen, not estimated, such as an order of the grid; it is printed in full."""
+    """Number that is not an estimate, such as an order of the grid, and is therefore printed in full."""
 
 
 Cell = str | float | None
 
 
 def number(value: float, digits: int = SIGNIFICANT_DIGITS) -> str:
-    """Return a number with this many significant digits; infinity is "∞ diverged"."""
+    """Return a number as text with the given significant digits; infinity is "∞ diverged"."""
     if isinstance(value, Integral):
         return f"{value:,}".replace(",", "\u202f")
     if math.isnan(value):
@@ -78,17 +78,17 @@ def number(value: float, digits: int = SIGNIFICANT_DIGITS) -> str:
 
 
 def format_bound(value: float, spec: str = ".3g") -> str:
-    """Format a standard error or an interval bound; infinity (not identifiable) is ∞."""
+    """Return a standard error or an interval bound as text; infinity (not identifiable) is "∞"."""
     return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
 
 
 def truncate_text(text: str, most: int) -> str:
-    """Truncate a text with an ellipsis."""
+    """Return a text of at most `most` characters, truncated with an ellipsis."""
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Format a number to two digits of its standard error; five digits without one."""
+    """Return a number as text, rounded to two digits of its standard error, or to five digits without one."""
     if error is None or not math.isfinite(error) or error <= 0 or not math.isfinite(value):
         return f"{value:.5g}"
     decimals = 1 - math.floor(math.log10(error))
@@ -98,14 +98,17 @@ def with_error(value: float, error: float | None) -> str:
 
 
 def columns() -> int:
-    """Line length [characters] of the terminal or of ``COLUMNS``, within bounds."""
+    """Return the line length [characters] of the terminal or of ``COLUMNS``, within limits."""
     return min(
         max(shutil.get_terminal_size((MAX_LINE_CHARACTERS, 40)).columns, MIN_LINE_CHARACTERS), MAX_LINE_CHARACTERS
     )
 
 
 def wrap_text(text: str, lead: str = "", further: str | None = None) -> list[str]:
-    """Wrap a text to the line length; continuation lines are indented, by `further` if given."""
+    """Return a text as lines of the current line length.
+
+    `lead` begins the first line, and `further` the others (by default spaces).
+    """
     # Equations break between their terms; what is ± something, or so many per cent, stays together.
     bound = re.sub(" (?![+-] )" if _EQUATION_PATTERN.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
     lines = textwrap.wrap(
@@ -124,29 +127,29 @@ _CONTROL_PATTERN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u061c\\u200e\
 
 
 def escape_controls(text: str) -> str:
-    """Return a text with control characters replaced by escapes of JSON."""
+    """Return a text in which control characters are replaced by JSON escapes."""
     return _CONTROL_PATTERN.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 class EscapedStream:
-    """Text stream to a terminal that escapes the control characters of all that is written.
+    """Text stream to a terminal that escapes control characters in everything that is written.
 
     Parameters
     ----------
     stream
-        Stream that receives the escaped text; ftlm's own bars are drawn on it directly.
+        Stream that receives the escaped text. Progress bars are written to it directly.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
 
     def write(self, text: str) -> int:
-        """Write a text with :func:`escape_controls`."""
+        """Write a text with escaped control characters, and return its length."""
         self.stream.write(escape_controls(text))
         return len(text)
 
     def writelines(self, lines: Any) -> None:
-        """Write texts."""
+        """Write several texts with escaped control characters."""
         for line in lines:
             self.write(line)
 
@@ -158,7 +161,7 @@ class EscapedStream:
 
 
 def escape_standard_streams() -> None:
-    """Replace standard output and standard error by escaped streams; those that are escaped already stay."""
+    """Replace standard output and standard error by escaped streams, unless they are escaped already."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if not isinstance(stream, EscapedStream):
@@ -171,12 +174,12 @@ def finite(value: float) -> float | None:
 
 
 def attributes(value: object, names: Iterable[str]) -> dict[str, Any]:
-    """Return some attributes of an object for JSON."""
+    """Return some attributes of an object as a dictionary for JSON."""
     return {name: json_value(getattr(value, name)) for name in names}
 
 
 def json_value(value: Any) -> Any:
-    """Return a value for JSON: mappings, sequences, and dataclasses by their fields. Infinity is None."""
+    """Return a value for JSON: mappings, sequences, and dataclasses as dictionaries; nonfinite numbers become None."""
     if isinstance(value, Mapping):
         return {f"{k:g}" if isinstance(k, float) else str(k): json_value(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,7 +1,7 @@
-"""References to parameters in messages, in the form of the interface in use: Python or the command line.
+"""References to parameters in messages, in the syntax of Python or of the command line.
 
-The interface is one for the whole process, so that every thread builds its messages alike. A process that another one
-starts passes on :func:`current_interface`.
+The interface (Python or command line) is the same for the whole process, so all threads format messages in the same
+way. A parent process passes :func:`current_interface` to its child processes.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ FLAG_BY_PARAMETER = {"inputs": "-u", "outputs": "-y", "order_grid": "--order-gri
 
 
 class _Current:
-    """Interface in use."""
+    """Interface that is currently used in messages."""
 
     interface: Interface = "python"
 
 
 class Placeholder(str):
-    """Word in a message that stands for a value, such as ``UNIT``; it is shown without quotes."""
+    """Word that represents a value in a message, such as ``UNIT``; it is shown without quotes."""
 
     __slots__ = ()
 
@@ -37,13 +37,13 @@ PART_COLUMNS = {Placeholder("part"): Placeholder("column")}
 
 
 def current_interface() -> Interface:
-    """Return the interface that messages are made for."""
+    """Return the interface for which messages are formatted."""
     return _Current.interface
 
 
 @contextmanager
 def use_interface(name: Interface) -> Iterator[None]:
-    """Make messages for an interface within a block."""
+    """Format messages for an interface within a ``with`` block."""
     interface_before, _Current.interface = _Current.interface, name
     try:
         yield
@@ -52,12 +52,12 @@ def use_interface(name: Interface) -> Iterator[None]:
 
 
 def flag_of(name: str) -> str:
-    """Return the flag of a parameter on the command line."""
+    """Return the command-line flag of a parameter."""
     return FLAG_BY_PARAMETER.get(name, f"--{name.replace('_', '-')}")
 
 
 def parameter(name: str, value: object = None) -> str:
-    """Reference to a parameter, alone or with a value.
+    """Return a reference to a parameter for a message, without or with a value.
 
     Parameters
     ----------
@@ -88,31 +88,37 @@ def parameter(name: str, value: object = None) -> str:
 
 
 def setting(name: str) -> str:
-    """Start of a sentence on the value of a parameter: ``top =``, or ``--top``; other names are quantities."""
+    """Return the beginning of a sentence on the value of a parameter, such as ``top =`` or ``--top``.
+
+    Names that are not parameters are returned as quantities.
+    """
     return f"{name} =" if _Current.interface == "python" or not name.isidentifier() else parameter(name)
 
 
 def choose_text(python: str, command_line: str) -> str:
-    """Return the first text in Python and the second on the command line."""
+    """Return the first text if the interface is Python, the second if it is the command line."""
     return python if _Current.interface == "python" else command_line
 
 
 def layout_parameter(**values: object) -> str:
-    """Reference to fields of a file's layout with values: ``layout=dict(decimal='comma')``, or ``--decimal comma``."""
+    """Return a reference to layout options with values.
+
+    It is such as ``layout=dict(decimal='comma')`` or ``--decimal comma``.
+    """
     if _Current.interface == "python":
         return f"layout=dict({', '.join(f'{name}={value!r}' for name, value in values.items())})"
     return " ".join(parameter(name, value) for name, value in values.items())
 
 
 def layout_fields(*names: str) -> str:
-    """Reference to fields of a file's layout to start a sentence: ``layout=: skip``, or ``--skip``."""
+    """Return a reference to layout options for the start of a sentence, such as ``layout=: skip`` or ``--skip``."""
     if _Current.interface == "python":
         return f"{parameter('layout')}: {' and '.join(names)}"
     return " and ".join(map(parameter, names))
 
 
 def _flag_value(value: object) -> str:
-    """Value of a flag as it is typed."""
+    """Return the value of a flag as it is typed on the command line."""
     if isinstance(value, Placeholder):
         return value.upper()
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Resources: memory limit of a search, machine speed, interruptible worker threads, processes of their own."""
+"""Resources of the machine: memory limit, speed, interruptible threads, and isolated processes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SYSTEM_ROOT = Path("/")
 
 
 def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
-    """Return the limit [bytes] of regressors, products, test vectors and layouts of a search together.
+    """Return the memory limit [bytes] of an order search: regressors, products, test vectors and grids together.
 
     Parameters
     ----------
@@ -56,9 +56,9 @@ def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
 
 
 def available_memory(system: Path = _SYSTEM_ROOT) -> int | None:
-    """Return the memory [bytes] that this process can still take before swapping; None if the system reports none.
+    """Return the memory [bytes] that this process can still use without swapping; None if the system reports none.
 
-    Minimum of the kernel's available memory and of the remainder of every control group of this process.
+    It is the minimum of the kernel's available memory and the free memory of every control group of this process.
     """
     amounts = [*_kernel_available_bytes(system), *_cgroup_available_bytes(system)]
     if not amounts:
@@ -82,7 +82,7 @@ def _kernel_available_bytes(system: Path) -> list[int]:
 
 
 def _cgroup_available_bytes(system: Path) -> list[int]:
-    """Remaining memory of each control group, v1 and v2; reclaimable page cache counts as free."""
+    """Return the free memory of each control group [bytes], v1 and v2; reclaimable page cache counts as free."""
     amounts = []
     for line in _text(system / "proc/self/cgroup").splitlines():
         number, controllers, name = (*line.split(":", 2), "", "")[:3]
@@ -121,7 +121,7 @@ PARALLEL_EFFICIENCY = 0.7
 
 
 def machine_slowdown() -> float:
-    """Return the time per unit of work on one core relative to the reference machine, at the current load."""
+    """Return the time per unit of work on one core at the current load, relative to the reference machine."""
     values, count = np.ones(BENCHMARK_FFT_LENGTH), 0
     start_time = time.perf_counter()
     while time.perf_counter() - start_time < BENCHMARK_DURATION_S:
@@ -131,22 +131,24 @@ def machine_slowdown() -> float:
 
 
 def estimate_duration(seconds: float, threads: int) -> float:
-    """Return the estimated duration [s] here of work that takes ``seconds`` on one core of the reference machine."""
+    """Return the expected duration [s] on this machine of work that takes ``seconds`` on one reference core."""
     return seconds * machine_slowdown() / (1.0 + PARALLEL_EFFICIENCY * (max(threads, 1) - 1))
 
 
 def duration_bounds(seconds: float, came_to: tuple[float, float] = FIT_TIME_FACTORS) -> tuple[float, float]:
-    """Return the range of a duration from its estimate and a range of factors."""
+    """Return the (shortest, longest) expected duration [s] from an estimate and a range of factors."""
     return came_to[0] * seconds, came_to[1] * seconds
 
 
 def output_error_cost(samples: int, numbers: int) -> float:
-    """Return the time [s] of an output-error fit on one core of the reference machine.
+    """Return the time [s] that an output-error fit takes on one core of the reference machine.
 
-    Actual times are within :data:`FIT_TIME_FACTORS` of it.
+    `samples` are those of all runs and outputs, and `numbers` is the number of free parameters.
 
-    The multistart grows with the square of the number of parameters, the rest with the samples of all runs and outputs.
-    Long records grow more slowly because most of their fit uses a part of them.
+    Actual times differ from it by at most the factors :data:`FIT_TIME_FACTORS`.
+
+    The time of the multistart grows with the square of the number of parameters, that of the rest with the number of
+    samples. It grows more slowly for long records, because most of the fit uses a part of them.
     """
     return 0.04 * numbers**2 + 3.5e-4 * min(samples, LONG_RECORD_SAMPLES) + 2e-5 * samples
 
@@ -161,7 +163,7 @@ def stop_flag() -> _core.Stop | None:
 
 @contextmanager
 def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
-    """Thread pool that cancels running computations and queued tasks when the main thread is interrupted."""
+    """Yield a thread pool whose running and queued tasks are cancelled if the main thread is interrupted."""
     flag = stop_flag() or _core.Stop()
     with ThreadPoolExecutor(threads, initializer=_STOP_FLAG.set, initargs=(flag,)) as pool:
         try:
@@ -174,11 +176,11 @@ def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, Any]:
-    """Return command, environment and working directory to run a script in an isolated Python subprocess.
+    """Return command, environment and working directory with which a script runs in an isolated Python process.
 
-    A file that somebody uploaded or downloaded must not become a module of the child. Python therefore runs isolated
-    (``-I``: neither ``PYTHONPATH`` nor the working directory is searched), in the folder of its installation. The
-    absolute folders of this process's modules, except its working directory, are searched after those of Python.
+    The process must not import an uploaded or downloaded file as a module. Python therefore runs isolated (``-I``:
+    neither ``PYTHONPATH`` nor the working directory is searched), in the folder of its installation. The absolute
+    module folders of this process, except its working directory, are searched after those of Python.
 
     Parameters
     ----------
@@ -200,7 +202,7 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
 
 
 def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a task of an executor; a worker process ends when the process that started it is killed."""
+    """Return the result of a task in a worker process, which ends when its parent process is killed."""
     # Tasks of thread pools run in other threads than the main one.
     if threading.current_thread() is threading.main_thread():
         _end_with_parent(os.getpid())
@@ -209,7 +211,7 @@ def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
 
 @cache
 def _end_with_parent(_process: int) -> None:
-    """End this process when its parent ends; a worker of a killed pool would wait for tasks forever."""
+    """End this process when its parent ends; otherwise it would wait for tasks forever."""
     from multiprocessing import parent_process  # noqa: PLC0415 — pools alone import it
 
     parent = parent_process()
@@ -223,7 +225,7 @@ def _end_with_parent(_process: int) -> None:
 
 
 def optional_module(name: str, package: str, install: str) -> Any:
-    """Import a module of a package that ftlm does not require; raise ModelError with the command that installs it."""
+    """Return a module of an optional package; raise ModelError with the install command if it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -231,5 +233,5 @@ def optional_module(name: str, package: str, install: str) -> Any:
 
 
 def python_control() -> Any:
-    """Import python-control."""
+    """Return the module of python-control; raise ModelError if it is not installed."""
     return optional_module("control", "python-control", "'ftlm[control]'")

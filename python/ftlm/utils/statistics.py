@@ -1,4 +1,4 @@
-"""Statistics of residuals and signals: noise level, rest, whiteness, quantiles, prewhitening."""
+"""Statistics of residuals and signals: noise level, rest, whiteness, quantiles and prewhitening."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ NORMAL_99 = NormalDist().inv_cdf(1 - SIGNIFICANCE_LEVEL / 2)
 
 
 def is_rest(samples: Floats) -> bool:
-    """Whether a signal starts at zero within its noise.
+    """Whether the first sample of a signal is zero within the noise.
 
-    Only the first sample is tested, because a machine at rest may respond within a few samples.
+    Later samples are not tested, because a machine that starts at rest may respond within a few samples.
     """
     finite = samples[~np.isnan(samples)]
     noise = white_noise(samples)
@@ -39,7 +39,7 @@ def is_rest(samples: Floats) -> bool:
 
 
 def estimate_noise(samples: Floats) -> float:
-    """Standard deviation of white noise on a smooth signal, from the median of second differences."""
+    """Return the standard deviation of white noise on a smooth signal, from the median of second differences."""
     bends = np.diff(samples, 2)
     bends = bends[~np.isnan(bends)]
     if bends.size == 0:
@@ -55,10 +55,13 @@ NOISE_SAMPLES = 4096
 
 
 def white_noise(samples: Floats) -> float:
-    """Standard deviation of white noise on a signal that may oscillate: the least of several difference estimates.
+    """Return the standard deviation of white noise on a signal that may oscillate.
 
-    White noise is in the differences of every order. A swing of few samples per period, which second differences take
-    for noise, is in the low orders alone (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521).
+    It is the smallest of the estimates from differences of several orders.
+
+    White noise contributes to the differences of every order. An oscillation with few samples per period, which second
+    differences mistake for noise, contributes only to low orders (Hall, Kay, Titterington 1990,
+    doi:10.1093/biomet/77.3.521).
     """
     start = samples[:NOISE_SAMPLES]
     least = estimate_noise(start)
@@ -72,14 +75,14 @@ def white_noise(samples: Floats) -> float:
 
 
 def robust_deviation(values: Floats) -> float:
-    """Standard deviation of normal values from the median of their absolute values."""
+    """Return the standard deviation of normally distributed values, from the median of their absolute values."""
     return float(np.median(np.abs(values))) / MAD_OVER_SIGMA if values.size else 0.0
 
 
 def huber_excess(few: Floats, many: Floats) -> float:
-    """Excess of Huber's loss of a smaller model over that of a larger one, in units of the noise.
+    """Return the excess of Huber's loss of a smaller model over that of a larger one, in units of the noise variance.
 
-    If the smaller model suffices, the excess is chi-squared distributed. Its degrees of freedom are the additional
+    If the smaller model is sufficient, the excess is chi-squared distributed. Its degrees of freedom are the additional
     parameters of the larger model, even with outliers (doi:10.1214/aoms/1177703732).
     """
     scale = robust_deviation(many) or float(np.sqrt(np.mean(many**2)))
@@ -93,32 +96,37 @@ def huber_excess(few: Floats, many: Floats) -> float:
 
 
 def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Autocovariances of series at lags from 0, and the number of pairs of each; NaN marks missing samples.
+    """Return autocovariances at lags 0 to `most`, pooled over series, and the number of pairs at each lag.
 
-    Each series is centered about its own mean. The series are pooled.
+    The mean of each series is subtracted. NaN marks missing samples.
     """
     return _core.autocovariances(series, most)
 
 
 def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Autocorrelations of series at lags from 0, and the number of pairs of each; NaN marks missing samples."""
+    """Return autocorrelations at lags 0 to `most`, pooled over series, and the number of pairs at each lag.
+
+    NaN marks missing samples.
+    """
     covariances, pairs = autocovariances(series, most)
     power = covariances[0] * pairs[0]
     return covariances * pairs / (power if power > 0 else 1.0), pairs
 
 
 def portmanteau(series: Sequence[Floats], most: int) -> float:
-    """Statistic of whiteness over lags 1 to ``most``, chi-squared with as many degrees of freedom for white noise.
+    """Return a whiteness statistic over lags 1 to ``most``.
 
-    The variance of the noise may change within a series: each lag has the variance of its own products (Lobato,
-    Nankervis and Savin, doi:10.1111/1468-2354.00106). Box and Pierce's sum takes a machine that stands still for a part
-    of the run for color.
+    For white noise it is chi-squared distributed with ``most`` degrees of freedom.
+
+    The variance of the noise may change within a series, because each lag is divided by the variance of its own
+    products (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). The Box-Pierce statistic would be too large for
+    a machine that rests during a part of the run.
     """
     return _core.portmanteau(series, most)
 
 
 def chi_squared(degrees: int, level: float) -> float:
-    """Value that a chi-squared variable exceeds with the probability ``level``, by Wilson and Hilferty.
+    """Return the value that a chi-squared variable exceeds with probability ``level`` (Wilson-Hilferty approximation).
 
     The relative error is 0.3 % from five degrees of freedom and 1 % from one.
     """
@@ -126,12 +134,12 @@ def chi_squared(degrees: int, level: float) -> float:
 
 
 def chi_squared_99(degrees: int) -> float:
-    """99 % quantile of chi-squared; see :func:`chi_squared`."""
+    """Return the 99 % quantile of the chi-squared distribution; see :func:`chi_squared`."""
     return chi_squared(degrees, SIGNIFICANCE_LEVEL)
 
 
 def variance_inflation(series: Floats) -> float:
-    """Variance of the series' sum relative to white noise of the same variance, at least 1 (Bartlett)."""
+    """Return the variance of a sum of the series' values relative to that for white noise, at least 1 (Bartlett)."""
     lags = min(int(4 * series.size ** (1.0 / 3.0)), series.size - 1)
     if lags < 2:
         return 1.0
@@ -140,7 +148,7 @@ def variance_inflation(series: Floats) -> float:
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:
-    """Whether :func:`portmanteau` accepts white noise at the 1 % level."""
+    """Whether the :func:`portmanteau` test accepts that a series is white noise, at the 1 % level."""
     return _core.is_white(series, lags)
 
 
@@ -149,17 +157,17 @@ CONSTANT_TOLERANCE = 1e-12
 
 
 def autoregression(series: Sequence[Floats], most: int) -> Floats:
-    """Return the common whitening filter 1, a₁, …, aₙ of several series.
+    """Return the coefficients 1, a₁, …, aₙ of a whitening filter that is common to several series.
 
-    Solution of the Yule-Walker equations by Levinson and Durbin (doi:10.1093/biomet/47.3-4.233). The autocovariances
-    are pooled over the series, each about its own mean. The order minimizes the Bayesian information criterion.
+    The Levinson-Durbin recursion solves the Yule-Walker equations (doi:10.1093/biomet/47.3-4.233) with autocovariances
+    that are pooled over the series, whose means are subtracted. The order minimizes the Bayesian information criterion.
 
     Parameters
     ----------
     series
         One array per run; NaN marks a missing sample.
     most
-        Largest order.
+        Maximum order.
     """
     return fit_whitening_filter(series, most)[0]
 
@@ -170,9 +178,9 @@ def fit_whitening_filter(series: Sequence[Floats], most: int) -> tuple[Floats, f
 
 
 def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:
-    """Return mean-free series after a whitening filter, without the samples of its start-up.
+    """Return series, minus their mean, after a whitening filter; the samples of its start-up are omitted.
 
-    Output samples that depend on a missing sample are zero.
+    Filtered samples that depend on a missing sample are zero.
     """
     out = []
     for x in series:

@@ -1,4 +1,4 @@
-"""Argument checks: numbers, choices, names, arrays, and the nearest valid spelling."""
+"""Checks of arguments: numbers, choices, names, arrays, and suggestions for misspelled names."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NUMBER_DTYPE_KINDS = frozenset("fiub")
 
 
 def short_repr(value: object, most: int = 60) -> str:
-    """Return a value's representation for an error message, truncated; a long integer by its number of bits."""
+    """Return the repr of a value for a message, truncated; a long integer is replaced by its number of bits."""
     if type(value) is int and value.bit_length() > 3 * most:
         # A long integer has no decimal form in Python.
         return f"an integer of {value.bit_length()} bits"
@@ -39,7 +39,7 @@ def short_repr(value: object, most: int = 60) -> str:
 
 
 def error_text(error: BaseException, most: int = 500) -> str:
-    """Return the message of a foreign exception, truncated and reduced to encodable characters."""
+    """Return the message of an exception of another package, truncated and without unencodable characters."""
     try:
         text = str(error)
     except Exception:
@@ -48,7 +48,7 @@ def error_text(error: BaseException, most: int = 500) -> str:
 
 
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
-    """Raise unless a value is one of some strings."""
+    """Raise ModelError unless a value is one of the given strings."""
     words = list(choices)
     if not isinstance(value, str) or value not in words:
         raise ModelError(f"{setting(name)} {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
@@ -61,14 +61,14 @@ def is_masked_array(value: object) -> TypeGuard[np.ma.MaskedArray[Any, Any]]:
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value may be a real number; complex values are excluded."""
+    """Whether a value can be a real number; complex values cannot."""
     if isinstance(value, (str, bytes, bytearray, bool, complex)) or is_masked_array(value):
         return False
     return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL_DTYPE_KINDS
 
 
 def whole_number(value: object) -> int | None:
-    """Return an integral value as an int, anything else as None; the caller raises."""
+    """Return an integral value as an int, or None for any other value."""
     if not _is_number(value):
         return None
     try:
@@ -79,7 +79,7 @@ def whole_number(value: object) -> int | None:
 
 
 def check_integer(name: str, value: object, low: int, high: int | None = None) -> int:
-    """Return a value as an int; raise ModelError unless it is an integer from `low` to `high`, by default 2^62 - 1."""
+    """Return a value as an int; raise ModelError unless it is an integer from `low` to `high` (by default 2^62 - 1)."""
     number = whole_number(value)
     if number is None or not low <= number <= ((1 << 62) - 1 if high is None else high):
         limits = f"of at least {low}" if high is None else f"from {low} to {high}"
@@ -88,7 +88,7 @@ def check_integer(name: str, value: object, low: int, high: int | None = None) -
 
 
 def check_seed(seed: object) -> int:
-    """Return a random seed as an int; floats and booleans are refused."""
+    """Return a random seed as an int; raise ModelError for floats, booleans and values out of range."""
     try:
         number = -1 if isinstance(seed, bool) else operator.index(seed)  # type: ignore[arg-type]
     except TypeError:
@@ -99,7 +99,7 @@ def check_seed(seed: object) -> int:
 
 
 def check_pulses(m: object, below: float = 1 << 62) -> int:
-    """Return the number of block pulses as an int below 2^62, the limit of the core."""
+    """Return the number of block pulses as an int; raise ModelError unless it is positive and below 2^62."""
     pulses = whole_number(m)
     if pulses is None or not 1 <= pulses < below:
         raise ModelError(f"{setting('m')} {m!r} is not a number of pulses; give a whole number, at least 1")
@@ -107,12 +107,12 @@ def check_pulses(m: object, below: float = 1 << 62) -> int:
 
 
 def real_number(name: str, value: object) -> float:
-    """Return a real number as a float, which may be infinite or NaN.
+    """Return a real number as a float; it may be infinite or NaN.
 
     Raises
     ------
     ModelError
-        Text, None, a boolean, a complex number, or an integer beyond the range of floating point.
+        If the value is text, None, a boolean, a complex number, or an integer too large for a float.
     """
     try:
         if not _is_number(value):
@@ -123,7 +123,7 @@ def real_number(name: str, value: object) -> float:
 
 
 def frequency_pair(band: Iterable[object]) -> tuple[float, float]:
-    """Return both ends of a band [rad/s]; raise for anything that is not a pair of numbers."""
+    """Return both limits of a frequency band [rad/s]; raise ModelError unless it is a pair of numbers."""
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
@@ -134,7 +134,7 @@ def frequency_pair(band: Iterable[object]) -> tuple[float, float]:
 
 
 def join_names(names: Iterable[object], most: int = 40) -> str:
-    """Return quoted names joined by commas, at most ``most`` of them, for an error message."""
+    """Return quoted names, joined by commas, for a message; at most ``most`` of them."""
     every = [repr(name) for name in names]
     if not every:
         return "none"
@@ -142,7 +142,7 @@ def join_names(names: Iterable[object], most: int = 40) -> str:
 
 
 def nearest(word: object, names: Iterable[object]) -> str:
-    """Return " (did you mean …?)" for the closest of names, or an empty string."""
+    """Return text such as " (did you mean …?)" with the most similar name, or "" if none is similar."""
     options = [str(name) for name in names]
     prefixes = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
     close = [max(prefixes, key=len)] if prefixes else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
@@ -150,12 +150,12 @@ def nearest(word: object, names: Iterable[object]) -> str:
 
 
 def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
-    """Return the error for invalid rows: object, first 0-based row, count and remedy."""
+    """Return the error for invalid rows: it names object, first row (from 0), number of rows and remedy."""
     return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
 
 
 def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]:
-    """Return {signal: column} for None, one name, a list of names or a mapping."""
+    """Return {signal: column} from None, a name, a list of names or a mapping; raise DataError for other values."""
     if column_names is None:
         return {}
     if isinstance(column_names, str):
@@ -178,14 +178,14 @@ def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]
 
 
 def as_mapping(argument: str, value: object, of: str = "array") -> Mapping[str, object]:
-    """Return a mapping unchanged; raise for anything else."""
+    """Return a mapping unchanged; raise DataError for any other value."""
     if not isinstance(value, Mapping):
         raise DataError(f"{parameter(argument)} is a {type(value).__name__}; pass a dict of name: {of}")
     return value
 
 
 def check_known(what: str, names: Iterable[str], choices: Sequence[str]) -> None:
-    """Raise for a name that does not occur in the equation."""
+    """Raise ModelError for a name that is not one of the choices; `what` says what is named."""
     for name in names:
         if name not in choices:
             near = difflib.get_close_matches(str(name), choices, 1)
@@ -194,7 +194,7 @@ def check_known(what: str, names: Iterable[str], choices: Sequence[str]) -> None
 
 
 def available_threads() -> int:
-    """Number of cores that this process may use."""
+    """Return the number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS or Windows
@@ -202,12 +202,12 @@ def available_threads() -> int:
 
 
 def check_threads(threads: int | None) -> int:
-    """Return the number of threads to use: by default ``FTLM_THREADS``, else all cores.
+    """Return the number of threads to use: the argument, or ``FTLM_THREADS``, or all cores.
 
     Raises
     ------
     ModelError
-        Fewer than one or more than 1024 threads, or an invalid ``FTLM_THREADS``.
+        If there are fewer than one or more than 1024 threads, or ``FTLM_THREADS`` is invalid.
     """
     if threads is None:
         text = os.environ.get(THREADS_VARIABLE, "").strip()
@@ -233,14 +233,14 @@ MAX_DIMENSIONS = 16
 
 
 def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
-    """Return an array of any dtype, possibly a view of the argument; every array of a caller passes here.
+    """Return the argument as an array of any dtype, possibly a view; all arrays of users pass this function.
 
-    A masked sample is a missing sample: NaN with ``gaps``, an error without.
+    Masked samples are missing samples: they become NaN with ``gaps``, and raise an error without.
 
     Raises
     ------
     DataError
-        Masked samples, rows of different lengths, a sequence or an array that does not fit into memory.
+        If samples are masked, rows differ in length, or the array does not fit into memory.
     """
     _check_sequence(name, values)
     try:
@@ -264,7 +264,7 @@ def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
 
 
 def _check_sequence(name: str, values: object) -> None:
-    """Raise for a sequence that is too long or too deep to be read."""
+    """Raise DataError for a sequence that is too long or too deeply nested."""
     depth, first = 0, values
     while isinstance(first, Sequence) and not isinstance(first, (str, bytes, bytearray, memoryview)):
         try:
@@ -282,7 +282,7 @@ def _check_sequence(name: str, values: object) -> None:
 
 
 def check_vector(name: str, array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Return a vector of at least one value; raise for arrays of other shapes."""
+    """Return a vector unchanged; raise DataError if it is empty or not one-dimensional."""
     if array.ndim != 1 or not array.size:
         raise DataError(f"{name} has shape {array.shape}; give a vector of at least one number")
     return array
@@ -294,7 +294,7 @@ def as_floats(name: str, values: object, *, gaps: bool = False) -> NDArray[np.fl
     Raises
     ------
     DataError
-        Text, objects, complex numbers, or what :func:`as_array` refuses.
+        If the values are text, objects or complex numbers, or in the cases of :func:`as_array`.
     """
     array = as_array(name, values, gaps=gaps)
     if array.dtype.kind not in _NUMBER_DTYPE_KINDS:
@@ -309,7 +309,7 @@ def as_complex(name: str, values: object) -> NDArray[np.complex128]:
     Raises
     ------
     DataError
-        Text, objects, or what :func:`as_array` refuses.
+        If the values are text or objects, or in the cases of :func:`as_array`.
     """
     array = as_array(name, values)
     if array.dtype.kind not in _NUMBER_DTYPE_KINDS | {"c"}:
@@ -324,7 +324,7 @@ def finite_floats(name: str, values: object) -> NDArray[np.float64]:
     Raises
     ------
     DataError
-        As :func:`as_floats`, and values that are not finite, with the first index and the count.
+        If a value is not finite (the message has the first index and the number), or in the cases of :func:`as_floats`.
     """
     array = as_floats(name, values)
     if not np.isfinite(array).all():
@@ -341,7 +341,7 @@ def finite_floats(name: str, values: object) -> NDArray[np.float64]:
 def apply_along_axis(
     name: str, values: ArrayLike, axis: int, work: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Apply ``work``, which maps rows to rows, along one axis of an array."""
+    """Return the result of ``work``, which maps rows to rows, along one axis of an array."""
     array = finite_floats(name, values)
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
@@ -363,7 +363,7 @@ def is_run_name(name: object) -> bool:
 
 
 def check_run_name(name: object) -> None:
-    """Raise if a run name cannot be written into every file format."""
+    """Raise DataError if a run name cannot be written to every file format."""
     if not is_run_name(name):
         raise DataError(
             f"{parameter('name', name)} cannot name a run; use 1 to {_NAME_LENGTH} printable characters, not "
@@ -372,7 +372,7 @@ def check_run_name(name: object) -> None:
 
 
 def check_signal_name(name: object) -> None:
-    """Raise if a signal name cannot be a column name or occur in an equation."""
+    """Raise DataError if a signal name cannot be a column name or part of an equation."""
     if not isinstance(name, str) or len(name) > _NAME_LENGTH or not _SIGNAL_NAME.fullmatch(name):
         raise DataError(
             f"{name!r} cannot name a signal; begin with a letter or _ and use letters, digits, _ . [ ] "
