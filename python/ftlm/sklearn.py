@@ -197,7 +197,7 @@ def _index(table: Any) -> Floats | None:
 
 
 def _check_index(index: Floats | None, fit_rows: int = 0) -> Floats | None:
-    """Return the index of rows; raise ValueError if it does not increase by one step."""
+    """Return the index of rows; raise DataError if it does not increase by one step."""
     steps = np.diff(index) if index is not None else np.zeros(0)
     usual = float(np.median(steps)) if steps.size else 1.0
     bad = np.flatnonzero(~((steps > 0) & (np.abs(steps - usual) <= MAX_INDEX_JITTER_SHARE * usual)))

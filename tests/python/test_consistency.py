@@ -134,7 +134,7 @@ def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
     assert joint_distance(half)[1] == 2
     found = replace(same, results=tuple(half), differences=tuple(differences(half)))
     assert found.not_identifiable == (place,)
-    assert f"{place}: not identifiable from some part" in str(found)
+    assert f"{place} is not identifiable from at least one segment" in str(found)
     nothing = replace(second.joint, covariance=np.diag([np.inf] * 3))
     none = [first, replace(second, joint=nothing)]
     assert joint_distance(none) == (None, 0)

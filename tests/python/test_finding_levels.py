@@ -110,7 +110,7 @@ def test_an_outlier_at_an_end_of_the_run_is_named_and_not_taken_for_a_poor_model
     assert "end_row_far_off" in codes(found)
     assert not {"explains_little", "buried_in_noise"} & set(codes(found))
     assert found.verdict.level == LEVEL_WITH_CARE
-    assert found.verdict.reason.startswith("the first or last row of y is an outlier")
+    assert found.verdict.reason.startswith("the first or the last row of y is an outlier")
 
 
 def test_a_flexible_link_names_what_it_leaves_out_of_an_arm():

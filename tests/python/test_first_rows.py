@@ -93,7 +93,7 @@ def test_an_input_that_is_on_from_the_first_row_assumes_rest_and_says_so(level, 
     said = [f for f in found.findings if f.code == "rest_assumed"]
     assert len(said) == 1
     assert "u is constant from row 0 on" in said[0].text
-    assert "the gain assumes that it rested at y = " in said[0].text
+    assert "the estimated gain assumes that the plant rested at y = " in said[0].text
 
 
 def test_a_coarse_swing_in_motion_is_not_taken_for_rest():

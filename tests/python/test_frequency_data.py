@@ -169,7 +169,7 @@ def test_deviations_that_are_too_small_are_found_out_and_intervals_widened():
     assert honest.warnings == ()
     boast = ftlm.identify_frequency(arc(1, deviation=0.002 * np.abs(exact)), ARC)
     assert boast.chi_squared == pytest.approx(25 * honest.chi_squared)
-    assert "times the standard deviations of the data" in boast.warnings[0]
+    assert "times the stated standard deviations" in boast.warnings[0]
     for name in TRUTH:
         assert boast.standard_errors[name] > 0.7 * honest.standard_errors[name]
 

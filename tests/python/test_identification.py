@@ -332,7 +332,7 @@ def test_results_print_and_are_json(clean_a, plants):
 def test_a_prior_that_pulls_is_named(small_run, structure):
     found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=0.01))
     (warning,) = (w for w in found.warnings if "the prior" in w)
-    assert "y: the prior (K0 = 0.01, coefficients near 0) shifts a coefficient by" in warning
+    assert "y: the prior (K0 = 0.01, centered at 0) shifts a coefficient by" in warning
     assert "Raise prior_covariance=, or use method='least-squares'" in warning
     assert "p = 7 only sets the weight of the data relative to the prior" in warning
     weak = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=1e6))
@@ -348,7 +348,7 @@ def test_a_prior_that_decides_the_ranking_is_named(small_run):
     strong = ftlm.identify(small_run, free, method=ftlm.MultiInnovation(prior_covariance=1e-4, order_grid=grid), m=256)
     (finding,) = (f for f in strong.findings if f.code == "prior_ranks")
     assert finding.text.startswith(
-        "y: the prior dominates the ranking of orders: with K0 = 0.0001 the error of the best candidate is "
+        "y: the prior determines the ranking of orders: with K0 = 0.0001 the error of the best candidate is "
     )
     for usual in (None, 1e8):
         method = ftlm.MultiInnovation(prior_covariance=usual, order_grid=grid)
@@ -371,7 +371,7 @@ def test_a_broken_coefficient_law_is_named(clean_a, with_noise, plants):
     structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
     found = ftlm.identify(with_noise(clean_a, 3e-3, 1), structure, method="least-squares")
     broken = [w for w in found.warnings if w.startswith("coefficient law: ")]
-    assert any(w.startswith("coefficient law: b2 = ") and "but the other equation gives" in w for w in broken)
+    assert any(w.startswith("coefficient law: b2 = ") and "but the other equation requires" in w for w in broken)
     assert any("the inertia ratio r1 must exceed 1, but is" in w for w in broken)
     free = ftlm.identify(with_noise(clean_a, 3e-3, 1), replace(structure, coefficient_law=()), method="least-squares")
     assert not any("coefficient law" in w for w in free.warnings)

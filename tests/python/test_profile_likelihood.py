@@ -349,7 +349,7 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     structure = found.task.structure
     short = ftlm.identify(bent, structure)
     assert "c" not in short.profiles
-    (said,) = [w for w in short.warnings if "a profile likelihood would take long" in w]
+    (said,) = [w for w in short.warnings if "profile-likelihood intervals would take too long" in w]
     assert "along c" in said
     assert "intervals='profile'" in said
     half = 1.959963984540054 * short.standard_errors["c"]
@@ -444,13 +444,13 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
     same = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
     # The fit was right all the while: its residuals do not fall, and its starts stay told.
-    assert not [w for w in same.warnings if "the search for intervals did" in w]
+    assert not [w for w in same.warnings if "it was found during the search for intervals" in w]
     assert same.joint.starts == right.joint.starts
     calls.clear()
     # As if it had been lower: of one optimum found twice rounding decides which is.
     monkeypatch.setattr(profiling, "MIN_NOISE_REDUCTION", -1.0)
     again = ftlm.identify(run, structure, threads=1, method=ftlm.OutputError(intervals="profile"))
-    assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
+    assert [w for w in again.warnings if "led to this optimum; it was found during the search for intervals" in w]
     assert "from a lower optimum" in again.details()
     for name, value in right.coefficients.items():
         assert again.coefficients[name] == pytest.approx(value, rel=1e-4)

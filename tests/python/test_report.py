@@ -268,7 +268,7 @@ def test_a_saved_model_has_a_report_of_its_own(tmp_path, small_run, small_model,
     assert "95 % interval" in text
     assert {found.standard_errors["alpha"], found.orders["alpha"]} <= {float(v) for v in Page(page).data}
     again = report.model_page(loaded, tmp_path / "again.html", validation=with_noise(small_run, 0.02, 1))
-    assert "it has the name of a run from which the model was identified" in again.read_text("utf-8")
+    assert "the run has the name of a run from which the model was identified" in again.read_text("utf-8")
     alone = report.model_page(small_model, tmp_path / "alone.html").read_text("utf-8")
     assert "No validation run was given" in alone
     assert "No standard errors are given" in alone

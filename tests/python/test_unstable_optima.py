@@ -79,7 +79,7 @@ def test_a_machine_that_grows_is_found_growing() -> None:
     assert found.joint is not None
     assert found.joint.unstable_optimum is not None
     assert found.joint.unstable_optimum.is_accepted
-    assert any("significant at 99 %" in w or "no stable one" in w for w in found.warnings)
+    assert any("significant at 99 %" in w or "no stable optimum" in w for w in found.warnings)
     assert any("grows without bound" in w for w in found.warnings)
 
 

@@ -228,8 +228,8 @@ def test_rough_intervals_are_a_fact(found, checked):
     doubted = worse(found, findings=(ROUGH,))
     assert verdict(doubted, checked).trusted
     assert doubted.warnings == (
-        "the cost is not quadratic along a0, and a profile likelihood would take long: these intervals are "
-        "approximate; intervals='profile' computes them",
+        "the cost is not quadratic along a0, and profile-likelihood intervals would take too long: these intervals are "
+        "approximate; use intervals='profile', which computes accurate intervals",
     )
 
 
@@ -242,7 +242,7 @@ BOUND = make_finding("on_bound", parameter="alpha", what="order alpha", value="2
 @pytest.mark.parametrize("words", ["D y = 2 u", "D^2 y = 2 u", "D^2 y = -0.3 D y + u", "D^1.5 y = -D^0.5 y + u"])
 def test_an_integrator_is_no_fault(words):
     assert saved_verdict(ftlm.Model(ftlm.equation(words)), []).reasons == (
-        "the model file does not say how it was identified",
+        "the model file does not state how the model was identified",
     )
 
 
@@ -559,7 +559,7 @@ def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_p
     page = model_page(saved, tmp_path / "m.html", validation=other).read_text("utf-8")
     assert page.index("Trust") < page.index("<math>")
     bare = replace(saved, estimate=None)
-    assert saved_verdict(bare, []).reason == "the model file does not say how it was identified"
+    assert saved_verdict(bare, []).reason == "the model file does not state how the model was identified"
     estimate = replace_estimate(saved, standard_errors={**saved.estimate.standard_errors, "b0": None})
     judged = saved_verdict(estimate, [])
     assert (judged.level, judged.reason) == ("do not use", "not separately identifiable from the runs: b0")
@@ -569,7 +569,7 @@ def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_p
     )
     # Sentences of earlier versions are shown and not judged.
     old = replace_estimate(saved, warnings=("order alpha = 2 is on its bound; widen it",))
-    assert saved_verdict(old, [saved.compare(other)]).remedy == "identify it again"
+    assert saved_verdict(old, [saved.compare(other)]).remedy == "identify the model again"
     assert "order alpha = 2 is on its bound; widen it" in model_page(old, tmp_path / "o.html").read_text("utf-8")
     better = replace_estimate(saved, fit={"y": 130.0})
     assert "falls from 130 to" in saved_verdict(better, [saved.compare(other)]).reason

@@ -126,7 +126,7 @@ class Observer:
 
 
 def _measured_values(observer: Observer, measured: Sequence[float] | Floats) -> Floats:
-    """Return the measured values of one sample; raise ModelError unless there is one for each measured output."""
+    """Return the measured values of one sample; raise DataError unless there is one for each measured output."""
     values = as_floats("measured", measured)
     if values.shape != (len(observer.measured),):
         raise DataError(f"measured has shape {values.shape}; give one value each of {', '.join(observer.measured)}")
