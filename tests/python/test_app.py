@@ -605,7 +605,7 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
         ({"structure": ["flexible_link(stage=1)"]}, "no signal"),
         ({"structure": ["__import__('os').system('id')"]}, None),
         ({"way": "guess"}, "way = 'guess' is not known"),
-        ({"way": "offered", "structure": ["D y = a y + b u"]}, "no choice"),
+        ({"way": "offered", "structure": ["D y = a y + b u"]}, "a comparison needs at least two structures"),
         ({"way": "auto", "structure": [], "method": "least-squares"}, "a choice of structures"),
         ({"method": "magic"}, "method = 'magic'"),
         ({"offset": "much"}, "offset = 'much'"),

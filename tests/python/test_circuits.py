@@ -186,12 +186,12 @@ def test_an_exponent_ends_at_1_and_bounds_are_kept():
         ("R0-R0", {}, "two elements are R0; number them"),
         ("R0-p(R1,C1))", {}, r"'\)' is out of place"),
         ("R0-", {}, "ends where an element is expected"),
-        ("R0+C1", {}, "is not understood; write it as in"),
+        ("R0+C1", {}, "has an invalid character; write it as in"),
         ("R0-C1", {"fixed": {"R1": 1.0}}, "fixed parameter 'R1' does not occur"),
         ("R0-C1", {"fixed": {"R0": 1.0, "C1": 1.0}}, "no parameter of R0-C1 is free"),
         ("R0-C1", {"bounds": {"R0": (2, 1)}}, "are not an interval"),
         ("R0-C1", {"start": {"R0": -1.0}}, "start= is out of the bounds"),
-        ("R0-CPE1", {"orders": {"CPE1_alpha": 0.5}}, "orders= and delay= are of equations"),
+        ("R0-CPE1", {"orders": {"CPE1_alpha": 0.5}}, "orders= and delay= apply to equations"),
     ],
 )
 def test_bad_circuits_are_refused_in_words(circuit, options, words):

@@ -187,7 +187,7 @@ def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_no
         (control.tf([1, 0, 0], [1, 1]), {}, "more zeros than poles"),
         (control.tf([0], [1, 1]), {}, "order 0"),
         (control.tf([1], [1, 1]), {"inputs": ["a", "b"]}, "2 given"),
-        (control.tf([1], [1, 1]), {"inputs": ["y"]}, "input and output at once"),
+        (control.tf([1], [1, 1]), {"inputs": ["y"]}, "name of an input and of an output"),
         (control.tf([1], [1, 1]), {"inputs": ["a b"]}, "a b"),
         (control.frd([1, 2, 3], [1, 2, 3]), {}, "FrequencyData"),
         (control.tf([1], np.poly(-np.arange(1, 12))), {}, "order 11"),

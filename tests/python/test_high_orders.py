@@ -92,7 +92,7 @@ def test_a_run_that_rounding_swamps_is_refused(monkeypatch) -> None:
     expected = exact(modes, u, STEP, linear=False)
     assert np.max(np.abs(found - expected)) < 1e-6 * np.ptp(expected)
     monkeypatch.setattr(step_refinement, "exact_samples", lambda *_: None)
-    with pytest.raises(ftlm.ConvergenceError, match="still moves by more than"):
+    with pytest.raises(ftlm.ConvergenceError, match="still changes by more than"):
         ftlm.Model(written(modes)).simulate(run, max_m=1 << 18)
 
 

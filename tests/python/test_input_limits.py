@@ -270,11 +270,15 @@ def test_a_model_with_limits_is_kept(tmp_path):
         ("D y = a y + b u", {"saturation": {"v": 1.0}}, "limited input"),
         ("D y = a y + b u", {"saturation": {"u": "much"}}, "saturation of u"),
         ("D y = a y + b u", {"saturation": {"u": (1, 2, 3)}}, "neither a number nor"),
-        ("D y = a y + b u", {"dead_zone": {"u": (0, 1)}, "saturation": {"u": 2.0}}, "saturates behind it"),
-        ("D y = a y + b u", {"dead_zone": {"u": (0, 1)}, "saturation": {"u": (1, 2)}}, "one number of an input"),
+        ("D y = a y + b u", {"dead_zone": {"u": (0, 1)}, "saturation": {"u": 2.0}}, "saturates after it"),
+        (
+            "D y = a y + b u",
+            {"dead_zone": {"u": (0, 1)}, "saturation": {"u": (1, 2)}},
+            "one parameter of an input",
+        ),
         ("D y = a y + b u", {"saturation": {"u": (1, 2)}, "delay": {"u": 0.1}}, "has a delay"),
-        ("D y = a y + b u", {"saturation": {"u": (1, 2)}, "delay": {"u": (0, 0.1)}}, "one number of an input"),
-        ("D y = a y + sat_u u", {"saturation": {"u": (1, 2)}}, "call the coefficient otherwise"),
+        ("D y = a y + b u", {"saturation": {"u": (1, 2)}, "delay": {"u": (0, 0.1)}}, "only one parameter of an input"),
+        ("D y = a y + sat_u u", {"saturation": {"u": (1, 2)}}, "give the coefficient another name"),
     ],
 )
 def test_what_is_no_limit_is_refused_in_words(text, options, words):

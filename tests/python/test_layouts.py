@@ -85,7 +85,10 @@ def test_a_layout_that_is_said_is_not_looked_for(tmp_path):
     assert ftlm.load(odd, columns=toml).length == 3
     assert ftlm.load(odd, columns=toml, layout=ftlm.Layout(skip=1), outputs={"y": "c2"}).length == 4
     messages(["no table below the first 99 lines"], lambda: ftlm.load(odd, layout=dict(skip=99), **SIGNALS))
-    messages(["header says 2 lines, and 1"], lambda: ftlm.load(odd, layout=dict(skip=4, header=2), **SIGNALS))
+    messages(
+        ["header is 2, but the number of lines above the rows is 1"],
+        lambda: ftlm.load(odd, layout=dict(skip=4, header=2), **SIGNALS),
+    )
 
 
 BAD_LAYOUTS = {
@@ -566,7 +569,7 @@ def test_clocks_of_12_and_of_24_hours_in_one_column_are_refused(tmp_path, monkey
         monkeypatch.setattr(text, "_BLOCK_BYTES", 21)
         monkeypatch.setattr(text, "_SAMPLE_CHARACTERS", 1)
     content = "time,u,y\n" + "".join(f"{stamp},{k},{k}\n" for k, stamp in enumerate(stamps))
-    words = ["written in several ways"] if first == "another piece" else [stamps[2], stamps[0], "written in two ways"]
+    words = ["have several notations"] if first == "another piece" else [stamps[2], stamps[0], "written in two ways"]
     messages(["'time'", *words], lambda: read(tmp_path, content))
 
 

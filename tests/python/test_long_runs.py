@@ -126,7 +126,7 @@ def test_what_is_left_is_told(words, monkeypatch):
 
 def test_too_few_pulses_are_an_error_and_what_grows_is_one_too():
     model, run = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u")), record(20_001)
-    with pytest.raises(ftlm.errors.ConvergenceError, match="still moves by more than"):
+    with pytest.raises(ftlm.errors.ConvergenceError, match="still changes by more than"):
         model.simulate(run, max_m=30_000)
     with pytest.raises(ftlm.errors.ConvergenceError, match="overflows"):
         ftlm.Model(ftlm.equation("D^1.4 y = 4 y + 2 u")).simulate(run)

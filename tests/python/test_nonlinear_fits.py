@@ -104,7 +104,7 @@ def test_order_search_ranks_by_free_runs(runs, tmp_path, monkeypatch):
 
 def test_candidates_whose_free_run_diverges_are_left_out(runs):
     structure = PLANTS["duffing"].structure.with_coefficients({"k3": 40.0})
-    with pytest.raises(ftlm.ModelError, match=r"the free runs of the best \d+ candidates .* all diverge"):
+    with pytest.raises(ftlm.ModelError, match=r"the simulations of the best \d+ candidates .* all diverge"):
         ftlm.search_orders(runs["duffing"], structure, GRID)
 
 

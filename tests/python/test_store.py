@@ -556,7 +556,7 @@ def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage
         with Store(forged, whole.requests) as kept:
             kept._append([CoupledTable(**{**held, **change})])
         for call in (ftlm.resume_search, ftlm.search_status):
-            with pytest.raises(ftlm.DataError, match="its table is of another search"):
+            with pytest.raises(ftlm.DataError, match="its table belongs to another search"):
                 call(forged)
     with Store(path) as kept, pytest.raises(ModelError, match="it has an unexpected final table"):
         kept.contents.sections[0].add_frame(CoupledTable(**held))
@@ -611,7 +611,7 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
         [
             (0, wave + 1, 0, "are divided into other blocks"),
             (0, wave, 9, "are no verdicts"),
-            (10**9, 10**9 + 1, 0, "it holds"),
+            (10**9, 10**9 + 1, 0, "it has"),
         ]
     ):
         path = tmp_path / f"{number}.ftlm"

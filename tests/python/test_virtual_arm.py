@@ -253,7 +253,7 @@ def test_a_stage_that_cannot_be_is_refused(changes, words):
         ({"inertia_ratio": -0.1}, "inertia_ratio = -0.1 is outside [0, inf]"),
         ({"reach": float("nan")}, "reach = nan is outside [0, inf]"),
         ({"rotating_share": 1.5}, "rotating_share = 1.5 is outside [0, 1]"),
-        ({"form": "published"}, "form = 'published' knows the stages apart alone: set coupling = 0"),
+        ({"form": "published"}, "form = 'published' has no coupling of the joints: set coupling = 0"),
         ({"current_offset": (float("nan"), 0.0)}, "current offset is not finite at index 0"),
     ],
 )
@@ -268,7 +268,7 @@ def test_an_arm_that_cannot_be_is_refused(changes, words):
     [
         ({"offset": (0.1,)}, "offset = (0.1,) is not a pair of currents"),
         ({"offset": (float("nan"), 0.0)}, "is not a pair of currents"),
-        ({"rig": "q8", "offset": (0.1, 0.0), "arm": True}, "offset is of the virtual arm"),
+        ({"rig": "q8", "offset": (0.1, 0.0), "arm": True}, "offset applies only to the virtual arm"),
     ],
 )
 def test_an_offset_that_cannot_be_is_refused(options, words):

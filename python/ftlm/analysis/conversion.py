@@ -323,7 +323,7 @@ def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...]
     behind = next((name for name in inputs if name in sensor.signals), None)
     if behind is not None:
         raise ModelError(
-            f"the input {behind} passes a sensor filter, and its inverse is not a transfer function; leave it out"
+            f"the input {behind} has a sensor filter, whose inverse is not a transfer function; leave the filter out"
         )
     return tuple(sensor.signals), _coefficients(sensor.numerator), _coefficients(sensor.denominator)
 
@@ -405,7 +405,7 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     """Return the structure that corresponds to a python-control system; see :meth:`ftlm.Model.from_control`."""
     if getattr(system, "dt", None) not in (0, None):
         raise ModelError(
-            f"the system is sampled (dt = {system.dt}); an equation is of continuous time: design it there"
+            f"the system is sampled (dt = {system.dt}); an equation is in continuous time: give a continuous system"
         )
     if hasattr(system, "A"):
         parts = _from_state_space(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))
@@ -421,7 +421,8 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     twice = sorted(set(signals) & set(results))
     if twice:
         raise ModelError(
-            f"{', '.join(twice)}: input and output at once; pass {parameter('inputs')} and {parameter('outputs')} "
+            f"{', '.join(twice)}: name of an input and of an output; pass {parameter('inputs')} and "
+            f"{parameter('outputs')} "
             "with other names"
         )
     rows = zip(results, parts, strict=True)
@@ -439,11 +440,11 @@ def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Seq
     terms = [(-c, output, order - k) for k, c in enumerate(bottom) if k > 0]
     for name, top in zip(inputs, tops, strict=True):
         if top.size > bottom.size:
-            raise ModelError(f"{output} from {name} has more zeros than poles; add a pole far out")
+            raise ModelError(f"{output} from {name} has more zeros than poles; add a fast pole")
         terms += [(c, name, top.size - 1 - k) for k, c in enumerate(top)]
     words = [f"{float(c)!r} D^{k} {name}" for c, name, k in terms if c]
     if not any(name != output for c, name, _ in terms if c):
-        raise ModelError(f"no input moves {output}; leave it out")
+        raise ModelError(f"no input affects {output}; leave this output out")
     return f"D^{order} {output} = " + " + ".join(words).replace("+ -", "- ")
 
 

@@ -54,7 +54,7 @@ class Ratio:
         if max(top) > highest + improper_order:
             raise ModelError(
                 f"the numerator is of order {max(top) + shift:g} and the denominator of order {order:g}, so a step "
-                "would drive the output to infinity; add a pole far out, or identify it from frequency responses with "
+                "would give an infinite output; add a fast pole, or identify it from frequency responses with "
                 "identify_frequency"
             )
         if not 0 < order <= MAX_ORDER:
@@ -134,12 +134,12 @@ def _ratio(model: Model, what: str) -> tuple[Ratio, str, str]:
     check_no_input_nonlinearity(model, what)
     if model.structure.has_friction or model.structure.sensor_filter is not None:
         raise ModelError(
-            f"{what} is of linear models without friction and sensor filter; leave them out of the equation"
+            f"{what} requires a linear model without friction and sensor filter; leave these out of the equation"
         )
     transfer = transfer_functions(model)
     if len(transfer.outputs) != 1 or len(transfer.inputs) != 1:
         raise ModelError(
-            f"{what} is of models with one output and one input; this one has {', '.join(transfer.outputs)} from "
+            f"{what} requires a model with one output and one input; this model has {', '.join(transfer.outputs)} from "
             f"{', '.join(transfer.inputs) or 'no input'}"
         )
     (output,), (signal,) = transfer.outputs, transfer.inputs
@@ -192,7 +192,7 @@ def inverse(model: Model) -> Model:
     """Return the model with output and input exchanged; see :meth:`ftlm.Model.inverse`."""
     own, output, signal = _ratio(model, "an inverse")
     if own.delay:
-        raise ModelError(f"the inverse would know the input {own.delay:g} s before it acts; leave the delay out")
+        raise ModelError(f"the inverse would need the output {own.delay:g} s in advance; leave the delay out")
     return Ratio(own.bottom, own.top, 0.0).model(signal, output)
 
 

@@ -299,7 +299,8 @@ def state_space_matrices(
     solved = np.eye(len(outputs)) - loop
     if abs(float(np.linalg.det(solved))) < 1e-12:
         raise ModelError(
-            f"the equations of {', '.join(outputs)} cannot be solved for them: they form an algebraic loop"
+            f"the equations of {', '.join(outputs)} cannot be solved for these outputs, because they form an "
+            "algebraic loop; change an equation"
         )
     c: Floats = np.asarray(np.linalg.solve(solved, reads), dtype=np.float64)
     d: Floats = np.asarray(np.linalg.solve(solved, direct), dtype=np.float64)

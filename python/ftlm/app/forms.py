@@ -284,9 +284,9 @@ def parse_structures(recipe: FitRequest) -> list[Structure]:
         if value not in choices:
             raise ModelError(f"{name} = {value!r} is not known; use {' or '.join(filter(None, choices))}")
     if recipe.way == "offered" and len(recipe.structure) < 2:
-        raise ModelError("one structure leaves no choice; fit it, or select its terms")
+        raise ModelError("a comparison needs at least two structures; fit this one, or select its terms")
     if recipe.way in ("fit", "inside") and len(recipe.structure) != 1:
-        raise ModelError("no structure is given; write an equation, or take a suggested one")
+        raise ModelError("no structure is given; write an equation, or use a suggested one")
     if recipe.way != "fit" and recipe.settings():
         raise ModelError(
             f"{', '.join(recipe.settings())}: a choice of structures is by output error, with its own offset; leave it "

@@ -243,7 +243,7 @@ class Session:
         """
         file = self.files[key]
         if any(m.is_busy and file.name in _file_names(m.recipe) for m in self.models.values()):
-            raise DataError(f"{file.name!r} is in use by a model that is being made; stop that first")
+            raise DataError(f"{file.name!r} is in use by a model that is being fitted; stop the fit first")
         del self.files[key]
         if file.task is not None:
             file.task.stop()
@@ -286,7 +286,7 @@ class Session:
     def _run(self, key: str) -> RunSource:
         file = self.files.get(key)
         if file is None:
-            raise DataError("no file is chosen; drop one first")
+            raise DataError("no file is chosen; add a file first")
         if file.task is not None or (file.preview is None and not file.error):
             raise DataError(f"{file.name!r} is still being read; wait until its columns are shown")
         if not file.is_run:
@@ -315,7 +315,7 @@ class Session:
 
     def _check_queue(self) -> None:
         if sum(m.is_busy for m in self.models.values()) >= MAX_QUEUED_MODELS:
-            raise DataError(f"{MAX_QUEUED_MODELS} models wait already; stop one, or wait")
+            raise DataError(f"{MAX_QUEUED_MODELS} models are already in the queue; stop one of them, or wait")
 
     def resume(self, key: str) -> Model:
         """Continue a stopped model, and return it.
@@ -332,7 +332,8 @@ class Session:
             return model
         if any(file not in self.files for file in model.files):
             raise DataError(
-                f"{' or '.join(sorted(_file_names(model.recipe)))} is no longer on the page; drop it, and ask anew"
+                f"{' or '.join(sorted(_file_names(model.recipe)))} is no longer on the page; add the file again, "
+                "and repeat the request"
             )
         self._check_queue()
         model.state, model.phase, model.error, model.share, model.time_left = STATE_WAITING, "waiting", "", None, ""

@@ -143,7 +143,7 @@ def energies(
     for name in free[2:]:
         if not 0.0 <= at[name] <= 1.0:
             raise ModelError(
-                f"{name} = {at[name]:g} is outside [0, 1], where a force stores and loses, and gives nothing"
+                f"{name} = {at[name]:g} is outside [0, 1], the range in which a force only stores and dissipates energy"
             )
     link = parameters or PARAMETER_SETS["effective"][stage]
     hub, bend, current = (

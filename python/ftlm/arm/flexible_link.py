@@ -143,7 +143,7 @@ def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Fo
     if form == "lagrange" and input_order is not None:
         raise ModelError(
             f"{setting('input_order')} {input_order!r} is not used by {parameter('form', 'lagrange')}, whose "
-            f"deflection does not see the current; leave it out, or use {parameter('form', 'published')}"
+            f"equation of the deflection has no current; leave it out, or use {parameter('form', 'published')}"
         )
     input_order = input_order or "published"
     if input_order not in ("published", "derived"):
@@ -325,8 +325,7 @@ def flexible_link(
         raise ModelError(f"{setting('cross_stage')} {cross_stage!r} is not known; use False, 'torques' or 'inertial'")
     if cross_stage == "inertial" and form != "lagrange":
         raise ModelError(
-            f"{parameter('cross_stage', 'inertial')} follows from the energies, as {parameter('form', 'lagrange')} "
-            "does; use that form"
+            f"{parameter('cross_stage', 'inertial')} requires {parameter('form', 'lagrange')}; use that form"
         )
     if parameters not in PARAMETER_SETS:
         raise ModelError(

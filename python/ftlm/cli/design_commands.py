@@ -110,12 +110,12 @@ def control(
     check_ending(out, ".json")
     check_ending(trajectory, ".csv")
     if trajectory is not None and path is None:
-        raise ModelError("--trajectory is of a move; give --path SIZE:SECONDS")
+        raise ModelError("--trajectory needs a move; give --path SIZE:SECONDS")
     wrong = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if arguments[n] not in (None, [])]
     if wrong:
         other = "lqg" if design == "pid" else "pid"
         text = ", ".join(map(parameter, wrong))
-        raise ModelError(f"{text}: of --design {other}, not used with {design}; leave out what is not meant")
+        raise ModelError(f"{text}: used with --design {other}, not with {design}; leave it out, or change --design")
     loaded = load_model(model)
     most = np.inf if limit is None else limit
     # A sum moves along the path; the loop itself has one output.
@@ -127,7 +127,7 @@ def control(
     running: designs.DiscretePid | designs.Lqg
     if design == "pid":
         if crossover is None:
-            raise ModelError("--crossover is missing: where the loop's gain is to be 1 [rad/s]")
+            raise ModelError("--crossover is missing; give the frequency at which the loop gain is 1 [rad/s]")
         announce_design(design, samples)
         result = designs.fractional_pid(
             loaded, crossover=crossover, phase_margin=60.0 if phase_margin is None else phase_margin, **common
@@ -136,7 +136,7 @@ def control(
     else:
         if max_input is None or not max_deviation:
             raise ModelError(
-                "--max-deviation OUTPUT=A and --max-input A are missing: which deviations weigh as much as which input"
+                "--max-deviation OUTPUT=A and --max-input A are missing; give the acceptable deviations and input"
             )
         low_high = None if band is None else parse_numbers("--band", band, 2)
         announce_design(design, samples)

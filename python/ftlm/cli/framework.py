@@ -36,9 +36,7 @@ def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
         value = value if equals else name
         if not equals and name and not re.fullmatch(r"[^\W\d][\w.\[\]]*", name):
             short = re.sub(r"\W+", "_", name.partition("(")[0]).strip("_0123456789").lower() or "name"
-            raise ModelError(
-                f'{option} {item!r} has no name of its own; write NAME=…, such as {option} "{short}={item}"'
-            )
+            raise ModelError(f'{option} {item!r} has no name; write NAME=…, such as {option} "{short}={item}"')
         if not name or not value:
             raise ModelError(f"{option} {item!r} is not NAME=VALUE")
         if name in values:
@@ -400,7 +398,7 @@ FIGURE_FORMATS = ("png", "pdf", "svg")
 def check_ending(path: str | None, ending: str, why: str = "") -> None:
     """Raise ModelError for a file name with another extension; None is ignored."""
     if path is not None and Path(path).suffix.lower() != ending:
-        raise ModelError(f"{path} does not end in {ending}{why}; name it so")
+        raise ModelError(f"{path} does not end in {ending}{why}; use this extension")
 
 
 def figure_kind(path: str | None) -> str:

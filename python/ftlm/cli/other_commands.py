@@ -115,7 +115,7 @@ def reproduce(
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
-        raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
+        raise ModelError("--sine is given without --square; give both, or neither of them to use the virtual rig")
     measurements = reading.runs([f for f in (square, sine) if f is not None], apart=True)
     rival = given_fields(genetic)
     with Progress("", quiet=as_json) as progress:

@@ -145,11 +145,15 @@ class DiscretePid:
         order: int = 6,
     ) -> None:
         if not isinstance(pid, FractionalPid):
-            raise ModelError(f"pid is a {type(pid).__name__}, no FractionalPid; tune one, or write its five numbers")
+            raise ModelError(
+                f"pid is a {type(pid).__name__}, not a FractionalPid; design one, or construct it from its five "
+                "parameters"
+            )
         for name, order_value in (("lam", pid.lam), ("mu", pid.mu)):
             if order_value > 1:
                 raise ModelError(
-                    f"{name} = {order_value:g} cannot be realised; give a controller whose orders are at most 1"
+                    f"{name} = {order_value:g} cannot be realized in discrete time; give a controller with orders "
+                    "of at most 1"
                 )
         value = checked_rate(rate)
         most = check_limit(limit)
@@ -171,7 +175,7 @@ class DiscretePid:
         #: Largest errors over the band against the exact controller [dB], [degrees].
         self.gain_error, self.phase_error = self._errors()
         if not math.isfinite(self.gain_error + self.phase_error):
-            raise ModelError(f"{pid} is not finite in its band; give gains within floating point, one not 0")
+            raise ModelError(f"{pid} has no finite response in its band; give finite gains, at least one of them not 0")
         self.reset()
 
     @property

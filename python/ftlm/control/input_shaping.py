@@ -251,7 +251,7 @@ def _mode_of(value: complex | np.number[Any]) -> Mode:
         pole, size = complex("nan"), math.nan
     low, high = POLE_RANGE_RAD_S
     if not (low <= abs(pole.imag) and size <= high):
-        raise ModelError(f"pole = {short_repr(value)} does not swing; give one such as -2 + 17j [rad/s]")
+        raise ModelError(f"pole = {short_repr(value)} does not oscillate; give a complex pole such as -2 + 17j [rad/s]")
     slow = abs(pole.real)
     return Mode(complex(pole.real, abs(pole.imag)), size, -pole.real / size, 1 / slow if slow else math.inf, True)
 

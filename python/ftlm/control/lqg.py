@@ -195,7 +195,7 @@ def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, s
     plants[0].check_stable()
     reached = [p for p in plants if p.has_response()]
     if not reached:
-        raise ModelError(f"{plants[0].input} reaches no output of this model")
+        raise ModelError(f"{plants[0].input} affects no output of this model; choose another input")
     return reached
 
 
@@ -234,7 +234,7 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
     for name in noise or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
-            raise ModelError(f"noise of {short_repr(name)} is of nothing that is measured{near}")
+            raise ModelError(f"noise of {short_repr(name)} does not belong to a measured output{near}")
     free = msgspec.UNSET if model.estimate is None else model.estimate.free
     noise_of_fit = {} if free is msgspec.UNSET else dict(free.noise)
     out = []
@@ -242,7 +242,8 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
         value = (noise or {}).get(name, noise_of_fit.get(name))
         if value is None:
             raise ModelError(
-                f"the noise of {name} is not known, since this model does not say what its fit left; give its standard "
+                f"the noise of {name} is not known, because the model file has no residuals of its fit; give its "
+                "standard "
                 f"deviation in {parameter('noise', {name: 0.001})}"
             )
         out.append(positive(f"noise of {name}", value))

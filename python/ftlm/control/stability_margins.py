@@ -160,7 +160,7 @@ class Plant:
         transfer = transfer_functions(self.model, coupling=self.coupling)
         above = transfer.numerators[self.output, self.input]
         if not above:
-            raise ModelError(f"{self.input} does not reach {self.output} in this model")
+            raise ModelError(f"{self.input} does not affect {self.output} in this model; choose another pair")
         return transfer.denominator[self.output][-1][1] - above[-1][1]
 
     def count_unstable_poles(self) -> float:

@@ -52,7 +52,7 @@ def arguments_from_frame(
                 f"the columns are {join_names(columns)}; for the index of a pandas frame use frame.reset_index()"
             )
         if count > 1:
-            raise DataError(f"column {column!r} ({thing}) is there {count} times; rename all but one")
+            raise DataError(f"column {column!r} ({thing}) occurs {count} times; rename all but one")
         return cast("Mapping[Any, object]", frame)[column]
 
     label, clock = "time" if time is None else f"time (column {time!r})", None

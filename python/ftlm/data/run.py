@@ -707,7 +707,7 @@ class Run:
             samples = drop_missing(values)
             if samples.size == 0:
                 raise DataError(
-                    f"output {name!r} of run {self.name!r}: none of its {values.size} rows holds a value; use a part "
+                    f"output {name!r} of run {self.name!r}: all of its {values.size} rows are missing; use a part "
                     "of the record in which it was read"
                 )
             if is_constant(values):

@@ -53,8 +53,8 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     for run in runs:
         if run.sample_times is not None:
             raise DataError(
-                f"run {run.name!r} has rows with times of their own, but the answer of an input to "
-                f"{parameter('reference')} is found on regular ones; give regular rows"
+                f"run {run.name!r} has nonuniform sample times, but the response of an input to "
+                f"{parameter('reference')} is estimated on a regular grid; resample the run"
             )
         if reference not in run:
             raise DataError(
@@ -70,7 +70,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     moves = [run[reference] for run in runs]
     if is_constant(moves):
         raise DataError(
-            f"{parameter('reference', reference)} does not move, so it explains nothing; record one that does"
+            f"{parameter('reference', reference)} is constant, so it explains no input; record a reference that changes"
         )
     shortest = min(run.length for run in runs)
     ends = np.cumsum([run.length for run in runs])[:-1]

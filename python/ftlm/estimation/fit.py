@@ -75,7 +75,7 @@ def check_no_friction(structure: Structure, method: str) -> None:
     if structure.has_friction:
         output = structure.outputs[structure.friction_equations[0]]
         raise ModelError(
-            f"the equation of {output} has friction, which {parameter('method', method)} does not know; use "
+            f"the equation of {output} has friction, which {parameter('method', method)} cannot estimate; use "
             f"{parameter('method', 'output-error')}"
         )
 

@@ -163,7 +163,7 @@ def _identify_circuit(
     """Identify the parameters of a circuit from measured impedances."""
     if any(others):
         raise ModelError(
-            f"{parameter('orders')} and {parameter('delay')} are of equations; give exponents of a circuit with "
+            f"{parameter('orders')} and {parameter('delay')} apply to equations; give exponents of a circuit with "
             f"{parameter('fixed')} or {parameter('bounds')}"
         )
     check_known("fixed parameter", fixed or {}, circuit.names)
@@ -326,10 +326,14 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
         matches.append(replace(record, output=own["output"], input=own["input"]))
     for output in outputs:
         if not any(r.output == output for r in matches):
-            raise DataError(f"no record is of {output}, which has an equation; give one, or leave the equation out")
+            raise DataError(
+                f"no record has the output {output} of an equation; give such a record, or leave the equation out"
+            )
     for name in inputs:
         if not any(r.input == name for r in matches):
-            raise DataError(f"no record is from {name}, an input of the equations; give one, or leave it out")
+            raise DataError(
+                f"no record has the input {name} of the equations; give such a record, or leave the input out"
+            )
     return matches
 
 
@@ -338,7 +342,7 @@ def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, li
     if not isinstance(weights, str):
         if len(records) > 1:
             raise ModelError(
-                f"{parameter('weights')} as an array are of one record; give each record its deviation instead"
+                f"{parameter('weights')} as an array apply to one record; give each record its deviation instead"
             )
         (record,) = records
         return "deviation", [1.0 / _given_deviations(record, weights)]

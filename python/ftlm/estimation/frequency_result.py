@@ -298,7 +298,7 @@ class FrequencyIdentification:
             If equations were identified.
         """
         if isinstance(self.system, Model):
-            raise ModelError("equations were identified, no circuit; use .model")
+            raise ModelError("equations were identified, not a circuit; use .model")
         return self.system
 
     @cached_property

@@ -268,7 +268,7 @@ def multi_innovation_trace(
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
     if equation.offset != "none":
         raise ModelError(
-            f"a trace follows no offset, and offset = {equation.offset!r}; use {parameter('offset', 'none')}"
+            f"a trace cannot estimate an offset, and offset = {equation.offset!r}; use {parameter('offset', 'none')}"
         )
     stride = check_integer("every", every, 1)
     rest = replace(equation, initial="rest")

@@ -61,7 +61,7 @@ def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
             f"{label} filters inputs and output alike, and friction, non-linear terms and limits do not commute with it"
         )
     if any(run.sample_times is not None for run in runs):
-        raise ModelError(f"{label} needs samples on a regular grid; resample the runs, or leave it out")
+        raise ModelError(f"{label} needs uniform samples; resample the runs, or leave it out")
 
 
 def fit_noise_model(fit: Fit, refit: Callable[[Task, JointFit], Fit]) -> Fit:

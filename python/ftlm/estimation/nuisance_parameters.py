@@ -121,7 +121,7 @@ def evaluate_at_point(
     exact = [output for output, level in levels.items() if not level * MAX_SAMPLE_VALUE > 1.0]
     if exact:
         raise ConvergenceError(
-            f"the residuals of {', '.join(exact)} are 0 and have no distribution; use a longer record"
+            f"the residuals of {', '.join(exact)} are 0, so no statistic can be computed; use a longer record"
         )
     weights = [1.0 / level for level in levels.values()]
     grid = replace(grid, weights=weights)

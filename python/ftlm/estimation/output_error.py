@@ -321,7 +321,7 @@ def fit_output_error(
         # A fit would leave the coefficients undetermined, after a search of all orders.
         why = describe_collinear_inputs(runs, structure)
         if why is not None:
-            raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
+            raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {why}")
     answer = _core.joint_fit(
         problem.core,
         [recording(run, structure) for run in runs],

@@ -214,7 +214,7 @@ def design_input(
         zones; if it is too uncertain; or if an argument is invalid or a limit cannot be met.
     """
     if progress is not None and not callable(progress):
-        raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
+        raise ModelError(f"progress is a {type(progress).__name__}; give a function of (done, total)")
     task = _check_arguments(
         model,
         reference_run,
@@ -416,7 +416,7 @@ def _check_arguments(
 def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
     """Raise ModelError if a model has no usable input, or the reference run lacks its inputs."""
     if not fit.inputs:
-        raise ModelError("the model has no input, so there is nothing to design; give one with an input")
+        raise ModelError("the model has no input to design; give a model with an input")
     if fit.problem.structure.all_filtered:
         raise ModelError(
             "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the "

@@ -120,7 +120,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     for name, kind in kinds.items():
         values = loaded.get(name)
         if not isinstance(values, numpy.ndarray) or values.ndim != 2 or values.dtype.kind not in "biufc":
-            raise UnreadableError(f"the variable {name!r} is not what the file's own list says")
+            raise UnreadableError(f"the variable {name!r} differs from the list of variables in the file")
         if values.dtype.kind == "c":
             skipped[name] = "complex"
             continue
@@ -233,7 +233,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
     if check is not None and check != f"{table.num_rows} {digest.hexdigest()}".encode():
         entry = check.split(b" ")[0].decode("utf-8", errors="replace")[:20]
         raise UnreadableError(
-            f"the file is damaged: {table.num_rows} rows were read where it says {entry}, or their checksum is another"
+            f"the file is damaged: {table.num_rows} rows were read instead of {entry}, or the checksum differs"
         )
     return header, arrays
 
@@ -342,7 +342,7 @@ def numpy_array(stream: Any, name: str, arrays: Arrays) -> Any:
     version = form.read_magic(stream)
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
     if read_header is None:
-        raise UnreadableError(f"{name!r} is of a format of NumPy's that is not known here ({version})", "save it again")
+        raise UnreadableError(f"{name!r} has an unknown NumPy format ({version})", "save it again")
     shape, order, kind = read_header(stream)
     if not arrays.fits(name, shape, kind):
         return None
@@ -418,7 +418,7 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
         if damaged is not None:
-            raise UnreadableError(f"the checksum of {damaged!r} in it is another")
+            raise UnreadableError(f"the checksum of {damaged!r} in the file is wrong")
     calamine: Any = importlib.import_module("python_calamine")
     book = calamine.CalamineWorkbook.from_path(path)
     names = list(book.sheet_names)

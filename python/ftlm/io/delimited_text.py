@@ -352,7 +352,7 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
         problem = None if trouble is None else trouble.error(name, source)
         if pieces is not None and (moments is None or moments.clock.size != rows.count):
             problem = problem or DataError(
-                f"{source}: column {name!r}: dates or times written in several ways; write all alike"
+                f"{source}: column {name!r}: dates or times have several notations; write all in the same notation"
             )
             moments = None
         elif moments is not None:

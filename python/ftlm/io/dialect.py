@@ -87,9 +87,7 @@ class Layout:
         if self.separator == self.decimal == "comma":
             raise DataError(f"{layout_fields('separator', 'decimal')} are both a comma; cells could not be told apart")
         if self.thousands is not None and self.thousands == self.decimal:
-            raise DataError(
-                f"{layout_fields('thousands', 'decimal')} are both a {self.decimal}; say which of them it is"
-            )
+            raise DataError(f"{layout_fields('thousands', 'decimal')} are both a {self.decimal}; change one of them")
         if self.separator == self.thousands == "space":
             raise DataError(
                 f"{layout_fields('separator', 'thousands')} are both a space; cells could not be told apart"
@@ -410,7 +408,7 @@ def _choose_separator(
         if best is None or rank > best[0]:
             best = rank, separator, comma, mark, cut
     if best is None:
-        raise DataError(f"{source}: {layout_fields('separator', 'decimal')} do not go together; say others")
+        raise DataError(f"{source}: {layout_fields('separator', 'decimal')} do not match the text; give others")
     _, separator, comma, mark, cut = best
     if layout.decimal is None and layout.separator is None and separator == ",":
         _check_commas(table_rows, cut, source)
@@ -530,7 +528,7 @@ def _header(
         top = count
     if count > top:
         raise DataError(
-            f"{source}: {layout_fields('header')} says {count} lines, and {top} stand above the rows; say fewer"
+            f"{source}: {layout_fields('header')} is {count}, but the number of lines above the rows is {top}; give fewer"
         )
     if count == 0:
         return None, None, top
@@ -559,7 +557,7 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
     for name in names:
         if name and times[name] > 1:
             raise DataError(
-                f"{source}: line {at}: the column name {name!r} is there {times[name]} times; rename all but one"
+                f"{source}: line {at}: the column name {name!r} occurs {times[name]} times; rename all but one"
             )
 
 

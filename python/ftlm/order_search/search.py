@@ -130,7 +130,8 @@ def rank_by_free_runs(
             scored.append(replace(row, score=score))
     if not scored:
         raise ModelError(
-            f"the free runs of the best {len(table)} candidates by equation error all diverge; check the signs of the "
+            f"the simulations of the best {len(table)} candidates by equation error all diverge; check the signs of "
+            "the "
             "non-linear terms, or search by equation error"
         )
     scored.sort(key=lambda row: (row.score, row.index))

@@ -79,7 +79,7 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     axes_given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
     strange = [type(a).__name__ for a in axes_given if not hasattr(a, "plot") or not hasattr(a, "figure")]
     if strange:
-        raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")
+        raise ModelError(f"ax holds {strange[0]}, which are not matplotlib axes; give the axes that subplots returns")
     if axes_given.size != rows * columns:
         raise ModelError(
             f"this figure has {rows * columns} axes ({rows} by {columns}), and ax has {axes_given.size}; give as many, "
@@ -269,7 +269,7 @@ def fit(
         elif isinstance(result, Identification):
             comparison = result.comparison
         else:
-            raise ModelError("a model alone has nothing to be compared with; give runs")
+            raise ModelError("a model without runs cannot be compared; give runs")
     runs_of_result = _runs_of(result, runs) if inputs else []
     pairs = zip(comparison_charts(comparison, units=units), residual_rows(comparison, units=units), strict=True)
     charts, heights = [], []
@@ -292,7 +292,7 @@ def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[R
         return [runs] if isinstance(runs, Run) else list(runs)
     task = result.task if isinstance(result, Identification) else None
     if task is None:
-        raise ModelError(f"{parameter('inputs', True)} needs the runs; give them")
+        raise ModelError(f"{parameter('inputs', True)} needs runs; give runs")
     return list(task.runs)
 
 

@@ -231,7 +231,7 @@ class ArmParameters:
         """
         if self.form == "published" and self.coupling != 0.0:
             raise ModelError(
-                "form = 'published' knows the stages apart alone: set coupling = 0, or use form = 'lagrange'"
+                "form = 'published' has no coupling of the joints: set coupling = 0, or use form = 'lagrange'"
             )
         coupled = self.coupling != 0.0
         structure = flexible_link(

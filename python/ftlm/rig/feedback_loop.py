@@ -117,8 +117,8 @@ def control(
     if not callable(controller):
         hint = "; a design is run by its controller" if isinstance(controller, LoopDesign) else ""
         raise ModelError(
-            f"controller is a {type(controller).__name__}; pass what is called as controller(time, angles, reference) "
-            f"and returns two currents [A]{hint}"
+            f"controller is a {type(controller).__name__}; give a function controller(time, angles, reference) "
+            f"that returns two currents [A]{hint}"
         )
     controller = _of_both_joints(controller)
     rate = _rate_of(controller, rate)
@@ -126,7 +126,7 @@ def control(
     if duration is None:
         if path.ndim == 1:
             raise ModelError(
-                f"a reference that is held needs {parameter('duration')} [s]; or give it as rows, one per sample"
+                f"a constant reference needs {parameter('duration')} [s]; or give it as rows, one per sample"
             )
         duration = (len(path) - 1) / rate
     duration, limit, rate = check_times(duration, limit, rate)
@@ -223,7 +223,7 @@ class ControllerSource:
     def next_commands(self, rows: Floats) -> Floats:
         """Return the command of the controller for the last measured row; 0 A at the end of the run."""
         if self._rig is None or not len(rows):
-            raise ModelError("the board ran a sample and handed over no row of it; correct its take()")
+            raise ModelError("the take() method of the board returned no row for a sample; correct it")
         self._at += 1
         if self._at + 2 >= self.rows:
             return np.zeros((1 if self._at + 2 == self.rows else 0, 2))

@@ -377,7 +377,7 @@ class Experiment:
             if not isinstance(flag, bool):
                 raise ModelError(f"{setting(name)} {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
-            raise ModelError(f"progress is a {type(self.progress).__name__}; pass what is called with (done, all)")
+            raise ModelError(f"progress is a {type(self.progress).__name__}; give a function of (done, total)")
         if self.sensor_filter is not None and not (
             isinstance(self.sensor_filter, str) and self.sensor_filter == "stock"
         ):
@@ -605,7 +605,7 @@ def _board(
     """Return the board that the arguments select, and metadata on it for the run."""
     virtual = isinstance(rig, str) and rig == "virtual"
     if offset is not None and not virtual:
-        raise ModelError("offset is of the virtual arm; a board has its own, leave it out")
+        raise ModelError("offset applies only to the virtual arm; leave it out for a board")
     if virtual:
         arm = ArmParameters.of(parameters)
         if offset is not None:
@@ -661,7 +661,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
             if length <= MAX_RUN_DURATION_S
             else f"no run is longer than {MAX_RUN_DURATION_S:g} s"
         )
-        raise ModelError(f"{setting('duration')} {length:g} s is over the limit of {longest:g} s; {way_out}")
+        raise ModelError(f"{setting('duration')} {length:g} s exceeds the limit of {longest:g} s; {way_out}")
     if samples is None or samples <= 0:
         raise ModelError(f"{setting('rate')} {short_repr(rate)} Hz is not a positive number of samples per second")
     check_rate(samples)

@@ -674,7 +674,7 @@ def check_rate(rate: float) -> None:
     """Raise ModelError if the board does not support a sampling rate [Hz]."""
     low, high = SAMPLE_RATE_RANGE_HZ
     if not low <= rate <= high:
-        raise ModelError(f"{setting('rate')} {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
+        raise ModelError(f"{setting('rate')} {rate!r} Hz is not possible with this board; use {low:g} to {high:g} Hz")
 
 
 def check_watchdog(rate: float, seconds: float) -> None:

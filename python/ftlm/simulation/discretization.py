@@ -525,7 +525,7 @@ def prepare(
         for term in item.terms:
             if term.fixed is None and term.column != item.output and not any(r.of(term.column).any() for r in prepared):
                 raise DataError(
-                    f"{term.column} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
+                    f"{term.column} is 0 in all rows, so its coefficient in the equation of {item.output} cannot be "
                     "identified; leave the term out, fix its coefficient, or add a run in which it moves"
                 )
             if structure.offset in ("constant", "ramp") and _is_offset(term, item, prepared):

@@ -174,8 +174,8 @@ def check_uniform_samples(run: Run, model: Model) -> None:
         what = "friction" if structure.has_friction else "a non-linear term"
         output = next(e.output for e in structure.equations if e.friction is not None or e.nonlinear_terms)
         raise ModelError(
-            f"run {run.name!r} has rows at times of their own, and the equation of {output} has {what}, "
-            "which is followed at regular times; resample the run yourself"
+            f"run {run.name!r} has nonuniform sample times, and the equation of {output} has {what}, "
+            "which is simulated on a regular grid; resample the run"
         )
 
 

@@ -145,7 +145,7 @@ class Circuit:
         text = "".join(c for c in self.text if not c.isspace())
         tokens = _TOKEN_PATTERN.findall(text)
         if "".join(tokens) != text:
-            raise ModelError(f"circuit {self.text!r} is not understood; write it as in 'R0-p(R1,CPE1)-W1'")
+            raise ModelError(f"circuit {self.text!r} has an invalid character; write it as in 'R0-p(R1,CPE1)-W1'")
         names: set[str] = set()
 
         def group(kind: str, parts: list[Node]) -> Node:

@@ -283,7 +283,7 @@ class Equation:
         twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
         if twice is not None:
             raise ModelError(
-                f"coefficient {twice} stands twice in the equation of {self.output}; give each its own name"
+                f"coefficient {twice} occurs twice in the equation of {self.output}; give each its own name"
             )
         both = set(names) & set(self.order_names)
         if both:
@@ -296,7 +296,7 @@ class Equation:
             if term.factor == 0 or not math.isfinite(term.factor):
                 raise ModelError(
                     f"factor {term.factor:g} of {term.coefficient} {term.signal} in the equation of {self.output} "
-                    "leaves nothing to estimate; give a finite number other than 0"
+                    "makes the coefficient meaningless; give a finite number other than 0"
                 )
             if term.fixed is not None and not math.isfinite(term.fixed):
                 raise ModelError(

@@ -282,7 +282,7 @@ def apply(function: str, argument: Expression) -> Expression:
         If the function is unknown.
     """
     if function not in EXPRESSION_FUNCTIONS:
-        raise ModelError(f"{function}(…) is not computed; use {', '.join(EXPRESSION_FUNCTIONS)}")
+        raise ModelError(f"{function}(…) is unknown; use {', '.join(EXPRESSION_FUNCTIONS)}")
     if argument.operation == "constant":
         with np.errstate(all="ignore"):
             value = float(EXPRESSION_FUNCTIONS[function][0](argument.value))

@@ -158,15 +158,19 @@ def check_nonlinearities(
     """
     for k, limit in enumerate(limits):
         if any((o.signal, o.law) == (limit.signal, limit.law) for o in limits[:k]):
-            raise ModelError(f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} stands there twice; give it once")
+            raise ModelError(f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is given twice; give it once")
         if limit.free is None:
             continue
         name, words = limit.signal, f"the {INPUT_EFFECT_LABELS[limit.law]} of {limit.signal} is free"
         other = next((o for o in limits if o.signal == name and o is not limit), None)
         if name in late or (other is not None and other.free is not None):
             second = "delay" if other is None or other.free is None else INPUT_EFFECT_LABELS[other.law]
-            raise ModelError(f"{words}, and so is its {second}; one number of an input is estimated: give the other")
+            raise ModelError(
+                f"{words}, and so is its {second}; only one parameter of an input can be estimated: give the other one"
+            )
         if delays.get(name):
             raise ModelError(f"{words}, and {name} has a delay; shift the input by it, or give the limit")
         if other is not None and limit.law == "dead_zone":
-            raise ModelError(f"{words}, and {name} saturates behind it; free the saturation instead, or give both")
+            raise ModelError(
+                f"{words}, and {name} saturates after it; free the saturation instead, or give both values"
+            )

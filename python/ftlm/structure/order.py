@@ -207,7 +207,7 @@ def order_axis(name: str, low: float, high: float, step: float) -> tuple[float, 
         raise ModelError(f"order {name}: increment {step:g} is not positive; the paper's is 0.05")
     if step < ORDER_RESOLUTION:
         raise ModelError(
-            f"order {name}: increment {step:g} is below {ORDER_RESOLUTION:g}, to which orders are kept; raise the "
+            f"order {name}: increment {step:g} is below {ORDER_RESOLUTION:g}, the resolution of orders; raise the "
             "increment"
         )
     _check_range(name, low)

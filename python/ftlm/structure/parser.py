@@ -231,7 +231,7 @@ def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlin
     for words in parsed:
         for key, limit in words.limits.items():
             if limits.setdefault(key, limit) != limit:
-                raise ModelError(f"{key[0]} has two limits of one kind in these equations; an actuator has one")
+                raise ModelError(f"{key[0]} has two different limits of one kind in these equations; give it one")
     bare = {signal for words in parsed for signal in words.plain}
     both = next((signal for signal, _ in limits if signal in bare), None)
     if both is not None:

@@ -55,7 +55,7 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
         raise ModelError(f"{setting('initial')} {initial!r} is not known; use {words}") from None
     bad = next((e for e in exponents if not (math.isfinite(e) and -1 < e <= 10)), None)
     if bad is not None:
-        raise ModelError(f"exponent {bad:g} of an initial term is outside (-1, 10]; t to this power is of no use")
+        raise ModelError(f"exponent {bad:g} of an initial term is outside (-1, 10]; choose another exponent")
     return exponents
 
 
@@ -178,7 +178,7 @@ class Structure:
         names = [n for e in self.equations for n in e.coefficient_names]
         twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
         if twice is not None:
-            raise ModelError(f"coefficient {twice} stands in two equations; give each its own name")
+            raise ModelError(f"coefficient {twice} occurs in two equations; give each its own name")
         external = [s for s in self.signals if s not in outputs]
         check_known("delayed input", [*self.delay, *self.free_delays], external)
         for name, delay in self.delay.items():
@@ -192,7 +192,7 @@ class Structure:
         check_nonlinearities(self.limits, self.delay, self.free_delays)
         for item in self.free_inputs:
             if item.name in names or item.name in self.order_names:
-                raise ModelError(f"{item.name} is the {item.words}; call the coefficient otherwise")
+                raise ModelError(f"{item.name} is the name of the {item.words}; give the coefficient another name")
         if self.sensor_filter is not None:
             check_known("filtered signal", self.sensor_filter.signals, self.signals)
         self._check_offset()
@@ -260,7 +260,7 @@ class Structure:
                 if any(abs(power - e) < 1e-9 for e in self.initial):
                     raise ModelError(
                         f"the offset of {item.output} is t^{power:g} in its equation, and so is one of the initial "
-                        f"terms {', '.join(f'{e:g}' for e in self.initial)}: they cannot be told apart; "
+                        f"terms {', '.join(f'{e:g}' for e in self.initial)}: they are not separately identifiable; "
                         f"leave {power:g} out of initial, or use {parameter('offset', 'none')}"
                     )
 

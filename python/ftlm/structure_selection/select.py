@@ -201,9 +201,7 @@ def select(
     searched = [candidates] if isinstance(candidates, Structure) else []
     idle = [describe_structure(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
     if idle:
-        raise ModelError(
-            f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
-        )
+        raise ModelError(f"{idle[0]} has no free parameter; name a coefficient or an order, or use model.compare(runs)")
     if delay and not sought:
         raise ModelError(f"{parameter('delay')} is used with 'auto'; give the delays to ftlm.equation instead")
     if driven_by and not sought:

@@ -258,7 +258,7 @@ class PlaneChart(Figure):
         if not 0 < self.sector < math.pi:
             raise DataError(f"sector = {self.sector!r} is not an angle between 0 and pi")
         if self.curve is not None and not bad.size:
-            raise DataError("there is no measured value to draw; give some")
+            raise DataError("there is no measured value to draw; give at least one")
 
     @cached_property
     def values(self) -> Complex:

@@ -161,7 +161,7 @@ class CheckpointFile:
         other: Kind = "selection" if self.kind == "search" else "search"
         if statements == [f"CREATE TABLE {other} {TABLE_COLUMNS}"]:
             raise DataError(
-                f"{self.path} is the store of a {other}, not of a {self.kind}; go on with it by the call that began it"
+                f"{self.path} is the store of a {other}, not of a {self.kind}; resume it with the call that began it"
             )
         if statements not in ([], [f"CREATE TABLE {self.kind} {TABLE_COLUMNS}"]):
             raise self._foreign_error()

@@ -100,7 +100,7 @@ def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: FileMe
         file = check_new(path, force=force, words=words)
         folder = file.absolute().parent
         if not folder.is_dir():
-            raise DataError(f"{words.format_path(file.parent)} is not a folder; make it first")
+            raise DataError(f"{words.format_path(file.parent)} is not a folder; create it first")
         if not os.access(folder, os.W_OK):
             raise DataError(
                 f"{words.format_path(file)} cannot be written: {words.format_path(file.parent)} is read-only; "
@@ -371,7 +371,7 @@ class JsonFormat(Generic[T]):
             raise self._newer_version_error(path, read.schema, getattr(read, "written_by", ""))
         if not 1 <= read.schema <= of:
             raise DataError(
-                f"{path} says that it has schema {read.schema}, and what it holds has schema {of}; give {self.source}"
+                f"{path} states schema {read.schema}, but its content needs schema {of}; give {self.source}"
             )
 
 
