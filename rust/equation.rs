@@ -413,8 +413,8 @@ pub fn grains(order: f64) -> i64 {
     (order * 1e9).round() as i64
 }
 
-/// Largest size of an order law within the bounds of its free orders. The sum of several may exceed an order's own range,
-/// which is checked at every point; tables by whole order need memory in proportion to it.
+/// Largest size of an order law within the bounds of its free orders. The sum of several may exceed an order's own
+/// range, which is checked at every point; tables by integer order need memory in proportion to it.
 pub const MAX_REACHED_ORDER: f64 = 100.0;
 
 /// An affine order law: constant + Σ weight·free order.

@@ -116,7 +116,7 @@ pub enum Error {
         /// Index of the first value that is not finite.
         index: usize,
     },
-    /// Pulse of a free run whose non-linear equations have no solution.
+    /// Pulse of a simulation whose nonlinear equations have no solution.
     #[error("the free run has no solution at {time:.4} s (pulse {index}): {why}; shorten the step, or check the coefficients of the non-linear terms")]
     NoSolution {
         /// Middle of the pulse \[s\].

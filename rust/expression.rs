@@ -1,7 +1,7 @@
-//! Expressions of non-linear terms: checked programs in postfix notation, with derivatives in one pass.
+//! Expressions of nonlinear terms: checked programs in postfix notation, with derivatives in one pass.
 //!
 //! A channel is a signal or a derivative of it. A [`DerivedSignal`] is an expression over channels, such as y³ or
-//! |Dy|·Dy. A non-linear term of an equation is a linear term of a derived signal.
+//! |Dy|·Dy. A nonlinear term of an equation is a linear term of a derived signal.
 
 use crate::error::{Error, Result};
 use crate::fractional::kernels::MAX_ORDER;

@@ -9,7 +9,7 @@
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
 //! 5. [`estimation`]: coefficients at fixed orders by least squares, multi-innovation least squares and instrumental
 //!    variables; orders and coefficients together by joint output error; [`friction`]: dry friction in one pulse;
-//!    [`expression`], [`nonlinear`]: simulation and output error with friction and non-linear terms;
+//!    [`expression`], [`nonlinear`]: simulation and output error with friction and nonlinear terms;
 //! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, limits and sensor filters, sampled on any grid;
 //! 7. [`order_search`]: orders by exhaustive search over an order grid;
 //! 8. [`simulate`], [`state_space`], [`output_samples`], [`signal::metrics`]: simulation by pulse means, exactly, and at
@@ -38,14 +38,14 @@
 //! # }
 //! ```
 //!
-//! A [`recording::Recording`] holds samples, a [`regressors::Record`] holds [`signal::block_pulse::PulseMeans`]. Samples
-//! in place of means would bias every estimate.
+//! A [`recording::Recording`] holds samples, a [`regressors::Record`] holds [`signal::block_pulse::PulseMeans`].
+//! Samples in place of means would bias every estimate.
 //!
 //! # Features
 //!
-//! None is on by default. `rig`: [`rig`], the simulated arm and the safety guard of the rigs. `oracles`: slow
-//! computations by definition, against which tests compare the fast ones. `python`: the Python bindings, with both of
-//! these.
+//! No feature is enabled by default. `rig`: [`rig`], the simulated arm and the safety guard of the rigs. `oracles`:
+//! slow computations by definition, against which tests compare the fast ones. `python`: the Python bindings, with both
+//! of these.
 //!
 //! Numerical code does not access files, clocks (except the timer of the virtual rig) or Python.
 #![forbid(unsafe_op_in_unsafe_fn)]

@@ -248,7 +248,7 @@ impl Record {
         self.signals.len()
     }
 
-    /// Always false: a record has at least one signal.
+    /// Whether the record has no signals; always false, since a record has at least one.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.signals.is_empty()

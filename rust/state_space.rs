@@ -53,8 +53,9 @@ const TAYLOR_TERMS: i32 = 15;
 ///
 /// The outputs are simulated together, and a signal that is neither output nor input is zero. A sample is the value
 /// just after the inputs of its row have changed. `initial` has (exponent, coefficient) pairs per equation, empty for
-/// zero initial conditions. An unstable model may overflow, so that values are not finite. None if the direct terms are singular or nearly so, if there are more than 128
-/// states, or if the transition over one interval overflows. O(n²) a row with n states.
+/// zero initial conditions. An unstable model may overflow, so that values are not finite. None if the direct terms are
+/// singular or nearly so, if there are more than 128 states, or if the transition over one interval overflows. O(n²) a
+/// row with n states.
 ///
 /// # Errors
 /// Invalid equations, orders or exponents that are not integers or are below 0, samples that are not finite or not as
@@ -340,7 +341,7 @@ pub(crate) struct InputGains {
 impl InputGains {
     /// Gains of an input with this drive; None if they overflow.
     ///
-    /// `fraction` is the part of the interval after which the next value of a held input arrives, 0 without a delay.
+    /// `fraction` is the part of the interval after which the next value of a zero-order-hold input arrives, 0 without a delay.
     pub(crate) fn new(
         interval: &Transition,
         system: &[f64],

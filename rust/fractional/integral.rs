@@ -213,7 +213,7 @@ fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
     series::multiply(&weights, &rises, m)
 }
 
-/// Derivative of whole order k ≤ 3 by central differences, one-sided towards the ends; second order in h at every
+/// Derivative of integer order k ≤ 3 by central differences, one-sided towards the ends; second order in h at every
 /// sample. Needs k + 2 samples.
 ///
 /// Each k has its own formula: first differences repeated would lose an order at the ends every time.

@@ -1,9 +1,9 @@
 //! Transforms of samples from Laplace transforms, by Poisson's summation formula.
 //!
 //! Samples f(kh) have the starred transform F*(s) = Σ f(kh) e^{−skh} = 1/h Σ_n F(s + 2πi n/h), in which the sample at a
-//! jump is the mean of both sides. For Re s = σ > 0, F* is the discrete Fourier transform of the samples times e^{−σkh},
-//! which are periodic up to e^{−σLh} over L samples. So a function of s of any orders has samples, exact to about 1e−10,
-//! without a grid of pulses, and a convolution with held inputs is a product of two transforms.
+//! jump is the mean of both sides. For Re s = σ > 0, F* is the discrete Fourier transform of the samples times
+//! e^{−σkh}, which are periodic up to e^{−σLh} over L samples. So a function of s of any orders has samples, exact to
+//! about 1e−10, without a grid of pulses, and a convolution with zero-order-hold inputs is a product of two transforms.
 //!
 //! The alias terms n ≠ 0 are smooth in the base band |Im s| ≤ π/h: they are evaluated at Chebyshev nodes and
 //! interpolated. Those of large |n| are an Euler–Maclaurin integral. The constant that it leaves is given by f(0).
@@ -108,8 +108,8 @@ impl StarredTransform {
         time
     }
 
-    /// Compute the starred transforms of functions: `functions(ln s, out)` writes their Laplace transforms, and `starts`
-    /// are their samples at t = 0.
+    /// Compute the starred transforms of functions: `functions(ln s, out)` writes their Laplace transforms, and
+    /// `starts` are their samples at t = 0.
     pub(crate) fn spectra(&self, starts: &[f64], mut functions: impl FnMut(Bin, &mut [Bin])) -> Vec<Vec<Bin>> {
         let count = starts.len();
         let mut values = vec![Bin::default(); count];

@@ -1,4 +1,4 @@
-//! Channels of equations with non-linear terms, their integral kernels and their forcing.
+//! Channels of equations with nonlinear terms, their integral kernels and their forcing.
 
 use super::convolution::{edge_kernel, ConvolutionKernel, MAX_FEEDTHROUGH_ORDER};
 use crate::equation::ORDER_GRAIN;

@@ -1,7 +1,8 @@
-//! Dry friction in a free run: friction of a pulse, and its derivatives.
+//! Dry friction in a simulation: friction force of a pulse, and its derivatives.
 //!
-//! The end velocity of a body is e = p − G φ. p is the end velocity without the friction φ, G the linear response within
-//! the pulse. Non-linear terms change p little within a pulse, so that the iteration for φ converges in a few steps.
+//! The end velocity of a body is e = p − G φ. p is the end velocity without the friction φ, G the linear response
+//! within the pulse. Nonlinear terms change p little within a pulse, so that the iteration for φ converges in a few
+//! steps.
 
 use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
 use crate::error::Result;
@@ -31,18 +32,18 @@ pub(super) trait PulseEquations {
 
 /// Bodies with friction.
 pub(super) struct ContactOperators {
-    /// Friction laws, and decrease of the end velocities for a unit of each friction without the non-linear terms.
+    /// Friction laws, and decrease of the end velocities for a unit of each friction without the nonlinear terms.
     problem: ContactProblem,
     /// State channels of the output and of the end velocity of each body.
     outputs: Vec<usize>,
     velocities: Vec<usize>,
     /// Number of state channels.
     states: usize,
-    /// Inverse of the equations of the state channels without non-linear terms.
+    /// Inverse of the equations of the state channels without nonlinear terms.
     inverse: Vec<f64>,
 }
 
-/// Motion of a body with friction in a free run.
+/// Motion of a body with friction in a simulation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyMotion {
     /// Mean friction over each pulse, in the unit of D^α y, at most the breakaway force up to rounding.
@@ -203,7 +204,7 @@ impl ContactOperators {
         let moves_freely =
             |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.is_resting && output == state);
         let free: Vec<usize> = (0..states).filter(|&state| moves_freely(state)).collect();
-        // Response of the state channels to a friction, with the non-linear terms.
+        // Response of the state channels to a friction, with the nonlinear terms.
         let response = |b: usize| -> Vec<f64> {
             let of = |a: usize| free.iter().map(|&s| inverse[a * states + s] * gains[s * count + count - n + b]).sum();
             (0..states).map(of).collect()
@@ -249,8 +250,8 @@ impl ContactOperators {
 impl ContactSolver<'_> {
     /// Solve a pulse for its state channels and frictions.
     ///
-    /// A constant friction cannot balance a force that varies within the pulse, so the mean output of a resting body would
-    /// drift with the square of the step. The solver keeps it fixed from one pulse at rest to the next.
+    /// A constant friction cannot balance a force that varies within the pulse, so the mean output of a resting body
+    /// would drift with the square of the step. The solver keeps it fixed from one pulse at rest to the next.
     pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), PulseFailure> {
         for (rests, (before, now)) in self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities)) {
             *rests = before.1 && *now == 0.0;

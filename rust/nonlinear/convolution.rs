@@ -2,14 +2,14 @@
 //!
 //! A block of the past is multiplied with the equally long block that follows as soon as it is complete, by one
 //! transform (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6): O(N log² N). Within a short block terms are summed
-//! directly. Kernels of whole orders are polynomials in the lag, for which running sums of the signal suffice: O(N).
+//! directly. Kernels of integer orders are polynomials in the lag, for which running sums of the signal suffice: O(N).
 
 use crate::fractional::kernels::digamma;
 use crate::series::{Buffers, Kernel};
 
 /// Length of a block that is summed directly. Transforms of shorter blocks cost more.
 const DIRECT_SUM_LENGTH: usize = 64;
-/// Largest whole order whose kernel is summed as a polynomial. Sums of higher ones lose digits on long runs.
+/// Largest integer order whose kernel is summed as a polynomial. Sums of higher ones lose digits on long runs.
 const MAX_POLYNOMIAL_ORDER: usize = 3;
 
 /// Kernel of an online convolution, shared by all signals.
@@ -40,8 +40,8 @@ impl ConvolutionKernel {
         Self { values, memory: Memory::Blocks(spectra) }
     }
 
-    /// Kernel of an integral of this order, given its values. From lag 1 on it is a polynomial of the lag if the order is
-    /// whole; up to order 3 running sums are used then.
+    /// Kernel of an integral of this order, given its values. From lag 1 on it is a polynomial of the lag if the order
+    /// is whole; up to order 3 running sums are used then.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn of_integral(order: f64, values: Vec<f64>) -> Self {

@@ -1,4 +1,4 @@
-//! Output-error fit of systems with non-linear terms or friction, by Levenberg–Marquardt.
+//! Output-error fit of systems with nonlinear terms or friction, by Levenberg–Marquardt.
 //!
 //! Orders, coefficients, free parameters of inputs, and the initial states of each run are optimized together.
 

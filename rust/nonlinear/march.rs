@@ -1,10 +1,10 @@
-//! Free run of equations with non-linear terms, pulse by pulse, and its sensitivities.
+//! Simulation of equations with nonlinear terms, pulse by pulse, and its sensitivities.
 //!
 //! A state channel is D^ρ of an output that enters an expression; the outputs themselves are the first. Its pulse means
-//! are z = L + Σ κ_η ∗ (w x): L from inputs and initial terms, κ_η the kernels of I^η, x the channels in linear terms and
-//! the values of the expressions. The terms of the outputs are not inverted, so that no kernel grows exponentially and
-//! an unstable linear part loses no digits. The mean of a pulse enters its own equation; Newton iterations that start
-//! at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
+//! are z = L + Σ κ_η ∗ (w x): L from inputs and initial terms, κ_η the kernels of I^η, x the channels in linear terms
+//! and the values of the expressions. The terms of the outputs are not inverted, so that no kernel grows exponentially
+//! and an unstable linear part loses no digits. The mean of a pulse enters its own equation; Newton iterations that
+//! start at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
 use super::contact::{BodyDerivatives, BodyMotion, ContactOperators, PulseContact, PulseEquations};
@@ -24,8 +24,8 @@ use crate::series::{Buffers, Kernel};
 const MAX_NEWTON_ITERATIONS: usize = 50;
 /// Halvings of a Newton step that does not reduce the residual.
 const MAX_STEP_HALVINGS: usize = 12;
-/// Newton step, relative to the terms of the channel, that ends the iteration. Convergence is quadratic, so the next one is below
-/// rounding, and the linearization before it is that of the solution to this relative error.
+/// Newton step, relative to the terms of the channel, that ends the iteration. Convergence is quadratic, so the next
+/// one is below rounding, and the linearization before it is that of the solution to this relative error.
 const NEWTON_TOLERANCE: f64 = 1e-8;
 /// Residual of a channel, relative to its terms, that is rounding.
 const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
@@ -37,7 +37,7 @@ enum Place {
     Known(usize),
 }
 
-/// Non-linear term of an equation.
+/// Nonlinear term of an equation.
 struct NonlinearTerm {
     equation: usize,
     term: usize,
@@ -90,11 +90,11 @@ pub(super) struct Operators {
     contact: Option<ContactOperators>,
 }
 
-/// Free run with the linearization of every pulse.
+/// Simulation with its linearization at every pulse.
 pub(super) struct LinearizedRun {
-    /// State channels, then means of the non-linear terms, then of the frictions.
+    /// State channels, then means of the nonlinear terms, then of the frictions.
     pub(super) sources: Vec<Vec<f64>>,
-    /// Derivatives of the non-linear terms with respect to state channels, then to known channels, pulse after pulse.
+    /// Derivatives of the nonlinear terms with respect to state channels, then to known channels, pulse after pulse.
     slopes: Vec<f64>,
     /// Inverse of the linearized equations of each pulse.
     inverses: Vec<f64>,
@@ -102,7 +102,7 @@ pub(super) struct LinearizedRun {
     contacts: Vec<PulseContact>,
 }
 
-/// Pulse at which a free run ends, and why.
+/// Pulse at which a simulation ends early, and the reason.
 pub(super) struct End {
     pub(super) index: usize,
     pub(super) why: String,
@@ -247,7 +247,7 @@ impl Operators {
         self.states.len() + self.values()
     }
 
-    /// Number of non-linear terms and frictions.
+    /// Number of nonlinear terms and frictions.
     fn values(&self) -> usize {
         self.terms.len() + self.contact.as_ref().map_or(0, ContactOperators::count)
     }
@@ -320,12 +320,12 @@ impl Operators {
         out
     }
 
-    /// Motion of each body with friction in a free run.
+    /// Motion of each body with friction in the simulation.
     pub(super) fn body_motions(&self, forcing: &ForcingTerms, run: &LinearizedRun) -> Vec<BodyMotion> {
         self.contact.as_ref().map_or_else(Vec::new, |contact| contact.motions(forcing, &run.contacts))
     }
 
-    /// Free run under a forcing of the state channels, or where and why it ends.
+    /// Simulation under a forcing of the state channels, or the pulse and reason of its early end.
     ///
     /// Of a run that ends, the outputs so far are returned, too.
     pub(super) fn run(&self, system: &NonlinearSystem, forcing: &ForcingTerms) -> (LinearizedRun, Option<End>) {
@@ -416,11 +416,12 @@ struct Pulse<'a> {
     free: Vec<f64>,
     /// Values of state channels that are given.
     fixed: Vec<Option<f64>>,
-    /// Which state channels were given when the inverse was computed; without non-linear terms it depends on these alone.
+    /// Which state channels were given when the inverse was computed; without nonlinear terms it depends on these
+    /// alone.
     inverted_for: Vec<bool>,
     known: Vec<f64>,
     z: Vec<f64>,
-    /// Non-linear terms at z, then frictions; derivatives with respect to state channels, then to known channels.
+    /// Nonlinear terms at z, then frictions; derivatives with respect to state channels, then to known channels.
     values: Vec<f64>,
     slopes: Vec<f64>,
     inverse: Vec<f64>,
@@ -544,7 +545,7 @@ impl<'a> Pulse<'a> {
         true
     }
 
-    /// Solve a pulse without non-linear terms for its state channels, at the present friction forces.
+    /// Solve a pulse without nonlinear terms for its state channels, at the present friction forces.
     fn solve_linear(&mut self) -> std::result::Result<(), PulseFailure> {
         if !self.linearize() {
             return Err(PulseFailure::Newton("its linearization is singular"));

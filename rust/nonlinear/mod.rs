@@ -1,10 +1,10 @@
-//! Equations with non-linear terms and dry friction: free run pulse by pulse, sensitivities, output error.
+//! Equations with nonlinear terms and dry friction: simulation pulse by pulse, sensitivities, output error.
 //!
 //! D^α y = Σ c D^ν s + Σ k D^μ n − F(Dy) sgn(Dy), where n is an expression over signals and derivatives of them
-//! ([`DerivedSignal`](crate::expression::DerivedSignal)) and F a [`FrictionLaw`](crate::friction::FrictionLaw). Orders of
-//! the derivatives of outputs are at most α − μ. The scheme is of second order in the step, and implicit: Newton
-//! iterations solve the non-linear terms of a pulse, the contact law its friction. The past enters by online convolutions
-//! with the kernels of fractional integrals alone.
+//! ([`DerivedSignal`](crate::expression::DerivedSignal)) and F a [`FrictionLaw`](crate::friction::FrictionLaw). Orders
+//! of the derivatives of outputs are at most α − μ. The scheme is of second order in the step, and implicit: Newton
+//! iterations solve the nonlinear terms of a pulse, the contact law its friction. The past enters by online
+//! convolutions with the kernels of fractional integrals alone.
 
 mod channels;
 mod contact;
@@ -24,7 +24,7 @@ pub use system::NonlinearSystem;
 use crate::error::{check_length, Result};
 use crate::regressors::{add_impulses, split_impulses, Record};
 
-/// Free run of a system.
+/// Simulation of a system.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeRun {
     /// Pulse means of each output.
@@ -34,15 +34,16 @@ pub struct FreeRun {
 }
 
 impl NonlinearSystem {
-    /// Free run with initial terms, (exponent, coefficient) pairs of powers of t by equation. Outputs are NaN from the
-    /// first pulse that overflows. O(d m log² m) for d convolutions of m pulses; O(d m) for whole orders.
+    /// Simulation with initial terms: (exponent, coefficient) pairs of powers of t by equation. Outputs are NaN from
+    /// the first pulse that overflows. O(d m log² m) for d convolutions of m pulses; O(d m) for integer orders.
     ///
-    /// The exponents −1, −2, … add an impulse and its derivatives to the output alone; the equations do not contain them.
-    /// After the filter of an output they become its initial transient.
+    /// The exponents −1, −2, … add an impulse and its derivatives to the output alone; the equations do not contain
+    /// them. After the filter of an output they become its initial transient.
     ///
     /// # Errors
-    /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution, although the run is finite;
-    /// [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction on this grid; as [`NonlinearSystem::check`].
+    /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution, although
+    /// the run is finite; [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction
+    /// on this grid; as [`NonlinearSystem::check`].
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;

@@ -1,4 +1,4 @@
-//! Parameters of equations with non-linear terms: residuals of all experiments and their derivatives.
+//! Parameters of equations with nonlinear terms: residuals of all experiments and their derivatives.
 
 use super::channels::{ForcingTerms, SystemDerivatives};
 use super::initial_state::{merge_powers, InitialTerm};
@@ -58,7 +58,7 @@ pub fn filtered_outputs(experiments: &[Experiment]) -> Vec<bool> {
     experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
 }
 
-/// Model with free parameters: equations with non-linear terms, some with friction of their own output's velocity.
+/// Model with free parameters: equations with nonlinear terms, some with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonlinearModel {
     /// Equations over recorded signals and, after these, derived ones.
@@ -295,7 +295,7 @@ impl NonlinearModel {
         self.model.initial.check()
     }
 
-    /// Whether a coefficient must not be negative: friction forces.
+    /// Whether a coefficient must not be negative, as a friction force must not.
     pub(super) fn is_nonnegative(&self, coefficient: usize) -> bool {
         self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
     }

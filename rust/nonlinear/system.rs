@@ -1,4 +1,4 @@
-//! Systems of equations with non-linear terms and dry friction at known orders and coefficients.
+//! Systems of equations with nonlinear terms and dry friction at known orders and coefficients.
 
 use super::channels::StateChannel;
 use super::convolution::MAX_FEEDTHROUGH_ORDER;
@@ -13,7 +13,7 @@ use crate::linalg::small;
 /// Smallest integration order of a linear term of the equation's own output, and of a term with an input.
 pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
-/// Equations with non-linear terms at known orders and coefficients.
+/// Equations with nonlinear terms at known orders and coefficients.
 ///
 /// The signals from `recorded` on are derived signals.
 #[derive(Debug, Clone, PartialEq)]
@@ -220,7 +220,7 @@ impl NonlinearSystem {
     }
 }
 
-/// Error for non-linear terms beside something else.
+/// Error for nonlinear terms in combination with an option that excludes them.
 pub(crate) fn unsupported_with(what: &str, remedy: &str) -> Error {
     Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
 }

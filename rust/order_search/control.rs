@@ -64,9 +64,9 @@ pub struct BatchPosition {
     pub batch: u64,
     /// Number of its open candidates that have been evaluated, in evaluation order.
     pub evaluated_count: u64,
-    /// End and length of the current chunk of candidates, 0 if the batch has not been screened.
+    /// End of the current chunk of candidates, 0 if the batch has not been screened.
     pub end: u64,
-    /// See `end`.
+    /// Length of the current chunk, 0 if the batch has not been screened.
     pub size: u64,
     /// Limit of that chunk.
     pub limit: f64,

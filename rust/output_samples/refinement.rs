@@ -12,8 +12,8 @@ use crate::recording::Role;
 use crate::series;
 use crate::signal::nonuniform::interpolate_gaps;
 
-/// Pulses per sampling interval of the coarsest grid. Two are the minimum for a sample that is independent of a jump of a
-/// held input at its time.
+/// Pulses per sampling interval of the coarsest grid. Two are the minimum for a sample that is independent of a jump of
+/// a zero-order-hold input at its time.
 const FIRST_REFINEMENT: usize = 2;
 /// Pieces of a response start at its end divided by powers of this ratio, down to this minimum number of intervals.
 /// Halving the step on a piece costs as much as the whole response did.
@@ -123,7 +123,7 @@ impl OutputSimulation {
         size_of::<f64>() * (2 * self.recording.channels().len() + (10 * n + 2 * units + 8) * n)
     }
 
-    /// Samples of a grid on which the equations are singular.
+    /// Samples returned for a grid on which the equations are singular: all NaN.
     fn unknown_samples(&self) -> OutputSamples {
         let count = self.times.as_ref().map_or(self.recording.len(), Vec::len);
         let n = self.equations.len();

@@ -26,8 +26,8 @@ pub(super) type Terms = Vec<Vec<(f64, f64)>>;
 pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
 /// Order of integration from which on a slope discontinuity is resolved by the pulses.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
-/// Maximum number of evaluations for the initial states of a run that is not linear in them, and relative change of the cost
-/// that terminates.
+/// Maximum number of evaluations for the initial states of a run that is not linear in them, and relative change of the
+/// cost that terminates.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 60, tolerance: 1e-12 };
 
 /// Initial terms of a simulation. Exponents −1, −2, … are an impulse and its derivatives before the sensor filter, the
@@ -56,8 +56,8 @@ pub struct OutputSimulation {
 }
 
 impl OutputSimulation {
-    /// Equations of the outputs of a recording in their sequence, and the friction of some of them. `times` \[s\] are the
-    /// times of the samples; None for the uniform samples of the recording.
+    /// Equations of the outputs of a recording in their sequence, and the friction of some of them. `times` \[s\] are
+    /// the times of the samples; None for the uniform samples of the recording.
     ///
     /// # Errors
     /// Equations that the recording cannot supply, or other outputs than its own.
@@ -97,7 +97,7 @@ impl OutputSimulation {
         Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
 
-    /// Simulation of equations with non-linear terms, and the friction of some of them. Non-linear terms are terms of
+    /// Simulation of equations with nonlinear terms, and the friction of some of them. Nonlinear terms are terms of
     /// derived signals, which are numbered after the signals of the recording.
     ///
     /// # Errors
@@ -178,7 +178,8 @@ impl OutputSimulation {
         self.frictions.is_empty() && self.derived.is_empty()
     }
 
-    /// Initial terms of a model with friction or non-linear terms, fitted on a grid of `every` pulses per sampling interval.
+    /// Initial terms of a model with friction or nonlinear terms, fitted on a grid of `every` pulses per sampling
+    /// interval.
     ///
     /// Outputs are not linear in them, so they are found by optimization, from level and velocity at the
     /// start of the run.
@@ -407,9 +408,9 @@ impl<'a> Grid<'a> {
 
     /// Samples from pulse means: integrals from the left, direct feedthrough with its value at the sample.
     ///
-    /// The last two pulses before each sample time are extrapolated to it. No jump of a held input lies in them, so the
-    /// extrapolation crosses no slope discontinuity t^α of a jump. At nonuniform sample times, between which jumps may
-    /// lie anywhere, samples follow from the pulses around them and the kink correction.
+    /// The last two pulses before each sample time are extrapolated to it. No jump of a zero-order-hold input lies in
+    /// them, so the extrapolation crosses no slope discontinuity t^α of a jump. At nonuniform sample times, between
+    /// which jumps may lie anywhere, samples follow from the pulses around them and the kink correction.
     fn samples(&self, means: &Rows, terms: &Terms, is_driven: bool) -> Result<Rows> {
         let OutputSimulation { recording, equations, times, .. } = self.simulation;
         let (n, m, every) = (means.len(), self.record.m(), self.every);

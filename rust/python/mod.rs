@@ -17,7 +17,7 @@ mod virtual_arm;
 
 use pyo3::prelude::*;
 
-/// Core of ftlm, compiled.
+/// The compiled core of ftlm.
 #[pymodule]
 mod _core {
     use super::*;

@@ -1,4 +1,4 @@
-//! Binding of Levenberg–Marquardt for residuals that Python computes.
+//! Binding of the Levenberg–Marquardt method for residuals that Python callbacks compute.
 
 use std::cell::RefCell;
 
@@ -96,7 +96,7 @@ impl LeastSquaresProblem for CallbackProblem<'_> {
     }
 }
 
-/// Values, sum of squares, termination status, number of evaluations, active constraints.
+/// Result of an optimization: values, sum of squares, termination status, number of evaluations, active constraints.
 type MinimumTuple<'py> = (Bound<'py, PyArray1<f64>>, f64, &'static str, usize, Vec<usize>);
 
 /// Minimize a sum of squares from a feasible initial guess under rows · values ≤ limits.

@@ -166,7 +166,7 @@ impl Recording {
         Ok(Experiment { inner })
     }
 
-    /// Times \[s\] and sizes of the jumps of a held input; None for other signals.
+    /// Times \[s\] and sizes of the jumps of a zero-order-hold input; None for other signals.
     fn jumps<'py>(&self, py: Python<'py>, signal: usize) -> PyResult<Option<(Array<'py>, Array<'py>)>> {
         self.inner.channel(signal)?;
         let discontinuities = run_detached(py, || Ok(self.inner.jumps(signal)))?;
@@ -186,7 +186,7 @@ impl Recording {
         Ok(run_detached(py, || Ok(self.inner.values_at(signal, &times)))?.map(|values| PyArray1::from_vec(py, values)))
     }
 
-    /// Samples of a signal as they act: behind its limits, without the transient of its sensor filter.
+    /// Samples of a signal as they enter the equations: after its limits, without the transient of its sensor filter.
     fn acting_samples<'py>(&self, py: Python<'py>, signal: usize) -> PyResult<Array<'py>> {
         self.inner.channel(signal)?;
         Ok(PyArray1::from_vec(py, run_detached(py, || Ok(self.inner.acting_samples(signal).into_owned()))?))

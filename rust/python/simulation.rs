@@ -275,7 +275,8 @@ impl OutputSimulation {
         Ok((samples_tuple(py, samples.samples)?, samples.refinement, PyArray1::from_vec(py, samples.change)))
     }
 
-    /// (exponent, coefficient) of the initial terms of a model with friction or non-linear terms by equation, fitted on a grid.
+    /// (exponent, coefficient) of the initial terms of a model with friction or nonlinear terms by equation, fitted on
+    /// a grid.
     #[pyo3(signature = (start, every, stop=None))]
     fn fit_initial_states(
         &self,

@@ -191,7 +191,7 @@ impl VirtualArm {
         Ok(Self { plant, step, pace: None, rows: Vec::new() })
     }
 
-    /// Start with real-time deadlines from now on, or step as fast as possible.
+    /// Start the arm with real-time deadlines from now on, or without deadlines, as fast as possible.
     fn start(&mut self, paced: bool) -> PyResult<()> {
         run_attached(|| {
             self.pace = if paced { Some(Pace::new(self.step)?) } else { None };

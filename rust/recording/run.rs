@@ -1,4 +1,4 @@
-//! One run that is sampled on any grid: pulse means of its signals, and samples to compare a simulation with.
+//! One run, resampled on any grid: pulse means of its signals, and samples to compare a simulation with.
 
 use std::borrow::Cow;
 
@@ -62,7 +62,7 @@ impl Default for Sampling {
     }
 }
 
-/// One run with what a structure says of its signals.
+/// One run, with the roles, delays and limits that a structure gives its signals.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -91,7 +91,7 @@ pub struct Recording {
     pub is_at_rest: bool,
     /// Whether each equation is driven by the simulated other outputs, not by the measured ones.
     pub is_coupled: bool,
-    /// Whether a body has friction or an equation non-linear terms, so that outputs are simulated before the filter.
+    /// Whether a body has friction or an equation nonlinear terms, so that outputs are simulated before the filter.
     pub has_friction: bool,
     /// Signal and law of each delay, saturation and dead zone that is to be estimated.
     pub free_inputs: Vec<(usize, InputLaw)>,
@@ -290,7 +290,7 @@ impl Recording {
         self.channels.first().map_or(0, |channel| channel.samples.len())
     }
 
-    /// Whether the recording has no samples. None has.
+    /// Whether the recording has no samples; always false.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -389,7 +389,7 @@ impl Recording {
         self.channels.iter().enumerate().any(|(signal, channel)| channel.is_filtered && !simulated(signal))
     }
 
-    /// Whether the samples have times of their own.
+    /// Whether the samples have nonuniform times.
     #[must_use]
     pub fn has_nonuniform_samples(&self) -> bool {
         self.times.is_some()
@@ -412,7 +412,7 @@ impl Recording {
         FilterStates::of(self.filter.as_ref()?).filter(|states| states.lasts(self.step))
     }
 
-    /// Samples of a signal as they act: behind its limits, without the transient of its sensor filter.
+    /// Samples of a signal as they enter the equations: after its limits, without the transient of its sensor filter.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -435,7 +435,7 @@ impl Recording {
         }
     }
 
-    /// Nonuniform samples of a signal as they act; the uniform ones if there are no others.
+    /// Nonuniform samples of a signal as they enter the equations; the uniform ones if there are no others.
     fn acting_nonuniform_samples(&self, signal: usize) -> Option<Cow<'_, [f64]>> {
         let (channel, times) = (&self.channels[signal], self.times.as_ref()?);
         let limited = channel.behind_limits(channel.nonuniform.as_ref()?);
@@ -799,7 +799,7 @@ impl Recording {
         Ok((Experiment::with_nonuniform_samples(record, samples, weights, own)?, unread, point_values))
     }
 
-    /// Times \[s\] and sizes of the jumps of a held input after its delay; None for other signals.
+    /// Times \[s\] and sizes of the jumps of a zero-order-hold input after its delay; None for other signals.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};

@@ -5,9 +5,9 @@
 //! between its samples. Samples used in place of means would bias every estimate.
 //!
 //! Four pulse means around a sample time determine a smooth signal to fourth order: the slope of the quartic through
-//! the integral at the pulse edges. Jumps of a held input break the smoothness. I^η of a jump of size Δ at p is Δ (t −
-//! p)^η/Γ(η + 1), which has a slope discontinuity, and pulse means spread the jump over its pulse. Both effects are
-//! known exactly, so samples near a jump are corrected by their difference.
+//! the integral at the pulse edges. Jumps of a zero-order-hold input break the smoothness. I^η of a jump of size Δ at p
+//! is Δ (t − p)^η/Γ(η + 1), which has a slope discontinuity, and pulse means spread the jump over its pulse. Both
+//! effects are known exactly, so samples near a jump are corrected by their difference.
 
 use crate::error::{check_finite, check_points, Error, Result};
 

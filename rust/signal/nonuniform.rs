@@ -80,7 +80,7 @@ impl<'a> NonuniformSignal<'a> {
         }))
     }
 
-    /// Means of a hold: bit-exact where the value is constant within a pulse.
+    /// Means of a zero-order-hold signal: bit-exact where the value is constant within a pulse.
     fn hold_means(&self, edges: &[f64], step: f64) -> Vec<f64> {
         let m = edges.len() - 1;
         let close = |edge: f64, time: f64| (edge - time).abs() <= EDGE_TOLERANCE_PULSES * step;
@@ -137,7 +137,7 @@ impl<'a> NonuniformSignal<'a> {
         integrals.windows(2).map(|pair| (pair[1] - pair[0]) / step).collect()
     }
 
-    /// Values at given times \[s\]; at a jump of a hold, the value after it.
+    /// Values at given times \[s\]; at a jump of a zero-order-hold signal, the value after it.
     #[must_use]
     pub fn at(&self, times: &[f64]) -> Vec<f64> {
         let (own, values) = (&self.times, &self.values);

@@ -528,7 +528,8 @@ def _header(
         top = count
     if count > top:
         raise DataError(
-            f"{source}: {layout_fields('header')} is {count}, but the number of lines above the rows is {top}; give fewer"
+            f"{source}: {layout_fields('header')} is {count}, "
+            f"but the number of lines above the rows is {top}; give fewer"
         )
     if count == 0:
         return None, None, top

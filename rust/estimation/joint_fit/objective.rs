@@ -169,7 +169,7 @@ impl<'a> Objective<'a> {
     }
 
     /// True if the simulation does not depend on the step: exact samples of integer orders, or of any orders on long
-    /// records, and no held input that switches within a pulse.
+    /// records, and no zero-order-hold input that switches within a pulse.
     #[must_use]
     pub fn is_exact(&self, place: &Iterate) -> bool {
         let whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
@@ -254,7 +254,8 @@ impl<'a> Objective<'a> {
             .flat_map(move |e| (0..outputs).map(move |i| (e, i, e.sample_weights.get(i).map(Vec::as_slice))))
     }
 
-    /// Residuals divided by their noise level, by run and output, without robust weights; NaN where a sample is missing.
+    /// Residuals divided by their noise level, by run and output, without robust weights; NaN where a sample is
+    /// missing.
     #[must_use]
     pub fn residuals(&self, attempt: &OptimizationResult) -> Vec<Vec<Vec<f64>>> {
         let outputs = self.problem.outputs.len();

@@ -120,7 +120,7 @@ impl ParameterSet {
 
     /// Problem with coordinates for an optimization from `start`.
     ///
-    /// Nonzero coefficients use logarithms unless `plain` or there are non-linear terms, whose initial guesses may have
+    /// Nonzero coefficients use logarithms unless `plain` or there are nonlinear terms, whose initial guesses may have
     /// wrong signs. The parameters with the indices `fixed` are fixed at their values.
     #[must_use]
     pub fn problem_at(&self, start: &Iterate, plain: bool, fixed: &[usize]) -> Problem {

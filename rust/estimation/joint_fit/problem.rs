@@ -1,4 +1,5 @@
-//! Problem of a joint fit, with friction or non-linear terms or without: iterates, optimization, candidates and feasible steps.
+//! Problem of a joint fit, with friction or nonlinear terms or without: iterates, optimization, candidates and feasible
+//! steps.
 
 use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
@@ -20,7 +21,7 @@ pub struct Problem {
     pub model: FreeModel,
     /// Friction laws by index of their equation.
     pub frictions: Vec<(usize, FreeFrictionLaw)>,
-    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
+    /// Signals of the nonlinear terms: expressions, numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
 }
 
@@ -114,7 +115,7 @@ impl Problem {
     /// Minimize the cost by Levenberg–Marquardt; if `steady`, a stable iterate does not become unstable.
     ///
     /// # Errors
-    /// As [`fit_until`], with friction or non-linear terms [`nonlinear::fit`].
+    /// As [`fit_until`], with friction or nonlinear terms [`nonlinear::fit`].
     pub fn minimize(
         &self,
         experiments: &[Experiment],
@@ -160,7 +161,7 @@ impl Problem {
 pub struct Iterate {
     /// Free orders, coefficients and input parameters.
     pub point: ParameterPoint,
-    /// Initial states of each run with friction or non-linear terms; empty if unknown.
+    /// Initial states of each run with friction or nonlinear terms; empty if unknown.
     pub states: Vec<Vec<f64>>,
 }
 
@@ -291,7 +292,7 @@ impl Problem {
         Ok(at.iter().zip(&step).map(|(a, s)| a + share * s).collect())
     }
 
-    /// Highest order of a derivative of a signal in the expressions of non-linear terms.
+    /// Highest order of a derivative of a signal in the expressions of nonlinear terms.
     fn highest_derivative(&self, signal: usize) -> f64 {
         let channels = self.derived.iter().flat_map(|derived| &derived.channels);
         channels.filter(|channel| channel.0 == signal).fold(0.0, |highest, channel| channel.1.max(highest))

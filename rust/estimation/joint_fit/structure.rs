@@ -197,7 +197,7 @@ pub struct Hints {
 pub struct ParametricStructure {
     /// Names of the signals, for messages: recorded ones, then derived ones.
     pub signals: Vec<String>,
-    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
+    /// Signals of the nonlinear terms: expressions, numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
     /// One equation per output.
     pub equations: Vec<ParametricEquation>,

@@ -1,10 +1,10 @@
 //! Exact output samples of equations of any orders, and their derivatives.
 //!
-//! With the integration orders η of the terms an equation is y = Σ c s^−η u/D. D = 1 − Σ c s^−η has the terms in y alone.
-//! A held input is a sum of steps, so the starred transform of the samples of y is that of c s^−η/(D s) times the
-//! transform of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D. Derivatives with respect to
-//! orders and coefficients are functions of s as well. A sample at a jump is the mean of both sides; [`Feedthrough`]
-//! corrects it.
+//! With the integration orders η of the terms an equation is y = Σ c s^−η u/D. D = 1 − Σ c s^−η has the terms in y
+//! alone. A zero-order-hold input is a sum of steps, so the starred transform of the samples of y is that of c s^−η/(D
+//! s) times the transform of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D. Derivatives
+//! with respect to orders and coefficients are functions of s as well. A sample at a jump is the mean of both sides;
+//! [`Feedthrough`] corrects it.
 
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -25,7 +25,7 @@ use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 /// Fewest pulses of an experiment with exact samples: shorter ones are simulated faster by pulses.
 pub(crate) const MIN_EXACT_PULSES: usize = 1 << 12;
 
-/// Equations of any orders with held inputs, on experiments with uniform samples.
+/// Equations of any orders with zero-order-hold inputs, on experiments with uniform samples.
 pub(crate) struct FractionalOrders {
     runs: Vec<Run>,
 }
@@ -338,8 +338,8 @@ fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: u
 }
 
 impl Run {
-    /// Samples of an equation from rest, once for each list in `weight_sets` of weights that replace its coefficients, and
-    /// samples of its response to each initial term t^e with e in `exponents`.
+    /// Samples of an equation from rest, once for each list in `weight_sets` of weights that replace its coefficients,
+    /// and samples of its response to each initial term t^e with e in `exponents`.
     fn responses(
         &self,
         experiment: &Experiment,
@@ -423,7 +423,8 @@ impl Run {
 
     /// Return the compared samples of `count` columns, each the sum of the transforms of `functions` with its index.
     ///
-    /// A transform with an input is multiplied by the jumps of that input. One without is the response to initial terms.
+    /// A transform with an input is multiplied by the jumps of that input. One without is the response to initial
+    /// terms.
     fn columns(
         &self,
         experiment: &Experiment,

@@ -2,10 +2,10 @@
 //!
 //! Let D^n y = Σ a_i D^i y + Σ b_j D^j u, A(s) = s^n − Σ a_i s^i. The samples of s^j/A u are states of one companion
 //! form, advanced from pulse to pulse by its matrix exponential. This is exact for an input that is held or linear over
-//! a pulse, with any delay of a held input. y is linear in b_j, its derivative with respect to a_i is s^i/A y, a state of
-//! two companion forms in series, and its derivative with respect to a delay is −D y. An initial term c t^e is the
-//! response of a chain of integrators to an impulse, a constant or a ramp. Time is scaled by the largest coefficient, so that no element of the companion form is
-//! above 1.
+//! a pulse, with any delay of a zero-order-hold input. y is linear in b_j, its derivative with respect to a_i is s^i/A
+//! y, a state of two companion forms in series, and its derivative with respect to a delay is −D y. An initial term c
+//! t^e is the response of a chain of integrators to an impulse, a constant or a ramp. Time is scaled by the largest
+//! coefficient, so that no element of the companion form is above 1.
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -48,7 +48,7 @@ pub(crate) struct SourceInput<'a> {
     /// A value per pulse if held, per edge if linear.
     pub(crate) samples: Cow<'a, [f64]>,
     pub(crate) between: Intersample,
-    /// Delay of a held input in pulses, and the value before the first pulse.
+    /// Delay of a zero-order-hold input in pulses, and the value before the first pulse.
     pub(crate) delay: f64,
     pub(crate) before: f64,
 }
@@ -87,8 +87,8 @@ pub(crate) struct Companion {
     known: RefCell<Vec<Rc<Discretization>>>,
 }
 
-/// Inter-sample behavior of the input, None without one; fraction of a pulse in its delay; output row and direct gain of
-/// the series connection.
+/// Inter-sample behavior of the input, None without one; fraction of a pulse in its delay; output row and direct gain
+/// of the series connection.
 type DiscretizationKey = (Option<Intersample>, u64, Option<(Vec<f64>, f64)>);
 
 /// Exact advance of the states by one pulse.

@@ -237,13 +237,13 @@ pub(super) fn apply_innovation_weights(
 pub(crate) struct ResidualSumOfSquares {
     stride: usize,
     gram: Vec<f64>,
-    /// Its diagonal, and the roots of that.
+    /// Diagonal of the Gram matrix, and its square roots.
     diagonal: Vec<f64>,
     norms: Vec<f64>,
     /// Rounding-error bound of a squared sum, per unit of the squared sum of norms.
     unit: f64,
-    /// Same bound for the minimum over all coefficients, and the smallest eigenvalue for which it holds. The eigenvalue
-    /// is that of the terms' correlation matrix (docs/mathematics.md).
+    /// Rounding-error bound of the minimum over all coefficients, and the smallest eigenvalue for which it holds. The
+    /// eigenvalue is that of the terms' correlation matrix (docs/mathematics.md).
     slack: f64,
     min_eigenvalue: f64,
 }

@@ -32,9 +32,9 @@ pub struct CertificateOptions {
     pub max_coefficient: f64,
     /// Maximum number of cells. The bisection ends there with the bound proved so far.
     pub max_cells: u64,
-    /// Number of threads, and memory \[bytes\].
+    /// Number of threads.
     pub threads: usize,
-    /// See `threads`.
+    /// Memory limit \[bytes\].
     pub memory: u64,
 }
 
@@ -44,11 +44,11 @@ pub struct Certificate {
     /// Lower bound of the root mean squared equation error, 0 if nothing is proved. It holds for all orders of the
     /// region and all admissible coefficients.
     pub lower_bound: f64,
-    /// Smallest error found, with the order of the equation and those of its terms. Infinite if none was found.
+    /// Smallest root mean squared equation error found; infinite if none was found.
     pub best: f64,
-    /// See `best`.
+    /// Order of the equation with the error `best`.
     pub order: f64,
-    /// See `best`.
+    /// Orders of the terms of that equation.
     pub orders: Vec<f64>,
     /// Number of bounded cells.
     pub cells: u64,

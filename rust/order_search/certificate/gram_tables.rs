@@ -305,9 +305,9 @@ const ORDER_TOLERANCE: f64 = 1e-9;
 pub struct Range {
     /// Signal of the term.
     pub signal: usize,
-    /// Lowest and highest order, equal for a fixed order.
+    /// Lowest order, equal to `highest` for a fixed order.
     pub lowest: f64,
-    /// See `lowest`.
+    /// Highest order, equal to `lowest` for a fixed order.
     pub highest: f64,
 }
 

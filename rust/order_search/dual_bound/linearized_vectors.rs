@@ -332,7 +332,7 @@ impl LinearizedVectors {
         false
     }
 
-    /// Whether this vector proves it, for a candidate with the same own columns.
+    /// Whether this vector proves that the raw score exceeds the limit, for a candidate with the same own columns.
     #[inline(always)]
     pub(crate) fn vector_excludes(
         &self,

@@ -272,9 +272,9 @@ pub(super) struct ScoreEntry {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Class {
     Exact,
-    /// Only a lower bound without simulation exists.
+    /// Only a lower bound is known; the candidate was not simulated.
     Bounded,
-    /// Early stop at a partial sum, or no evaluation yet.
+    /// The simulation stopped early at a partial sum, or has not been run yet.
     Open,
     Failed(Failure),
 }

@@ -65,7 +65,7 @@ pub fn joint_multistart(
 /// interval).
 type NearArg = (List<f64>, List<f64>, usize);
 
-/// Fit a structure to its runs. None if every start has a simulation that overflows.
+/// Fit a structure to its runs; None if the simulation overflows for every initial guess.
 #[pyfunction]
 #[pyo3(signature = (problem, runs, known, start, near, candidates, huber, refine, means, progress=None, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]

@@ -47,7 +47,7 @@ fn state(fit: FitArg<'_>) -> PyResult<FitState> {
     })
 }
 
-/// Refuse an index that is no parameter.
+/// Return an error for an index that is no parameter.
 fn check_parameters(problem: &JointProblem, parameters: &[usize]) -> PyResult<()> {
     let size = problem.inner.problem.size();
     match parameters.iter().find(|&&i| i >= size) {

@@ -310,7 +310,7 @@ impl Points {
     }
 }
 
-/// Panic at a requested place: in the call, in the search thread, or in one of its workers.
+/// Test hook: panic in the call, in the search thread, or in one of its workers.
 #[pyfunction]
 #[allow(clippy::panic)]
 pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
@@ -322,7 +322,7 @@ pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
     }
 }
 
-/// Make kernels run as compiled for the oldest machine.
+/// Test hook: run all kernels with the instructions of the oldest supported processor.
 #[pyfunction]
 pub fn force_portable(on: bool) {
     crate::simd::force_portable(on);

@@ -4,7 +4,7 @@
 //! samples. They start from optima of integer orders with the orders freed ([`IntegerOrderProblem`]) and from order
 //! grids. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
 //! term less ([`ReducedProblem`]) or one fixed order ([`FixedOrderProblem`]). Bodies with friction start from linear
-//! fits ([`run_friction_multistart`]), non-linear terms from fits with the measured values of their expressions
+//! fits ([`run_friction_multistart`]), nonlinear terms from fits with the measured values of their expressions
 //! ([`run_nonlinear_multistart`]).
 
 mod coarse_grid;
