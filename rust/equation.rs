@@ -376,7 +376,7 @@ pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
 
 pub(crate) fn missing_signal_error(signal: usize, signals: usize) -> Error {
     Error::Structure {
-        what: format!("the equation names signal {signal}, but the record holds {signals}"),
+        what: format!("the equation contains signal {signal}, but the record has {signals} signals"),
         remedy: "give the record all signals of the equation".into(),
     }
 }
@@ -580,7 +580,7 @@ pub fn check_regular(equations: &[Equation]) -> Result<()> {
                 "the leading matrix of the equations is singular: their highest orders cancel each other, so they do \
                    not tell their outputs apart"
                     .into(),
-            remedy: "take out an equation that repeats another, or change an order or a coefficient".into(),
+            remedy: "remove an equation that repeats another one, or change an order or a coefficient".into(),
         }),
     }
 }

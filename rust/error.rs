@@ -51,7 +51,7 @@ pub enum Error {
         above: usize,
     },
     /// Division by a series that starts with (nearly) zero. For a coupled system: a singular leading matrix.
-    #[error("the series to divide by starts with {leading:e} at z^0; the equation is not solvable for its output (an own-output term of the highest order with coefficient 1?)")]
+    #[error("the leading coefficient of a divisor series is {leading:e}, so that the equation cannot be solved for its output; check for a term of the output at the highest order with coefficient 1")]
     LeadingZero {
         /// The leading coefficient, or the pivot of the leading matrix.
         leading: f64,
@@ -65,13 +65,13 @@ pub enum Error {
         count: usize,
     },
     /// Order grid without candidates.
-    #[error("the lattice holds no candidate: {why}; widen the intervals or refine the step")]
+    #[error("the order grid has no candidate: {why}; widen the intervals or refine the step")]
     EmptyOrderGrid {
         /// Condition that no order satisfies.
         why: String,
     },
     /// Order grid with too many candidates.
-    #[error("the lattice holds up to {count} candidates, more than the limit of {limit}: up to {} of one core at 10 ns each, as fast as searches are at best; take a larger step, narrower intervals or fixed orders", format_search_time(*count))]
+    #[error("the order grid has up to {count} candidates, more than the limit of {limit}; at 10 ns per candidate, the best case, a search takes {} on one core; take a larger step, narrower intervals or fixed orders", format_search_time(*count))]
     OrderGridTooLarge {
         /// Number of candidates, or of all tuples of the axes if they were not enumerated.
         count: u128,
@@ -79,7 +79,7 @@ pub enum Error {
         limit: u128,
     },
     /// Bank of regressors over the memory limit.
-    #[error("the bank of {columns} regressors of {m} pulses and their products needs {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step or narrower intervals")]
+    #[error("{columns} regressors of {m} pulses and their products need {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step or narrower intervals")]
     BankTooLarge {
         /// Number of columns.
         columns: usize,
@@ -91,7 +91,7 @@ pub enum Error {
         limit: u128,
     },
     /// Working memory over its limit.
-    #[error("{what} need {bytes} bytes, more than the {limit} that may be taken; take a smaller m, a larger step, narrower intervals, fewer or shorter runs at once, or allow more")]
+    #[error("{what} need {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step, narrower intervals, fewer or shorter runs, or raise the memory limit")]
     Memory {
         /// Data that need the memory.
         what: String,
@@ -109,7 +109,7 @@ pub enum Error {
         remedy: String,
     },
     /// Response or estimate that overflows.
-    #[error("the {what} stopped being finite at index {index}; the model is unstable over this record")]
+    #[error("the {what} is not finite from index {index} on; the model is unstable on this record")]
     Diverged {
         /// Name of the computation.
         what: String,
@@ -117,7 +117,7 @@ pub enum Error {
         index: usize,
     },
     /// Pulse of a simulation whose nonlinear equations have no solution.
-    #[error("the free run has no solution at {time:.4} s (pulse {index}): {why}; shorten the step, or check the coefficients of the non-linear terms")]
+    #[error("the equations have no solution at {time:.4} s (pulse {index}) of the simulation: {why}; shorten the step, or check the coefficients of the nonlinear terms")]
     NoSolution {
         /// Middle of the pulse \[s\].
         time: f64,
@@ -127,7 +127,7 @@ pub enum Error {
         why: String,
     },
     /// Every start of a fit leads to a simulation that overflows.
-    #[error("wherever it starts, the free run of {output} ends beyond the range of numbers: it grows; leave out the term that pushes, or bound its coefficient")]
+    #[error("the simulation of {output} overflows from every initial guess; remove the term that makes the model unstable, or bound its coefficient")]
     Beyond {
         /// Name of the output.
         output: String,
@@ -144,7 +144,7 @@ pub enum Error {
     #[error("interrupted")]
     Interrupted,
     /// Threads that the system cannot start.
-    #[error("{threads} threads could not be started: {why}; ask for fewer")]
+    #[error("{threads} threads could not be started: {why}; use fewer threads")]
     Threads {
         /// Number of requested threads.
         threads: usize,
@@ -243,7 +243,7 @@ pub(crate) fn check_overflow(result: &[f64], step: f64) -> Result<()> {
         name: "step".into(),
         value: step,
         range: "the steps for which the result is finite".into(),
-        remedy: "measure time, or the signal, in another unit".into(),
+        remedy: "change the unit of time or of the signal".into(),
     })
 }
 
@@ -305,7 +305,7 @@ pub fn check_points(name: &str, m: usize) -> Result<()> {
         name: name.to_owned(),
         value: m as f64,
         range: format!("[0, {MOST_POINTS}]"),
-        remedy: "ask for as many points as the record has".into(),
+        remedy: "use a number of points between 1 and that of the record".into(),
     })
 }
 
@@ -336,6 +336,6 @@ pub fn check_dense(m: usize) -> Result<()> {
         name: "m".into(),
         value: m as f64,
         range: format!("[1, {LARGEST_DENSE}]"),
-        remedy: "dense matrices are for study; apply the operator as a series instead".into(),
+        remedy: "apply the operator as a series, since dense matrices of this size are too large".into(),
     })
 }

@@ -123,7 +123,7 @@ impl Instruction {
 }
 
 fn refuse<T>(what: String, remedy: &str) -> Result<T> {
-    Err(Error::Structure { what: format!("{what} in a non-linear term"), remedy: remedy.into() })
+    Err(Error::Structure { what: format!("{what} in a nonlinear term"), remedy: remedy.into() })
 }
 
 /// Expression over numbered channels.

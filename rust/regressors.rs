@@ -485,7 +485,10 @@ impl Bank {
         let strange = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
         if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(strange) {
             return Err(Error::Structure {
-                what: format!("a regressor is of signal {signal}, but the record holds {}", record.len()),
+                what: format!(
+                    "a regressor refers to signal {signal}, but the number of signals of the record is {}",
+                    record.len()
+                ),
                 remedy: "give the record all signals of the equation".into(),
             });
         }

@@ -300,7 +300,7 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
         if !whole(structure.order) || alpha[i] == 0 || !structure.terms.iter().all(fits) {
             return Err(Error::Structure {
                 what: format!("equation {i} has orders that explicit Euler cannot step"),
-                remedy: "use whole orders below each output's own and order 0 for inputs, or the series simulation"
+                remedy: "use integer orders below that of each output, and order 0 for inputs, or use the simulation by series"
                     .into(),
             });
         }

@@ -110,8 +110,8 @@ fn integer(order: f64) -> Result<usize> {
         return Ok(nearest.min(MAX_STATES as f64 + 1.0) as usize);
     }
     Err(Error::Structure {
-        what: format!("an order or exponent {order} that no chain of integrators has"),
-        remedy: "use whole numbers from 0, or the series simulation".into(),
+        what: format!("order or exponent {order} is not an integer, as a chain of integrators requires"),
+        remedy: "use integers from 0, or the simulation by series".into(),
     })
 }
 

@@ -205,6 +205,6 @@ def _check_index(index: Floats | None, fit_rows: int = 0) -> Floats | None:
         return index
     where = "between the fitted rows and those of X" if fit_rows == bad[0] + 1 else f"after row {bad[0]} of X"
     raise DataError(
-        f"X: its index does not go on by one step {where}, {bad.size} such places in all, and rows are instants of "
-        "one record; leave out no row in between (gap=0, no shuffling), or reset the index if none is missing"
+        f"the index of X does not increase by one step {where} ({bad.size} such gaps in all), but X must be one "
+        "record without gaps; give consecutive rows (gap=0, no shuffling), or reset the index if no row is missing"
     )

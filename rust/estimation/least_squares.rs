@@ -97,7 +97,7 @@ impl Regression {
         check_length("solution", count, solution.len())?;
         if let Some(index) = dropped.iter().find(|index| !(first..count).contains(index)) {
             let what = format!("column {index} is no initial term of {first} to {count}");
-            return Err(Error::Structure { what, remedy: "drop initial terms only".into() });
+            return Err(Error::Structure { what, remedy: "omit initial terms only".into() });
         }
         let mut free = solution.iter();
         let coefficients = self.fixed.iter().map(|f| f.or_else(|| free.next().copied()).unwrap_or(0.0)).collect();

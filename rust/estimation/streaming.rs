@@ -62,7 +62,7 @@ impl RunningIntegral {
                 name: "order of an integral in a stream".into(),
                 value: eta,
                 range: "[0, 2]".into(),
-                remedy: "identify such an equation from the recorded run".into(),
+                remedy: "identify an equation with this term from the recorded run instead".into(),
             });
         }
         let history = |q: f64, weight: fn((f64, f64, f64), f64) -> f64| -> Vec<f64> {
@@ -155,7 +155,7 @@ impl StreamingOptions {
             name: "forgetting factor".into(),
             value: self.forgetting,
             range: "(0, 1]".into(),
-            remedy: "1 forgets nothing".into(),
+            remedy: "use 1 for no forgetting".into(),
         })
     }
 }
@@ -275,7 +275,7 @@ impl Streaming {
                 name: "pulses in the stream".into(),
                 value: (self.pulses + 1) as f64,
                 range: format!("[0, {}]", self.longest),
-                remedy: "state a longer run".into(),
+                remedy: "set a longer duration of the stream".into(),
             });
         }
         for (s, mean) in self.means.iter_mut().enumerate() {
@@ -324,7 +324,7 @@ impl InitialColumn {
                 name: "exponent of an initial term in a stream".into(),
                 value: exponent,
                 range: "(-1, ∞)".into(),
-                remedy: "identify such an equation from the recorded run".into(),
+                remedy: "identify an equation with this term from the recorded run instead".into(),
             });
         }
         let scale = libm::tgamma(exponent + 1.0) / libm::tgamma(exponent + excess + 1.0);

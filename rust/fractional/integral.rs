@@ -143,7 +143,7 @@ pub fn fractional_derivative(
             name: "order".into(),
             value: alpha,
             range: format!("[0, {MAX_DERIVATIVE}]"),
-            remedy: "differentiate what was differentiated, or put the order into an equation".into(),
+            remedy: "reduce the order of the derivative, or move the derivative to an equation".into(),
         });
     }
     check_finite("x", x)?;

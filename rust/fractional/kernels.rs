@@ -446,7 +446,7 @@ pub fn check_order(name: &str, order: f64) -> Result<()> {
             name: name.to_owned(),
             value: order,
             range: format!("[0, {MAX_ORDER}]"),
-            remedy: "split a higher order into a whole and a fractional part".into(),
+            remedy: "split a higher order into an integer and a fractional part".into(),
         })
     }
 }

@@ -39,10 +39,7 @@ impl ContactProblem {
     pub fn new(laws: Vec<FrictionLaw>, gains: Vec<f64>) -> Result<Self> {
         if !is_p_matrix(&gains, laws.len()) {
             // Same error as for a step that is too long, so that an optimizer shortens it.
-            return Err(Error::Diverged {
-                what: "friction of bodies that move each other; the free run".into(),
-                index: 0,
-            });
+            return Err(Error::Diverged { what: "friction of coupled bodies; simulation".into(), index: 0 });
         }
         Ok(Self { laws, gains })
     }

@@ -139,7 +139,7 @@ pub(super) fn derivative_powers(
                 name: "exponent of an initial term".into(),
                 value: exponent,
                 range: format!("above {}, or 0, 1, …", order - 1.0),
-                remedy: "the derivative in a non-linear term has no mean over the first pulse".into(),
+                remedy: "the derivative in a nonlinear term has no mean over the first pulse".into(),
             });
         }
         let scale = libm::tgamma(exponent + 1.0) / libm::tgamma(exponent - order + 1.0);

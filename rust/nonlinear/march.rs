@@ -114,7 +114,7 @@ impl End {
         #[allow(clippy::cast_precision_loss)]
         let time = (self.index as f64 + 0.5) * step;
         if self.is_overflow {
-            Error::Diverged { what: format!("free run (at {time:.4} s)"), index: self.index }
+            Error::Diverged { what: format!("simulation (at {time:.4} s)"), index: self.index }
         } else {
             Error::NoSolution { time, index: self.index, why: self.why }
         }
@@ -152,7 +152,7 @@ impl Operators {
             }
         }
         // Same error as for a step that is too long, so that an optimizer shortens it.
-        let beyond = || Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 };
+        let beyond = || Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 };
         let (mut integrals, mut lanes, mut inputs) = (Vec::new(), Vec::<Lane>::new(), Vec::new());
         let mut algebraic = false;
         for (state, &channel) in states.iter().enumerate() {
@@ -365,7 +365,7 @@ impl Operators {
             }
             let positive = pulse.determinant > 0.0;
             if *sign.get_or_insert(positive) != positive {
-                let why = "its solutions meet and vanish".into();
+                let why = "two solutions of the pulse merge and vanish".into();
                 return (run, Some(End { index: k, why, is_overflow: !self.algebraic }));
             }
             let values = pulse.z.iter().chain(&pulse.values);
@@ -400,7 +400,7 @@ fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
     }
     if order > MAX_EXCESS {
         return Err(Error::OutOfRange {
-            name: "order of a derivative of an input in a non-linear term".into(),
+            name: "order of a derivative of an input in a nonlinear term".into(),
             value: order,
             range: format!("[0, {MAX_EXCESS}]"),
             remedy: "record the derivative".into(),

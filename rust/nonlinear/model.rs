@@ -285,7 +285,7 @@ impl NonlinearModel {
             self.model.check_experiment(experiment)?;
             if experiment.nonuniform.is_some() {
                 let terms = if self.derived.is_empty() { "friction" } else { "non-linear terms" };
-                return refuse(&format!("{terms} with samples at times of their own"), "resample the runs");
+                return refuse(&format!("{terms} with samples at nonuniform times"), "resample the runs");
             }
             let passes = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
             if passes != self.filtered {
@@ -343,7 +343,7 @@ impl NonlinearModel {
             let record = acting.as_ref().unwrap_or(&experiment.record);
             let system = self.system(&point.orders, &point.coefficients, record.len());
             // Same error as for a step that is too long, so that an optimizer shortens it.
-            let far = |_| Error::Diverged { what: "orders out of range; the free run".into(), index: 0 };
+            let far = |_| Error::Diverged { what: "orders out of range; simulation".into(), index: 0 };
             system.check().map_err(far)?;
             let operators = Operators::new(&system, record)?;
             let mut forcing = self.initial_forcing(&operators, (&point.orders, &point.coefficients, values))?;
@@ -410,7 +410,7 @@ impl NonlinearModel {
             }
         }
         if columns.iter().flatten().any(|v| !v.is_finite()) {
-            return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+            return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
         }
         Ok(columns)
     }

@@ -108,8 +108,9 @@ impl NonlinearSystem {
                 structure.terms.iter().find(|t| above(t.order) && self.output_index(i, t.signal).is_none())
             {
                 let rubs = self.frictions.iter().any(|f| f.0 == i);
-                let name = if rubs { "order beside friction" } else { "order of what drives a body" };
-                return refuse(name, term.order, "below that of the body", "lower it");
+                let name =
+                    if rubs { "order of a term of a body with friction" } else { "order of a term that drives a body" };
+                return refuse(name, term.order, "below that of the body", "reduce it");
             }
         }
         check_regular(&self.equations)?;
@@ -120,10 +121,10 @@ impl NonlinearSystem {
             let above = |term: &&Term| term.signal >= self.recorded && term.order > limit - MIN_INTEGRATION_ORDER;
             if let Some(term) = structure.terms.iter().find(above) {
                 return Err(Error::OutOfRange {
-                    name: "order of a non-linear term beside friction".into(),
+                    name: "order of a nonlinear term in an equation with friction".into(),
                     value: term.order,
                     range: format!("below {limit}, the order of the equation minus 1"),
-                    remedy: "lower it, or leave the friction out".into(),
+                    remedy: "reduce the order, or remove the friction".into(),
                 });
             }
         }
@@ -154,10 +155,12 @@ impl NonlinearSystem {
             return Ok(());
         }
         Err(Error::Structure {
-            what: "bodies with friction hand each other so much of their accelerations that a force on one moves it \
+            what: "the coupled accelerations of bodies with friction are so large that a force on one moves it \
                    against the force"
                 .into(),
-            remedy: "make the coefficients of each other's accelerations smaller, as those of inertias are".into(),
+            remedy:
+                "reduce the coupling coefficients of the accelerations, so that the inertia matrix is positive definite"
+                    .into(),
         })
     }
 
@@ -222,5 +225,5 @@ impl NonlinearSystem {
 
 /// Error for nonlinear terms in combination with an option that excludes them.
 pub(crate) fn unsupported_with(what: &str, remedy: &str) -> Error {
-    Error::Structure { what: format!("non-linear terms beside {what}"), remedy: remedy.into() }
+    Error::Structure { what: format!("nonlinear terms in combination with {what}"), remedy: remedy.into() }
 }

@@ -60,7 +60,10 @@ impl Points {
         for &signal in std::iter::once(&output).chain(&signals) {
             if signal >= first.len() {
                 return Err(Error::Structure {
-                    what: format!("the equation names signal {signal}, but the record holds {}", first.len()),
+                    what: format!(
+                        "the equation contains signal {signal}, but the number of signals of the record is {}",
+                        first.len()
+                    ),
                     remedy: "give the record all signals of the equation".into(),
                 });
             }

@@ -98,7 +98,7 @@ impl OutputSimulation {
             let values = terms.iter().flatten().map(|term| term.1).collect();
             table.add(outputs, values, &relative_change);
             let long_samples = table.estimate(&owners.collect::<Vec<_>>(), options.tolerance, &relative_change);
-            let limit = long_samples.ok_or_else(|| Error::Internal { what: "no grid of a simulation".into() })?;
+            let limit = long_samples.ok_or_else(|| Error::Internal { what: "no grid for the simulation".into() })?;
             // A stiff equation may have no stable scheme on a coarse grid. One that has none on two in a row has none.
             failures = if finite || every == FIRST_REFINEMENT { 0 } else { failures + 1 };
             if last || failures == 2 || limit.change.iter().all(|c| *c <= options.tolerance) {

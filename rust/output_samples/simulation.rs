@@ -92,7 +92,10 @@ impl OutputSimulation {
         let own: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
         if own != recording.outputs() {
             let what = format!("equations of signals {own:?} for outputs {:?}", recording.outputs());
-            return Err(Error::Structure { what, remedy: "give one equation an output, in their sequence".into() });
+            return Err(Error::Structure {
+                what,
+                remedy: "give one equation per output, in the sequence of the outputs".into(),
+            });
         }
         Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
@@ -133,10 +136,13 @@ impl OutputSimulation {
         let own: Vec<usize> = equations.iter().map(|equation| equation.structure.output).collect();
         if own != recording.outputs() {
             let what = format!("equations of signals {own:?} for outputs {:?}", recording.outputs());
-            return Err(Error::Structure { what, remedy: "give one equation an output, in their sequence".into() });
+            return Err(Error::Structure {
+                what,
+                remedy: "give one equation per output, in the sequence of the outputs".into(),
+            });
         }
         if recording.is_all_filtered() {
-            let remedy = "the sensor filter does not commute with them: use coupling='simulated' and inputs before it";
+            let remedy = "the sensor filter does not commute with nonlinear terms: use coupling='simulated' and inputs before it";
             return Err(nonlinear::unsupported_with("inputs behind the sensor filter", remedy));
         }
         let simulation = Self { recording, equations, frictions, times, derived };
@@ -152,7 +158,7 @@ impl OutputSimulation {
             let is_improper = |t: &&Term| t.order >= structure.order - ORDER_TOLERANCE && driven(t.signal);
             if let Some(term) = structure.terms.iter().find(is_improper) {
                 return Err(Error::OutOfRange {
-                    name: "order of an input beside non-linear terms".into(),
+                    name: "order of an input in equations with nonlinear terms".into(),
                     value: term.order,
                     range: format!("below {}, that of the equation", structure.order),
                     remedy: "lower it".into(),

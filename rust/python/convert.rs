@@ -205,7 +205,7 @@ impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
         let mut items = Vec::new();
         for next in object.try_iter()? {
             if items.len() == length {
-                let what = format!("a sequence that tells of {length} items and hands over more");
+                let what = format!("a sequence with a stated length of {length} that has more items");
                 return Err(Error::Structure { what, remedy: "give a list".into() }.into());
             }
             items.push(item(next?)?);

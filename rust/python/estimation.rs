@@ -194,7 +194,7 @@ pub fn jumps_near(
     let (places, sizes) = (vector("times of jumps", places)?, vector("jumps", sizes)?);
     check_length("jumps", places.len(), sizes.len())?;
     if let Some(k) = places.windows(2).position(|pair| pair[0] > pair[1]) {
-        let what = format!("the times of jumps fall from index {k}");
+        let what = format!("the jump times decrease at index {k}");
         return Err(Error::Structure { what, remedy: "give them in ascending order".into() }.into());
     }
     Ok(readings.jumps(&places, &sizes))

@@ -157,7 +157,7 @@ impl Arm {
                         "motor {} does not turn its hub, so friction given as its current does not hold it",
                         k + 1
                     ),
-                    remedy: "give the hub a torque per ampere above 0, or no friction".into(),
+                    remedy: "give the hub a positive torque per ampere, or no friction".into(),
                 });
             }
         }
@@ -309,8 +309,8 @@ fn past_weights(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
 
 fn singular() -> Error {
     Error::Structure {
-        what: "the arm's equations do not tell its angles apart: their leading matrix is singular".into(),
-        remedy: "change an order, or an inertia that the stages share".into(),
+        what: "the equations of the arm cannot be solved for its angles: their leading matrix is singular".into(),
+        remedy: "change an order, or a coupling inertia of the links".into(),
     }
 }
 
@@ -333,7 +333,7 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
         crate::error::check_finite("coefficients of the arm", &equation.coefficients)?;
         check_length("coefficients", structure.terms.len(), equation.coefficients.len())?;
         if structure.output != row {
-            let what = format!("equation {row} of the arm is not that of its angle {row}");
+            let what = format!("equation {row} of the arm does not have angle {row} as output");
             return Err(Error::Structure { what, remedy: "give θ11, θ12, θ21, θ22 in this order".into() });
         }
         let alpha = structure.order;
@@ -344,13 +344,17 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
         let terms = structure.terms.iter().zip(&equation.coefficients).map(|(t, &c)| (t.signal, t.order, c));
         for (signal, order, c) in std::iter::once((row, alpha, -1.0)).chain(terms) {
             if signal >= SIGNAL_COUNT {
-                let what = format!("an equation of the arm names signal {signal}, but it has {SIGNAL_COUNT}");
+                let what =
+                    format!("an equation of the arm contains signal {signal}, but the arm has {SIGNAL_COUNT} signals");
                 return Err(Error::Structure { what, remedy: "number four angles and two currents from 0".into() });
             }
             if signal >= 4 {
                 if order.abs() > ORDER_GRAIN {
-                    let what = format!("an equation of the arm has its current differentiated by {order}");
-                    return Err(Error::Structure { what, remedy: "currents are held: take them as they are".into() });
+                    let what = format!("an equation of the arm contains a current with derivative order {order}");
+                    return Err(Error::Structure {
+                        what,
+                        remedy: "use order 0 for currents, which are held between samples".into(),
+                    });
                 }
                 input[row][signal - 4] += c;
                 continue;

@@ -259,7 +259,7 @@ impl SampleInterpolation {
         }
         check_finite("times of readings", &places)?;
         if let Some(&value) = places.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
-            let remedy = "leave out what was read before or after the inputs are known".into();
+            let remedy = "remove readings before or after the time span of the inputs".into();
             return Err(Error::OutOfRange {
                 name: "time of a reading".into(),
                 value,

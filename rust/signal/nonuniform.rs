@@ -171,7 +171,7 @@ pub(crate) fn check_times(times: &[f64]) -> Result<()> {
         None => Ok(()),
         Some(row) => Err(Error::Structure {
             what: format!("sample time {row} is {} s", times[row]),
-            remedy: "give times that ascend from 0".into(),
+            remedy: "give increasing sample times that start at 0".into(),
         }),
     }
 }

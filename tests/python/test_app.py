@@ -795,7 +795,7 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
         desk = page.desk
         await put_beside(desk, "a.csv", 1)
         models = [desk.start(LONG) for _ in range(desks.MAX_QUEUED_MODELS)]
-        with pytest.raises(DataError, match="8 models wait"):
+        with pytest.raises(DataError, match="8 models are already in the queue"):
             desk.start(LONG)
         await until(lambda: models[0].state == "running")
         assert [m.state for m in models] == ["running", *["waiting"] * 7]

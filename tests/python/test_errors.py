@@ -84,7 +84,7 @@ BAD = {
     # Lattices
     "lattice of zero": (
         MODEL,
-        "the lattice holds no candidate",
+        "the order grid has no candidate",
         lambda: search(order_grid=ftlm.order_grid(alpha=(0.5, 0.6), beta=[1.0, 2.0])),
     ),
     "lattice of 10^9": (

@@ -160,7 +160,7 @@ def test_a_state_space_carries_the_sensor_filter_and_refuses_what_it_is_not():
     for text, options, words in (
         ("D^1.5 y = -y + u", {}, r"order 1\.5 is not a whole number"),
         ("D^2 y = -D y + u - sign(D y)", {}, "has friction"),
-        ("D y = -y + u", {"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "the input u passes a sensor filter"),
+        ("D y = -y + u", {"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "the input u has a sensor filter"),
     ):
         with pytest.raises(ftlm.ModelError, match=words):
             model(text, **options).to_ss()
@@ -174,7 +174,7 @@ def test_a_transfer_function_carries_the_sensor_filter_and_refuses_what_it_is_no
     np.testing.assert_allclose(seen.to_tf()(1j * w), seen.frequency_response(w)[0, 0], rtol=1e-12)
     with pytest.raises(ftlm.ModelError, match=r"order 1\.5 is not a whole number .*to_control with band="):
         model("D^1.5 y = -y + u").to_tf()
-    with pytest.raises(ftlm.ModelError, match="the input u passes a sensor filter"):
+    with pytest.raises(ftlm.ModelError, match="the input u has a sensor filter"):
         model("D y = -y + u", sensor_filter=ftlm.SensorFilter.low_pass(["u"])).to_tf()
 
 

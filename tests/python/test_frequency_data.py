@@ -130,7 +130,7 @@ def test_two_outputs_that_hang_together_are_one_fit():
         assert low - (high - low) / 2 < value < high + (high - low) / 2, name
         assert found.standard_errors[name] < 0.05
     assert [e.rms < 1.5 for e in found.errors] == [True, True]
-    with pytest.raises(ftlm.DataError, match=r"no record is of y, which has an equation"):
+    with pytest.raises(ftlm.DataError, match=r"no record has the output y of an equation"):
         ftlm.identify_frequency(data[:1], words)
 
 
@@ -223,7 +223,7 @@ def test_a_second_record_decides_the_verdict():
     assert found.validate(arc(2)).verdict.level == "trust"
     assert found.validate(arc(1)).verdict.level == "with care"
     other = ftlm.FrequencyData.from_arrays(W, 1.2 * circuits_of_arc(), name="older")
-    assert "of the estimation data and 16.7 % of older" in found.validate(other).verdict.reason
+    assert "of the estimation data, but 16.7 % of older" in found.validate(other).verdict.reason
 
 
 def test_weights_are_what_they_are_called():
@@ -580,7 +580,7 @@ def test_data_are_never_changed():
             ftlm.DataError,
             r"cell has the output 'U', which is not an output of the equa",
         ),
-        ({"structure": "D U = a U + b I + d J"}, ftlm.DataError, r"no record is from J, an input of the equations"),
+        ({"structure": "D U = a U + b I + d J"}, ftlm.DataError, r"no record has the input J of the equations"),
         ({"orders": {"alpa": 1.0}}, ftlm.ModelError, r"alpa"),
         ({"fixed": {"q": 1.0}}, ftlm.ModelError, r"fixed coefficient 'q' does not occur"),
         ({"delay": {"u": 0.1}}, ftlm.ModelError, r"u"),

@@ -52,7 +52,7 @@ def truth_is_inside(found, width=4.0):
 @pytest.mark.parametrize("method", METHODS)
 def test_an_input_that_is_zero_identifies_nothing(method):
     still = run(np.zeros(ROWS))
-    with pytest.raises(ftlm.DataError, match=r"^u is 0 throughout, so its coefficient in the equation of y .* leave"):
+    with pytest.raises(ftlm.DataError, match=r"^u is 0 in all rows, so its coefficient in the equation of y .* remove"):
         identified(still, method)
     # Beside a run in which it moves it is a run like any other.
     assert identified([still, run(square())], method).coefficients["b0"] > 10

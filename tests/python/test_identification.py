@@ -557,7 +557,7 @@ def test_regressors_that_cannot_be_told_apart_are_refused(small_run):
     with pytest.raises(ftlm.ConvergenceError, match="regressor 3 of 4 is a combination of the others"):
         ftlm.identify(twice, words, method="least-squares")
     silent = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.zeros(513)}, outputs={"y": small_run["y"]})
-    with pytest.raises(ftlm.DataError, match="u is 0 throughout, so its coefficient in the equation of y cannot"):
+    with pytest.raises(ftlm.DataError, match="u is 0 in all rows, so its coefficient in the equation of y cannot"):
         ftlm.identify(silent, ftlm.equation(WORDS), method="least-squares")
 
 

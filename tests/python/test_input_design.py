@@ -492,7 +492,7 @@ def test_what_is_not_linear_or_says_nothing_is_refused(found: ftlm.Identificatio
     written = ftlm.Model(ftlm.equation("D y = -2 y + 1 u"))
     with pytest.raises(ftlm.ModelError, match=r"was not identified.*identify it with method='output-error'"):
         ftlm.design_input(written, duration=10, step=STEP, peak=1)
-    with pytest.raises(ftlm.ModelError, match="friction, and a design"):
+    with pytest.raises(ftlm.ModelError, match="friction, and a design of the next experiment"):
         ftlm.design_input(ftlm.Model(ftlm.equation("D^2 y = -2 y - 0.1 D y - 0.2 sign(D y) + 1 u")))
     with pytest.raises(ftlm.ModelError, match="saturation before it acts, which a design"):
         ftlm.design_input(ftlm.Model(ftlm.equation("D y = -2 y + 1 u").with_limits(saturation={"u": 0.5})))

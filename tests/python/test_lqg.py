@@ -279,7 +279,7 @@ REFUSED = [
     ({"measured": ["hub", "hub"]}, "is not a list of outputs, each once"),
     ({"measured": [["hub"], "bend"]}, r"measured = \['hub'\] is not one of the outputs"),
     ({"measured": ["h" * 9999]}, "measured = 'h{59}… is not one of the outputs"),
-    ({"noise": {("hub",): 1e-4}}, r"noise of \('hub',\) is of nothing"),
+    ({"noise": {("hub",): 1e-4}}, r"noise of \('hub',\) does not belong to a measured output"),
     ({"noise": {"hub": 1e308, "bend": 1e-4}}, "noise of hub = 1e.308 is outside"),
     ({"noise": {"hub": 1e30, "bend": 1e-4}}, "no observer from hub, bend .*; measure more, or narrow the band"),
     ({"max_deviation": {"hub": 5e-324}}, "= 5e-324 is outside"),

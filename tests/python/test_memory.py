@@ -19,7 +19,7 @@ from ftlm.utils.resources import (
     memory_limit,
 )
 
-REFUSED = re.compile(r"(\d+) regressors of all runs.* need (\d+) bytes, more than the (\d+) that may be taken")
+REFUSED = re.compile(r"(\d+) regressors of all runs.* need (\d+) bytes, more than the limit of (\d+)")
 
 
 def machine(folder, **files):

@@ -94,14 +94,14 @@ def one_lag(delay=0.0):
         (lambda: ftlm.transfer_function([1], [0, 0]), "den has no coefficient"),
         (lambda: ftlm.transfer_function([1], [1, float("nan")]), r"den\[1\] is nan"),
         (lambda: ftlm.transfer_function([(1, 2, 3)], [1, 1]), r"num\[0\] is \(1, 2, 3\)"),
-        (lambda: one_lag(0.1).inverse(), "0.1 s before it acts"),
+        (lambda: one_lag(0.1).inverse(), "0.1 s in advance"),
         (lambda: one_lag().inverse(), "numerator is of order 1"),
         (lambda: one_lag(0.1).feedback(), "delay of 0.1 s"),
         (lambda: one_lag().feedback(sign=2), "sign"),
         (lambda: one_lag(0.1).parallel(one_lag()), "the delays are 0.1 s and 0 s"),
         (
             lambda: one_lag().series(ftlm.Model(ftlm.equation("D y = -1 y + 1 u + 1 v"))),
-            "one output and one input; this one has y from u, v",
+            "one output and one input; this model has y from u, v",
         ),
     ],
 )

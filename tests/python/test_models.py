@@ -251,12 +251,12 @@ def test_what_is_no_text_is_refused(text):
         ("D^1.5 y = a D^-0.1 y", "own-output order -0.1 of y is outside [0, 1.5)"),
         ("D^1.5 y = a D^10.5 u", "order 10.5 of u is above 10"),
         ("D^1.5 y = a D^-3.5 u", "order -3.5 of u is below -3"),
-        ("D^1.5 y = a y + a u", "coefficient a stands twice in the equation of y"),
-        ("D y = a y; D z = a z", "coefficient a stands in two equations"),
+        ("D^1.5 y = a y + a u", "coefficient a occurs twice in the equation of y"),
+        ("D y = a y; D z = a z", "coefficient a occurs in two equations"),
         ("D y = a u; D^2 y = b u", "two equations have the output y"),
         ("D^a y = a u", "a names an order and a coefficient"),
-        ("D y = 0 a u", "factor 0 of a u in the equation of y leaves nothing to estimate"),
-        ("D y = 1e400 a u", "factor inf of a u in the equation of y leaves nothing to estimate"),
+        ("D y = 0 a u", "factor 0 of a u in the equation of y makes the coefficient meaningless"),
+        ("D y = 1e400 a u", "factor inf of a u in the equation of y makes the coefficient meaningless"),
         ("D y = 1e400 u", "coefficient of u in the equation of y is inf, which is not finite"),
     ],
 )
@@ -353,8 +353,8 @@ def test_values_of_an_order(spec, values):
         ("2:1:0.1", "interval 2:1 is empty"),
         ("1:11:0.1", "= 11 is outside [-3, 10]"),
         ("0:3:1e-7", "has 3e+07 values, more than 1000000"),
-        ("1:1.000000002:5e-10", "increment 5e-10 is below 1e-09, to which orders are kept; raise the increment"),
-        ("0:3:1e-300", "increment 1e-300 is below 1e-09, to which orders are kept; raise the increment"),
+        ("1:1.000000002:5e-10", "increment 5e-10 is below 1e-09, the resolution of orders; raise the increment"),
+        ("0:3:1e-300", "increment 1e-300 is below 1e-09, the resolution of orders; raise the increment"),
         (
             [0.5, 0.7, 0.7000000001],
             "values 0.7 and 0.7000000001 are one order: orders are kept to 1e-09; leave one out",
@@ -665,7 +665,7 @@ def test_whether_a_file_may_be_written_is_said_in_the_words_of_who_asks(tmp_path
         for check in (check_new, check_free):
             with pytest.raises(ftlm.DataError, match=f"^{re.escape(text)}$"):
                 check(path, force=False, words=words)
-    with pytest.raises(ftlm.DataError, match=f"^{re.escape(missing.format(new))}; make it first$"):
+    with pytest.raises(ftlm.DataError, match=f"^{re.escape(missing.format(new))}; create it first$"):
         check_free(None, new / "file", force=False, words=words)
     check_free(there, new, None, force=True, words=words)
     assert check_new(new / "file", force=False, words=words) == new / "file"
@@ -777,7 +777,7 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
         "later schema": later,
         "later schema with what is in it": later,
         "later schema, and who wrote it": f"is a model of a later version of ftlm, 'ftlm 7.1': it has schema {10**30}",
-        "schema of more than it holds": "says that it has schema 3, and what it holds has schema 2; give a file",
+        "schema of more than it holds": "states schema 3, but its content needs schema 2; give a file",
         "unknown key": "is not an ftlm model: Object contains unknown field `extra`",
     }
     assert expected.get(kind, "") in message

@@ -724,7 +724,7 @@ TOO_MANY = "candidates, more than the limit of"
 @pytest.mark.parametrize(
     ("text", "order_grid", "message"),
     [
-        (EQUATION, {"orders": {"alpha": [0.5], "beta": [1.0]}}, "the lattice holds no candidate"),
+        (EQUATION, {"orders": {"alpha": [0.5], "beta": [1.0]}}, "the order grid has no candidate"),
         (EQUATION, {"orders": {"alpha": [0.0]}}, "order alpha = 0 is outside (0, 10]; move the interval of alpha"),
         ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"increment": 0.002}, TOO_MANY),
         # Refused from the lengths of the axes: to go through them would take minutes.
@@ -732,9 +732,9 @@ TOO_MANY = "candidates, more than the limit of"
         (
             EQUATION,
             {"increment": 1e-4},
-            ": up to 11.7 years of one core at 10 ns each, as fast as searches are at best;",
+            "at 10 ns per candidate, the best case, a search takes 11.7 years on one core;",
         ),
-        ("D^alpha y = a D^(alpha+0.1) y + b u", {}, "the lattice holds no candidate"),
+        ("D^alpha y = a D^(alpha+0.1) y + b u", {}, "the order grid has no candidate"),
         ("D^alpha y = a D^(alpha-beta) y + b D^mu u + c D^nu u", {"increment": 0.002}, TOO_MANY),
         ("D^1.5 y = a y + b u", {}, "every order is a number, so there is nothing to search"),
         ("D^alpha y = a y + b u; D^beta z = c z", {}, "one by one: pass .equation('y') or use identify"),

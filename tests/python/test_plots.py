@@ -151,7 +151,7 @@ def test_a_fit_has_its_inputs_where_they_are_asked_for(joint, small_run):
     figure = saved(ftlm.plot.fit(joint, inputs=True))
     assert [a.get_ylabel() for a in figure.axes] == ["y [rad]", "residual", "u [A]"]
     assert len(ftlm.plot.fit(joint.model, [small_run, small_run], inputs=True).axes) == 6
-    with pytest.raises(ftlm.errors.ModelError, match="inputs=True needs the runs"):
+    with pytest.raises(ftlm.errors.ModelError, match="inputs=True needs runs"):
         ftlm.plot.fit(joint.comparison, inputs=True)
 
 
@@ -222,7 +222,7 @@ def test_every_picture_draws_into_axes_that_are_given(joint, small_run):
         assert all(a.has_data() for a in np.atleast_1d(axes))
         with pytest.raises(ftlm.errors.ModelError, match=rf"this figure has {count} axes .* ax has {count + 1}"):
             draw(Figure().subplots(1, count + 1))
-        with pytest.raises(ftlm.errors.ModelError, match="ax holds str, which is no matplotlib axes"):
+        with pytest.raises(ftlm.errors.ModelError, match="ax contains an object of type str, not matplotlib axes"):
             draw("axes")
 
 

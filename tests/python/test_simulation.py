@@ -228,7 +228,7 @@ def test_an_unstable_model_says_when_it_leaves_the_range_of_numbers():
 
 def test_a_response_that_does_not_stand_still_says_so():
     with pytest.raises(
-        ftlm.ConvergenceError, match=r"still moves by more than 1e-12 of its size at 2400 pulses; raise"
+        ftlm.ConvergenceError, match=r"still changes by more than 1e-12 of its size at 2400 pulses; raise"
     ):
         model("D^0.5 y = -3 y + u").simulate(zeros_run(), tolerance=1e-12, max_m=3000)
 

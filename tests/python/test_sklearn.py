@@ -142,11 +142,11 @@ def test_a_gap_in_the_index_of_a_frame_is_refused(frames):
     X, y = frames[0][["u"]], frames[1]["z"]
     going = FractionalRegressor("D z = d z + e u", step=STEP, continues=True, method="least-squares")
     assert np.all(cross_val_score(going, X, y, cv=TimeSeriesSplit(3), error_score="raise") > 0.99)
-    with pytest.raises(ftlm.DataError, match="does not go on by one step between the fitted rows and those of X"):
+    with pytest.raises(ftlm.DataError, match="does not increase by one step between the fitted rows and those of X"):
         cross_val_score(going, X, y, cv=TimeSeriesSplit(3, gap=20), error_score="raise")
-    with pytest.raises(ftlm.DataError, match="after row 133 of X, 1 such places in all, and rows are instants"):
+    with pytest.raises(ftlm.DataError, match=r"after row 133 of X \(1 such gaps in all\)"):
         going.fit(X.drop(range(134, 267)), y.drop(range(134, 267)))
-    with pytest.raises(ftlm.DataError, match="leave out no row in between"):
+    with pytest.raises(ftlm.DataError, match="give consecutive rows"):
         cross_val_score(going, X, y, cv=KFold(3, shuffle=True), error_score="raise")
     dated = X.set_axis(pd.date_range("2024-01-01", periods=len(X), freq="50ms"))
     going.fit(dated[:200], y[:200])

@@ -226,7 +226,7 @@ def test_words_are_read_and_written() -> None:
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/-1)^2)*sign(D y)", "a speed"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)", "'vs' at character 41 divides inside a non-linear term"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/0)^2)*sign(D y)", "vs = 0; give a positive one"),
-        ("D^2 y = u - fc*sign(D y) - fc*exp(-(D y/vs)^2)*sign(D y)", "fc stands twice"),
+        ("D^2 y = u - fc*sign(D y) - fc*exp(-(D y/vs)^2)*sign(D y)", "fc occurs twice"),
         ("D^0.8 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)", r"outside \(1, 2\]"),
     ],
 )
@@ -277,7 +277,7 @@ def test_a_file_keeps_it(tmp_path) -> None:
     with pytest.raises(DataError, match="give a positive one"):
         ftlm.load_model(path)
     path.write_text(text.replace('"schema": 7', '"schema": 8'))
-    with pytest.raises(DataError, match="what it holds has schema 7"):
+    with pytest.raises(DataError, match="its content needs schema 7"):
         ftlm.load_model(path)
 
 

@@ -47,7 +47,7 @@ fn orders_that_make_no_equation_are_named() {
     for missing in [structure(3, 2.0, &[]), structure(0, 2.0, &[(3, 0.0)])] {
         match checked(&missing) {
             Err(error @ Error::Structure { .. }) => {
-                assert!(error.to_string().starts_with("the equation names signal 3, but the record holds 3"));
+                assert!(error.to_string().starts_with("the equation contains signal 3, but the record has 3 signals"));
             }
             other => panic!("{other:?}"),
         }

@@ -100,7 +100,7 @@ class LiveOptions:
         if self.live is None:
             useless = [parameter(name) for name in given_fields(self)]
             if useless:
-                raise ModelError(f"{', '.join(useless)}: only valid with --live; leave out, or give --live")
+                raise ModelError(f"{', '.join(useless)}: only valid with --live; remove the option, or add --live")
             return None
         free = numbers("--orders", self.orders)
         if self.live.startswith("flexible-link:"):

@@ -79,7 +79,9 @@ def axes_for(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any,
     axes_given = np.atleast_1d(as_array("ax", ax)).ravel().astype(object)
     strange = [type(a).__name__ for a in axes_given if not hasattr(a, "plot") or not hasattr(a, "figure")]
     if strange:
-        raise ModelError(f"ax holds {strange[0]}, which are not matplotlib axes; give the axes that subplots returns")
+        raise ModelError(
+            f"ax contains an object of type {strange[0]}, not matplotlib axes; give the axes that subplots returns"
+        )
     if axes_given.size != rows * columns:
         raise ModelError(
             f"this figure has {rows * columns} axes ({rows} by {columns}), and ax has {axes_given.size}; give as many, "

@@ -345,7 +345,6 @@ def _describe_controller(controller: Controller) -> dict[str, Any]:
     if size > MAX_CONTROLLER_JSON_CHARACTERS:
         raise ModelError(
             f"what to_dict() of the controller returns is {size} characters long, more than the "
-            f"{MAX_CONTROLLER_JSON_CHARACTERS} that a run says "
-            "of its controller; leave out what no reader needs"
+            f"{MAX_CONTROLLER_JSON_CHARACTERS} that the metadata of a run may contain; shorten it"
         )
     return description

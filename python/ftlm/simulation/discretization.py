@@ -273,8 +273,9 @@ def check_derivative_orders(run: Run, structure: Structure, order_values: Mappin
             if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
                 raise ModelError(
                     f"order {order.constant:g} of {term.signal} is above alpha = {alpha.constant:g} of "
-                    f"{item.output}, and run {run.name!r} holds {term.signal} between its samples: its jumps have no "
-                    f"derivative; lower the order, or say {parameter('intersample', 'foh')} if it moves in between"
+                    f"{item.output}, and {term.signal} of run {run.name!r} has a zero-order hold, whose jumps have "
+                    f"no derivative; reduce the order, or set {parameter('intersample', 'foh')} if the signal is "
+                    "linear between samples"
                 )
             _check_excess_order(term.signal, order.constant, item.output, alpha.constant)
 
@@ -416,7 +417,7 @@ def check_frictionless(equations: Sequence[Equation], what: str) -> None:
         if item.friction is not None:
             raise ModelError(
                 f"the equation of {item.output} has friction, and {what} needs a linear model; use "
-                f"{parameter('method', 'output-error')} and simulations (simulate, compare), or leave the friction out"
+                f"{parameter('method', 'output-error')} and simulations (simulate, compare), or remove the friction"
             )
 
 
@@ -526,7 +527,7 @@ def prepare(
             if term.fixed is None and term.column != item.output and not any(r.of(term.column).any() for r in prepared):
                 raise DataError(
                     f"{term.column} is 0 in all rows, so its coefficient in the equation of {item.output} cannot be "
-                    "identified; leave the term out, fix its coefficient, or add a run in which it moves"
+                    "identified; remove the term, fix its coefficient, or add a run in which the signal is not 0"
                 )
             if structure.offset in ("constant", "ramp") and _is_offset(term, item, prepared):
                 raise DataError(

@@ -228,16 +228,16 @@ class Structure:
         words = f"the equation of {rubbing[0]} has friction"
         if len(self.equations) > 1 and self.coupling == "measured":
             raise ModelError(
-                f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
-                f"measured signals they share no free run, so give that of {rubbing[0]} a structure of its own, or "
-                f"follow them together with {parameter('coupling', 'simulated')}"
+                f"{words}, but the structure has {len(self.equations)} equations with measured coupling, which are "
+                f"not simulated together; give the equation of {rubbing[0]} a structure of its own, or "
+                f"use {parameter('coupling', 'simulated')}"
             )
         if self.all_filtered:
             through = [s for s in self.signals if s not in self.outputs and self.is_filtered(s)]
             raise ModelError(
-                f"{words}, and {' and '.join(through)}, which drives it, passed the sensor filter: what sticks does so "
-                "before the filter, and what was filtered is not given back; let it follow from an equation of its "
-                f"own with {parameter('coupling', 'simulated')}, or leave it out of the filter"
+                f"{words}, and {' and '.join(through)}, which drives it, passed the sensor filter: friction acts "
+                "before the filter, and the unfiltered input is not known; add an equation with this signal as output "
+                f"and use {parameter('coupling', 'simulated')}, or exclude it from the filter"
             )
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
         names = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]

@@ -134,7 +134,9 @@ pub fn fit(
     }
     let best = ends.into_iter().map(|(_, ended)| ended).min_by(|a, b| a.error.total_cmp(&b.error));
     let Some(mut ended) = best else {
-        return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
+        return Err(
+            failure.unwrap_or_else(|| Error::Diverged { what: "simulation of every initial guess".into(), index: 0 })
+        );
     };
     if let Some(candidate) = together {
         ended = RefinementResult {

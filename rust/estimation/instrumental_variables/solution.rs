@@ -44,11 +44,11 @@ impl InstrumentalSettings {
         if self.iterations > MAX_ITERATIONS {
             #[allow(clippy::cast_precision_loss)]
             let steps = self.iterations as f64;
-            let remedy = "what has not stood still by then goes round";
+            let remedy = "use fewer steps; estimates that have not converged by then oscillate";
             return refuse("steps of instrumental variables", steps, &format!("[0, {MAX_ITERATIONS}]"), remedy);
         }
         if !(self.tolerance >= 0.0 && self.tolerance.is_finite()) {
-            let remedy = "give the relative change at which the steps end";
+            let remedy = "give the relative change at which the iterations stop";
             return refuse("tolerance of instrumental variables", self.tolerance, "[0, ∞)", remedy);
         }
         Ok(())

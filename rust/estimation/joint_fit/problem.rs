@@ -47,7 +47,7 @@ impl Problem {
         }
         for (place, law) in &frictions {
             if *place >= model.equations.len() || [&law.coulomb, &law.stribeck, &law.speed].into_iter().any(missing) {
-                let what = format!("friction of equation {place} names what is not there");
+                let what = format!("friction of equation {place} refers to an equation or signal that does not exist");
                 return refuse(what, "number equations and coefficients from 0");
             }
         }

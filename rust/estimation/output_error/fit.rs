@@ -136,7 +136,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         match evaluation {
             Simulation::Exact(evaluation) => match &self.exact {
                 Some(exact) => exact.jacobian(self.model, self.experiments, &self.linear, evaluation),
-                None => Err(Error::Internal { what: "exact samples of orders that are no integers".into() }),
+                None => Err(Error::Internal { what: "exact samples of a model with non-integer orders".into() }),
             },
             Simulation::Sampled(evaluation) => match &self.sampled {
                 Some(sampled) => sampled.jacobian(self.model, self.experiments, &self.linear, evaluation),
@@ -387,7 +387,7 @@ fn check_start(model: &FreeModel, start: &ParameterPoint) -> Result<()> {
                 name: format!("start of coefficient {i}"),
                 value: c,
                 range: "its coordinate".into(),
-                remedy: "start a logarithmic coefficient away from 0, a ratio above 1".into(),
+                remedy: "start a coefficient with logarithmic coordinate away from 0, and a ratio above 1".into(),
             });
         }
     }

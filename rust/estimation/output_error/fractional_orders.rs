@@ -74,7 +74,7 @@ impl Terms {
             let own = model.output_index(i, term.signal).is_some();
             if eta < if own { MIN_INTEGRATION_ORDER } else { 0.0 } {
                 // This is reported as divergence, so that the optimization shortens its step.
-                return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
+                return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
             }
             let position = terms.etas.iter().position(|e| e.to_bits() == eta.to_bits());
             terms.places.push(position.unwrap_or(terms.etas.len()));
@@ -308,7 +308,7 @@ impl FractionalOrders {
             for (mut column, out) in columns.into_iter().zip(&mut jacobian) {
                 project_out(&at.parts[index].basis, &mut column);
                 if column.iter().any(|v| !v.is_finite()) {
-                    return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+                    return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
                 }
                 // Residuals are measured minus simulated samples.
                 out.extend(column.iter().map(|v| -v));

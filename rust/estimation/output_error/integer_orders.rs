@@ -479,7 +479,7 @@ impl IntegerOrders {
             let responses = (0..self.equations.len())
                 .map(|i| simulation.autoregressive_states(self, model, experiment, (i, point), &at.initial[run]))
                 .collect::<Option<Vec<_>>>()
-                .ok_or_else(|| Error::Diverged { what: "sensitivity of the free run".into(), index: 0 })?;
+                .ok_or_else(|| Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 })?;
             for (parameter, out) in jacobian.iter_mut().enumerate() {
                 let mut column = match parameter.checked_sub(orders) {
                     // No order is free.
@@ -503,7 +503,7 @@ impl IntegerOrders {
                 };
                 project_out(&simulation.basis, &mut column);
                 if column.iter().any(|v| !v.is_finite()) {
-                    return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+                    return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
                 }
                 // Residuals are measured minus simulated samples.
                 out.extend(column.iter().map(|v| -v));
@@ -724,7 +724,7 @@ impl ExactSimulation<'_> {
                 let (states, values) = simulation
                     .companion
                     .respond(Some(&slope), None, grid)
-                    .ok_or_else(|| Error::Diverged { what: "sensitivity of the free run".into(), index: 0 })?;
+                    .ok_or_else(|| Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 })?;
                 let (read, direct) = self.input_output(orders, (i, q), of, 0);
                 Source { kind: SourceKind::Impulse, input: None, states, values }.add_output(&read, direct, own);
             }

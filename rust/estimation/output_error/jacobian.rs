@@ -31,7 +31,7 @@ impl FreeModel {
             self.sensitivities(experiment, shelf, part, point, &at.initial[index], linear, &mut jacobian)?;
         }
         if jacobian.iter().flatten().any(|v| !v.is_finite()) {
-            return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+            return Err(Error::Diverged { what: "sensitivity of the simulation".into(), index: 0 });
         }
         Ok(jacobian)
     }

@@ -163,7 +163,7 @@ impl FreeModel {
                 *signal >= signals + derived || c.powers.iter().any(|&(i, _)| i >= coefficients)
             };
             if equation.output >= signals || equation.terms.iter().any(missing) {
-                let what = "an equation names a signal or a coefficient that is not there".to_owned();
+                let what = "an equation contains a signal or a coefficient that does not exist".to_owned();
                 return refuse(what, "number them from 0");
             }
             for order in equation.terms.iter().map(|term| &term.1).chain([&equation.order]) {
@@ -172,7 +172,7 @@ impl FreeModel {
         }
         for (k, &FreeInput { signal, law, bounds: (low, high) }) in self.inputs.iter().enumerate() {
             if signal >= signals || self.equations.iter().any(|e| e.output == signal) {
-                let what = format!("signal {signal} has a free delay or limit and is no input");
+                let what = format!("signal {signal} has a free delay or limit but is not an input");
                 return refuse(what, "delay and limit inputs only");
             }
             if self.law_of(signal) != Some(k) {
@@ -196,8 +196,8 @@ impl FreeModel {
         experiment.check()?;
         check_length("outputs", self.equations.len(), experiment.samples.len())?;
         if experiment.nonuniform.is_some() && !self.inputs.is_empty() {
-            let what = "a free delay or limit with samples at times of their own".into();
-            return Err(Error::Structure { what, remedy: "give its value, or samples at regular times".into() });
+            let what = "a free delay or limit with samples at nonuniform times".into();
+            return Err(Error::Structure { what, remedy: "fix its value, or resample the signal uniformly".into() });
         }
         Ok(())
     }
@@ -340,7 +340,7 @@ impl InputLaw {
                 name: "number of an input".into(),
                 value,
                 range: "[0, ∞)".into(),
-                remedy: "an input acts after it is given, and alike on both sides of 0".into(),
+                remedy: "give a delay of at least 0, and symmetric limits of at least 0".into(),
             });
         }
         let excess = |v: f64| if v.abs() > value { v.signum() } else { 0.0 };

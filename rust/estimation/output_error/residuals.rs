@@ -193,7 +193,7 @@ impl FreeModel {
                 };
                 if eta < least {
                     // This is reported as divergence, so that the optimization shortens its step.
-                    return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
+                    return Err(Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 });
                 }
                 row.push(shelf.operator((i, k), eta, self.depends_on_free_order(i, k)));
             }

@@ -219,7 +219,7 @@ impl<'a> BatchEvaluator<'a> {
             part: Part::default(),
         });
         if !(first <= from.place.batch && from.place.batch <= last && last <= all) {
-            let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.batch);
+            let what = format!("batches {first} to {last} from {} on are not among {all}", from.place.batch);
             return Err(mismatch_error(what));
         }
         if !from.place.is_valid() {

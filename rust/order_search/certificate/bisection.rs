@@ -101,7 +101,7 @@ pub fn certify(
             name: "within".into(),
             value: options.tolerance,
             range: "(0, 1)".into(),
-            remedy: "0.05 asks for a proof that nothing is better by more than 5 %".into(),
+            remedy: "a tolerance of 0.05 requires a proof that no orders reduce the error by more than 5 %".into(),
         });
     }
     if !(options.max_coefficient >= 1.0 && options.max_coefficient <= 1e9) {
@@ -304,7 +304,7 @@ impl CellBisection<'_> {
                         "these intervals hold up to {all} cells of orders, but {} are allowed",
                         self.options.max_cells
                     ),
-                    remedy: "narrow them, or allow more cells".into(),
+                    remedy: "narrow the intervals of the orders, or allow more cells".into(),
                 });
             }
             let mut next = Vec::new();

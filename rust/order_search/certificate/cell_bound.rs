@@ -231,7 +231,7 @@ pub fn cell_bounds(
                 name: "half width".into(),
                 value: half,
                 range: format!("[0, {middle}], the middle of the orders"),
-                remedy: "orders of integration are not negative".into(),
+                remedy: "give nonnegative orders of integration".into(),
             });
         }
     }
@@ -287,7 +287,10 @@ pub(super) fn check_records(records: &[Record], output: usize, signals: impl Ite
     let signals: Vec<usize> = signals.collect();
     if let Some(signal) = signals.iter().chain([&output]).find(|s| **s >= first.len()) {
         return Err(Error::Structure {
-            what: format!("the equation names signal {signal}, but the record holds {}", first.len()),
+            what: format!(
+                "the equation contains signal {signal}, but the number of signals of the record is {}",
+                first.len()
+            ),
             remedy: "give the record all signals of the equation".into(),
         });
     }
@@ -300,8 +303,8 @@ pub(super) fn check_records(records: &[Record], output: usize, signals: impl Ite
     }
     if !(1..=MAX_TERMS).contains(&signals.len()) {
         return Err(Error::Structure {
-            what: format!("an equation of {} terms", signals.len()),
-            remedy: format!("certificates are of 1 to {MAX_TERMS} terms"),
+            what: format!("the equation has {} terms", signals.len()),
+            remedy: format!("give an equation with 1 to {MAX_TERMS} terms"),
         });
     }
     Ok(())

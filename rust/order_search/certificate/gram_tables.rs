@@ -332,7 +332,7 @@ impl Region {
             name: name.into(),
             value,
             range: range.into(),
-            remedy: "give intervals from low to high".into(),
+            remedy: "give intervals whose lower end is not above the upper end".into(),
         };
         let (low, high) = self.alpha;
         if !(0.0 < low && low <= high && high <= 10.0) {

@@ -173,7 +173,9 @@ impl RegressorExpansion {
         if !(size > 0.0 && size < f64::MAX && lambda.is_finite()) {
             return Err(Error::Structure {
                 what: format!("the integral of order {eta} of signal {signal} has the size {size}"),
-                remedy: "leave out a signal that is zero all along, and scale one whose squares are no numbers".into(),
+                remedy:
+                    "remove a signal that is zero throughout, and scale a signal whose squares overflow or underflow"
+                        .into(),
             });
         }
         let inverse = 1.0 / size;

@@ -116,7 +116,7 @@ impl OrderGrid {
             .collect();
         if let Some(group) = axes.iter().position(|group| group.len() > MAX_TERMS) {
             let what = format!("signal {} has {} terms, more than {MAX_TERMS}", signals[group], axes[group].len());
-            return Err(Error::Structure { what, remedy: "leave terms out".into() });
+            return Err(Error::Structure { what, remedy: "remove terms".into() });
         }
         check_size(&axes, &firsts)?;
         let groups: Vec<Group> = signals

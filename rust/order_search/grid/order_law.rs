@@ -55,7 +55,7 @@ impl OrderLawGrid {
             check_finite(&format!("values of free order {axis}"), values)?;
         }
         if equations.is_empty() {
-            let what = "a stage without an equation has nothing to search".into();
+            let what = "a stage without equations cannot be searched".into();
             return Err(Error::Structure { what, remedy: "give at least one equation".into() });
         }
         equations.iter().try_for_each(|equation| equation.check(axes.len(), inputs.len()))?;
@@ -196,7 +196,7 @@ impl LawEquation {
             if law.weights.len() > free {
                 return Err(Error::Structure {
                     what: format!("an order law weighs {} free orders, but there are {free}", law.weights.len()),
-                    remedy: "give every free order its values".into(),
+                    remedy: "give values for every free order".into(),
                 });
             }
         }

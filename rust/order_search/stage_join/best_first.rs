@@ -127,7 +127,7 @@ impl<'a> Stage<'a> {
                 name: format!("scale of equation {e}"),
                 value: scales[e],
                 range: "(0, ∞)".into(),
-                remedy: "divide its score by the size of its output".into(),
+                remedy: "divide its score by a positive scale of its output".into(),
             });
         }
         options.check()?;
@@ -236,8 +236,11 @@ impl<'a> Stage<'a> {
     /// Candidates that are not evaluated yet, or an internal fault.
     pub fn outcome(&self, course: &SearchState, control: &Control) -> Result<StageOutcome> {
         if !course.pending_spans.is_empty() {
-            let what = "a search that has candidates left to follow has no result".into();
-            return Err(Error::Structure { what, remedy: "follow them, and take in what they come to".into() });
+            let what = "the search has no result yet, because candidates are still to be evaluated".into();
+            return Err(Error::Structure {
+                what,
+                remedy: "evaluate the pending candidates, and add their verdicts".into(),
+            });
         }
         course.check(self)?;
         let (mut counts, failures) = course.join.count_outcomes(&course.states());

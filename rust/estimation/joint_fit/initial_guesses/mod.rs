@@ -160,7 +160,7 @@ impl<'a> OrderGrids<'a> {
                     "order {order} of {signal} is above alpha = {alpha} of {output}, and the runs hold {signal} between \
                      their samples: its jumps have no derivative"
                 );
-                let remedy = "lower the order, or say intersample='foh' if it moves in between".into();
+                let remedy = "reduce the order, or set intersample='foh' if the input is linear between samples".into();
                 return Err(Error::Structure { what, remedy });
             }
         }

@@ -194,7 +194,7 @@ pub(super) fn check_linear(structure: &ParametricStructure, item: &ParametricEqu
     let output = &structure.signals[item.output];
     Err(Error::Structure {
         what: format!("the equation of {output} has friction, which {what} does not know"),
-        remedy: "use free runs, or leave the friction out".into(),
+        remedy: "rank by the output error, or remove the friction".into(),
     })
 }
 
@@ -287,8 +287,11 @@ pub(super) fn law_candidates(
                 continue;
             }
             if let Some(missing_name) = values_by_name.keys().find(|name| !named.contains(name)) {
-                let what = format!("no free coefficient {missing_name}");
-                return Err(Error::Structure { what, remedy: "name one of the equations'".into() });
+                let what = format!("coefficient {missing_name} is not a free coefficient");
+                return Err(Error::Structure {
+                    what,
+                    remedy: "use the name of a free coefficient of the equations".into(),
+                });
             }
             for rest in coarse.best_rows(&structure.with_coefficients(&values_by_name), &point, 1)? {
                 let value_of =

@@ -125,7 +125,7 @@ fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<
                 "{output} never moves beyond its noise in {names}, and a body that only rests tells nothing but that \
                  its friction is not exceeded"
             );
-            return Err(Error::Recording { what, remedy: "add a run in which it slides".into() });
+            return Err(Error::Recording { what, remedy: "add a run in which the body slides".into() });
         }
     }
     Ok(())

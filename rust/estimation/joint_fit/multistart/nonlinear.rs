@@ -141,7 +141,7 @@ fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterS
 fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, half_width: usize) -> Result<Recordings> {
     let of = |run: &Recording| {
         if run.has_nonuniform_samples() {
-            return Err(unsupported_with("samples at times of their own", "resample the runs"));
+            return Err(unsupported_with("samples at nonuniform times", "resample the runs"));
         }
         let mut channels = run.channels().to_vec();
         for (derived, name) in structure.derived.iter().zip(&structure.signals[structure.recorded_count()..]) {
