@@ -22,7 +22,9 @@ from ftlm.plot.comparison_charts import compared_bars, error_chart, residual_cha
 from ftlm.plot.model_charts import bode_charts, pole_charts
 from ftlm.report.html_report import settings_table
 from ftlm.report.typesetting import equation_html, parameter_table
-from ftlm.reproduction.demo import PaperRow, paper_row, paper_table, paper_table_text
+from ftlm.reproduction.demo import PAPER_TABLE_WIDTHS, paper_table
+from ftlm.reproduction.report import letters_of, table_text
+from ftlm.reproduction.stage import Candidate
 from ftlm.svg import figure as axes
 from ftlm.svg.charts import BarChart, CorrelationMap, PlaneChart, histogram
 from ftlm.svg.figure import LINE_HEIGHT_PX
@@ -442,23 +444,22 @@ def test_parameters_stand_beside_the_stated_ones(identified):
     assert [row[1] for row in plain.rows] == [-1, 2]
 
 
-def paper_rows(identified):
-    integer = ftlm.link_model(form="published")
+def paper_models(identified):
+    comparison = identified.comparison
     infinite = ftlm.Metrics(math.inf, math.inf, math.inf, -math.inf)
-    rows = []
-    for output in ("theta11", "theta12"):
-        rows.append(paper_row("integer-order model of the maker", integer, identified.comparison, output))
-        rows += [paper_row(f"p = {p}", identified.model, identified.comparison, output) for p in (1, 3, 5, 7)]
-    rows.append(PaperRow("diverged", "theta12", {"alpha": 2.0}, {"a": -1.23456e-5, "g": 1.0}, None, infinite))
-    return rows
+    diverged = replace(comparison, output_error=dict.fromkeys(comparison.output_error, infinite))
+    models = {"integer-order model of the maker": (ftlm.link_model(form="published"), comparison)}
+    models |= {f"p = {p}": (identified.model, comparison) for p in (1, 3, 5, 7)}
+    models["diverged"] = (identified.model, diverged)
+    return {label: Candidate(label, model, errors, None, {}) for label, (model, errors) in models.items()}
 
 
 def test_paper_table_has_the_papers_columns(identified):
-    table = paper_table(paper_rows(identified))
+    table = paper_table(paper_models(identified))
     assert [re.sub("<.*?>", "", c) for c in table.columns[:9]] == ["model", *"γαβμabdg"]
     assert [text for text, _ in table.groups][3:] == ["equation error", "output error (free run)"]
     assert sum(width for _, width in table.groups) == len(table.columns) == 15
-    deflection = table.rows[6]
+    deflection = table.rows[7]
     o, c, comparison = identified.orders, identified.coefficients, identified.comparison
     assert deflection[1:5] == [1.05, o["alpha2"], o["beta2"], o["mu2"]]
     assert deflection[5:9] == [c["a2"], c["b2"], c["d2"], c["g2"]]
@@ -467,13 +468,13 @@ def test_paper_table_has_the_papers_columns(identified):
     html = str(table.to_html())
     Page(html)
     assert "∞ diverged" in html
-    assert sorted(table.headings) == [0, 5]
+    assert sorted(table.headings) == [0, 6]
     with pytest.raises(ftlm.ModelError, match="no output 'theta21'"):
-        paper_row("p = 7", identified.model, identified.comparison, "theta21")
+        letters_of(identified.model, "theta21")
 
 
 def test_paper_table_fits_a_terminal(identified):
-    lines = paper_table_text(paper_rows(identified)).splitlines()
+    lines = table_text(paper_table(paper_models(identified)), 16, PAPER_TABLE_WIDTHS)
     assert max(map(len, lines)) <= 120
     assert lines[-1].startswith("∞: diverged")
     assert len([line for line in lines if line.startswith("  p = ")]) == 8

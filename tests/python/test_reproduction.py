@@ -483,8 +483,8 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     own = ["I2", "theta21", "theta22"]
     moving = reproduction.square.select(own).window(1.3, 4.3)
     other = reproduction.sine.select(own).window(0.7, 3.7)
-    monkeypatch.setattr("ftlm.reproduction.stage.MOST_ROWS", 1000)
-    monkeypatch.setattr("ftlm.reproduction.stage.JOINT_ROWS", 500)
+    monkeypatch.setattr("ftlm.reproduction.stage.MAX_FULL_SAMPLES", 1000)
+    monkeypatch.setattr("ftlm.reproduction.stage.DECIMATED_SAMPLES", 500)
     told = []
     found = ftlm.reproduce(moving, other, increment=0.5, progress=lambda *share: told.append(share))
     # One share of the whole, which never falls.

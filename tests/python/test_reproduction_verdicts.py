@@ -308,7 +308,7 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
     monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
         simulated_panel(1, "whole orders", [1], 0.0, 1, order_grid=rivals_order_grid(step))
-    preset = Preset(ftlm.OrderGrid(increment=step), 1, 2, common_pulses=True)
+    preset = Preset(ftlm.OrderGrid(increment=step), None, 2)
     work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None)
     assert work.rivals(None) == {}
     assert rivals_order_grid(step, 0.01).increment == step
@@ -329,7 +329,7 @@ def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
 def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
     monkeypatch.setattr("ftlm.reproduction.stage.COARSE_INCREMENT", 0.4)
     run, lattice = demo_run("square"), ftlm.OrderGrid(increment=0.2)
-    work = StageWork(1, run, None, Preset(lattice, 1, 2, common_pulses=True), 1, lambda _: None, None)
+    work = StageWork(1, run, None, Preset(lattice, None, 2), 1, lambda _: None, None)
     options = {"coefficients": "multi-innovation", "innovation_length": 3}
     seen = []
     monkeypatch.setattr(
@@ -359,7 +359,7 @@ def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
     monkeypatch.setattr("ftlm.reproduction.stage.identify", identify)
     with pytest.raises(ftlm.ConvergenceError):
         compare_orders(1, demo_run("square"), "fractional", 1, validation=demo_run("sine"))
-    preset = Preset(ftlm.OrderGrid(increment=0.25), 1, 2, common_pulses=True)
+    preset = Preset(ftlm.OrderGrid(increment=0.25), None, 2)
     for simulated, initial in ((True, "rest"), (False, "auto")):
         work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None, simulated=simulated)
         seen += [work.coupled.initial, work.published.initial]

@@ -7,8 +7,8 @@ import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from operator import itemgetter
+from itertools import pairwise, product
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, Literal
 
 from ftlm.arm.flexible_link import PARAMETER_SETS, order_law
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
 
 Word = Literal["holds", "does not hold", "turns with", "cannot be told from a simulated truth", "cannot be told"]
+#: Case of a claim: whether the claim holds, and the conditions by name, the same names in all cases of a claim.
+Case = tuple[bool, dict[str, str]]
 #: Factor chosen by the simulation; a verdict that it alone decides reproduces this choice.
 ARM_FACTOR = "the arm"
 #: Relative difference below which two errors are equal.
@@ -49,15 +51,7 @@ FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 
 
 @dataclass(frozen=True)
-class Case:
-    """Case of a claim: its conditions by name, the same names in all cases of a claim, and whether the claim holds."""
-
-    factors: Mapping[str, str]
-    holds: bool
-
-
-@dataclass(frozen=True)
-class ClaimVerdict:
+class Ruling:
     """Verdict over all cases of a claim.
 
     Parameters
@@ -92,22 +86,22 @@ class ClaimVerdict:
 
 def case(holds: bool, **factors: str) -> Case:
     """Build a case from factors by keyword; an underscore stands for a space."""
-    return Case({name.replace("_", " "): level for name, level in factors.items()}, holds)
+    return holds, {name.replace("_", " "): level for name, level in factors.items()}
 
 
-def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> ClaimVerdict:
+def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Ruling:
     """Return the verdict over all cases.
 
     A claim holds if it holds in every case, and does not hold if it holds in none. Otherwise it depends on those
     factors whose change alone changes the outcome. A claim about the machine is not decidable by simulation if it
     depends on the arm, or if there is only one arm.
     """
-    holding = sum(c.holds for c in cases)
+    holding = sum(holds for holds, _ in cases)
 
     def outcomes(level_of: Callable[[Mapping[str, str]], Any]) -> dict[Any, list[bool]]:
         outcomes_by_level: dict[Any, list[bool]] = defaultdict(list)
-        for c in cases:
-            outcomes_by_level[level_of(c.factors)].append(c.holds)
+        for holds, factors in cases:
+            outcomes_by_level[level_of(factors)].append(holds)
         return outcomes_by_level
 
     def flips(name: str) -> int:
@@ -115,18 +109,18 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
         groups = outcomes(lambda factors: tuple(level for n, level in factors.items() if n != name))
         return sum(sum(g) * (len(g) - sum(g)) for g in groups.values())
 
-    def verdict(word: Word, factors: Sequence[str] = (), by: str | None = None) -> ClaimVerdict:
+    def verdict(word: Word, factors: Sequence[str] = (), by: str | None = None) -> Ruling:
         groups = {} if by is None else outcomes(itemgetter(by))
         levels = tuple((level, len(each), sum(each)) for level, each in groups.items())
-        return ClaimVerdict(word, tuple(factors), len(cases), holding, levels)
+        return Ruling(word, tuple(factors), len(cases), holding, levels)
 
     if not cases:
         return verdict("cannot be told")
-    if of_the_machine and len({c.factors.get(ARM_FACTOR) for c in cases}) < 2:
+    if of_the_machine and len({factors.get(ARM_FACTOR) for _, factors in cases}) < 2:
         return verdict("cannot be told from a simulated truth", [ARM_FACTOR])
     if holding in (0, len(cases)):
         return verdict("holds" if holding else "does not hold")
-    names = list(cases[0].factors)
+    names = list(cases[0][1])
     turning = sorted(filter(flips, names), key=flips, reverse=True)
     if of_the_machine and ARM_FACTOR in turning:
         return verdict("cannot be told from a simulated truth", [ARM_FACTOR], ARM_FACTOR)
@@ -153,7 +147,7 @@ class Check:
     """
 
     claim: str
-    ruling: ClaimVerdict
+    ruling: Ruling
     computed: str
     printed: str
     rule: str
@@ -190,15 +184,15 @@ def format_list(values: Iterable[float], digits: int = 3) -> str:
     return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
-def _of_angles(holding: Mapping[str, bool], **of: bool) -> ClaimVerdict:
+def _of_angles(holding: Mapping[str, bool], **of: bool) -> Ruling:
     return combine_cases([case(v, the_angle=symbol(o)) for o, v in holding.items()], **of)
 
 
-def _of_rows(reproduction: Reproduction, holds: Callable[[PrintedModelRun], bool]) -> ClaimVerdict:
+def _of_rows(reproduction: Reproduction, holds: Callable[[PrintedModelRun], bool]) -> Ruling:
     return combine_cases([case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in reproduction.ran])
 
 
-def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: bool) -> ClaimVerdict:
+def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: bool) -> Ruling:
     cases = [
         case(bool(holds(t)), K0=prior_text(t.prior), the_arm=t.arm, the_angle=symbol(t.output), the_record=str(t.seed))
         for t in trials
@@ -242,14 +236,12 @@ def deviation_text(reproduction: Reproduction) -> str:
     )
 
 
-#: Result of a check: its verdict, and the fields of its texts. None: the reproduction has no numbers for it.
-Outcome = tuple[ClaimVerdict, dict[str, Any]] | None
+#: Ruling on a claim, and the computed fields of its texts in claims.toml.
+Evidence = tuple[Ruling, dict[str, Any]]
 
 
-def movement(reproduction: Reproduction) -> Outcome:
+def movement(reproduction: Reproduction) -> Evidence:
     """Return whether the printed models move as much as the paper's arm."""
-    if not reproduction.ran:
-        return None
     worst = max(reproduction.ran, key=lambda r: r.deviation_ratio)
     return _of_rows(reproduction, lambda r: 1 / MAX_DEVIATION_RATIO < r.deviation_ratio < MAX_DEVIATION_RATIO), {
         "angle": symbol(worst.output),
@@ -262,52 +254,37 @@ def movement(reproduction: Reproduction) -> Outcome:
     }
 
 
-def stability(reproduction: Reproduction) -> Outcome:
+def stability(reproduction: Reproduction) -> Evidence:
     """Return whether the printed models are stable."""
-    if not reproduction.ran:
-        return None
     outputs = dict.fromkeys(r.output for r in reproduction.ran)
     poles = {o: [r.stability.unstable_poles for r in reproduction.ran if r.output == o] for o in outputs}
     return _of_rows(reproduction, lambda r: r.stability.stable), {"poles": by_angle(poles, 2)}
 
 
-def returned_coefficients(reproduction: Reproduction) -> Outcome:
+def returned_coefficients(reproduction: Reproduction) -> Evidence:
     """Return whether a fit to the response of each published model recovers its coefficient `a`."""
-    if not reproduction.ran:
-        return None
-    back = [
-        (r, k, r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan))
-        for r in reproduction.ran
-        for k in PRIOR_COVARIANCES
-    ]
-    last = {k: {r.output: [a] for r, prior, a in back if r.p == LAST_P and prior == k} for k in PRIOR_COVARIANCES}
-    orders = "; ".join(
-        f"{symbol(r.output)}, K0 = {prior_text(k)}: "
-        + ", ".join(f"{symbol(n)} {v:g}" for n, v in r.orders[k].items() if not n.startswith("alpha"))
-        for r, k, _ in back
-        if k in r.orders
-    )
-    cases = [
-        case(
-            abs(a / printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"] - 1) < MIN_RELATIVE_DIFFERENCE,
-            K0=prior_text(k),
-            the_angle=symbol(r.output),
-            p=str(r.p),
-        )
-        for r, k, a in back
-    ]
+    cases: list[Case] = []
+    last: dict[float, dict[str, list[float]]] = {k: {} for k in PRIOR_COVARIANCES}
+    orders: list[str] = []
+    for r, k in product(reproduction.ran, PRIOR_COVARIANCES):
+        a = r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan)
+        away = abs(a / printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"] - 1)
+        cases.append(case(away < MIN_RELATIVE_DIFFERENCE, K0=prior_text(k), the_angle=symbol(r.output), p=str(r.p)))
+        if r.p == LAST_P:
+            last[k][r.output] = [a]
+        if k in r.orders:
+            found = ", ".join(f"{symbol(n)} {v:g}" for n, v in r.orders[k].items() if not n.startswith("alpha"))
+            orders.append(f"{symbol(r.output)}, K0 = {prior_text(k)}: {found}")
     return combine_cases(cases), {
         "values": ". ".join(f"a of p = {LAST_P} with K0 = {prior_text(k)}: {by_angle(a)}" for k, a in last.items()),
-        "orders": orders,
+        "orders": "; ".join(orders),
         "stated": _printed_text(lambda row: row.coefficients["a"], dict.fromkeys(r.output for r in reproduction.ran)),
     }
 
 
-def recomputed_tables(reproduction: Reproduction) -> Outcome:
+def recomputed_tables(reproduction: Reproduction) -> Evidence:
     """Return whether Tables 4 and 5 follow from what the paper says."""
     tables = reproduction.as_printed
-    if not tables:
-        return None
     settings = (f"{symbol(o)} {t.reading}, with K0 = 1 {t.ratio_at_unit_prior:.3g}" for o, t in tables.items())
     return _of_angles({o: t.is_close for o, t in tables.items()}), {
         "away": ", ".join(f"{t.ratio:.2f} ({symbol(o)})" for o, t in tables.items()),
@@ -317,11 +294,9 @@ def recomputed_tables(reproduction: Reproduction) -> Outcome:
     }
 
 
-def printed_orders(reproduction: Reproduction) -> Outcome:
+def printed_orders(reproduction: Reproduction) -> Evidence:
     """Return whether no neighboring orders have a smaller equation error than the printed ones."""
     tables = reproduction.as_printed
-    if not tables:
-        return None
     return _of_angles({o: t.rank == 1 for o, t in tables.items()}), {
         "places": ", ".join(f"{symbol(o)} {t.rank} of {t.among}" for o, t in tables.items()),
         "best": by_angle({o: [t.best[n] for n in ("beta", "gamma", "mu")] for o, t in tables.items()}),
@@ -344,7 +319,7 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
     return math.isfinite(max(steps)) and earlier
 
 
-def innovation_length(reproduction: Reproduction) -> Outcome:
+def innovation_length(reproduction: Reproduction) -> Evidence:
     """Return whether a larger p gives a smaller error."""
     return _of_trials(reproduction.panel.trials, error_falls), {
         "errors": _by_prior(reproduction, lambda t: t.errors.values()),
@@ -352,11 +327,9 @@ def innovation_length(reproduction: Reproduction) -> Outcome:
     }
 
 
-def convergence(reproduction: Reproduction) -> Outcome:
+def convergence(reproduction: Reproduction) -> Evidence:
     """Return whether a larger p needs fewer steps."""
     trials = reproduction.panel.trials
-    if not trials:
-        return None
     comparable = [t for t in trials if converges_faster(t.convergence_steps) is not None]
     return _of_trials(comparable, lambda t: converges_faster(t.convergence_steps)), {
         "steps": _by_prior(reproduction, lambda t: t.convergence_steps.values()),
@@ -365,7 +338,7 @@ def convergence(reproduction: Reproduction) -> Outcome:
     }
 
 
-def weak_prior(reproduction: Reproduction) -> Outcome:
+def weak_prior(reproduction: Reproduction) -> Evidence:
     """Return whether a larger p gives a smaller error where the data alone decide."""
     weak = [t for t in reproduction.panel.trials if t.prior == WEAK_PRIOR]
     ruling = _of_trials(weak, error_falls)
@@ -391,11 +364,9 @@ def beats(error: float, seeds: Iterable[float]) -> bool:
     return math.isfinite(error) and error < statistics.median(seeds)
 
 
-def optimizers(reproduction: Reproduction) -> Outcome:
+def optimizers(reproduction: Reproduction) -> Evidence:
     """Return whether multi-innovation has a smaller error than the other optimizers."""
     contests = reproduction.panel.contests
-    if not contests:
-        return None
     cases = [
         case(beats(error, errors.values()), K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_rival=name)
         for c in contests
@@ -417,7 +388,7 @@ def optimizers(reproduction: Reproduction) -> Outcome:
     }
 
 
-def manual(reproduction: Reproduction) -> Outcome:
+def manual(reproduction: Reproduction) -> Evidence:
     """Return whether p = 7 is closer to the run than the manual's model; only as far as the arms agree."""
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
     return _of_trials(reproduction.panel.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
@@ -426,7 +397,7 @@ def manual(reproduction: Reproduction) -> Outcome:
     }
 
 
-def fractional_orders(reproduction: Reproduction) -> Outcome:
+def fractional_orders(reproduction: Reproduction) -> Evidence:
     """Return whether fractional orders earn their place; only as far as the arms agree."""
     freed = reproduction.panel.order_comparisons
     verdicts = [(f, o, earns) for f in freed for o in f.free_nr if (earns := f.earns(o)) is not None]
@@ -439,7 +410,7 @@ def fractional_orders(reproduction: Reproduction) -> Outcome:
     }
 
 
-def close_orders(reproduction: Reproduction) -> Outcome:
+def close_orders(reproduction: Reproduction) -> Evidence:
     """Return whether models with the printed orders describe the arm."""
     near = {o: s.printed_orders.estimation for s, o in reproduction.angles}
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
@@ -450,10 +421,8 @@ def close_orders(reproduction: Reproduction) -> Outcome:
     }
 
 
-def published_form(reproduction: Reproduction) -> Outcome:
+def published_form(reproduction: Reproduction) -> Evidence:
     """Return whether the published form finds the orders of an arm with links that move with their hubs."""
-    if not reproduction.simulated:
-        return None
     cases: list[Case] = []
     away: list[str] = []
     fits: dict[str, list[float]] = {}
@@ -490,7 +459,7 @@ def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
     return coefficients
 
 
-def dropped_derivative(reproduction: Reproduction) -> Outcome:
+def dropped_derivative(reproduction: Reproduction) -> Evidence:
     """Return whether (19) and (21) may drop the derivative of the current."""
     orders = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
@@ -503,7 +472,7 @@ def dropped_derivative(reproduction: Reproduction) -> Outcome:
     }
 
 
-def table_3(_: Reproduction) -> Outcome:
+def table_3(_: Reproduction) -> Evidence:
     """Return whether Table 3 gives the printed integer-order models."""
     rows = table_3_coefficients()
     ratios = {n: t / p for n, (t, _, p) in rows.items()}
@@ -519,14 +488,14 @@ def table_3(_: Reproduction) -> Outcome:
     }
 
 
-def one_record(_: Reproduction) -> Outcome:
+def one_record(_: Reproduction) -> Evidence:
     """Return whether Table 7 implies one standard deviation of each angle."""
     spreads = printed.implied_spreads()
     agreeing = {o: abs(g / m - 1) <= MAX_DEVIATION_MISMATCH for o, (g, m) in spreads.items()}
     return _of_angles(agreeing), {"deviations": by_angle(spreads)}
 
 
-def possible_row(_: Reproduction) -> Outcome:
+def possible_row(_: Reproduction) -> Evidence:
     """Return whether a mean absolute error is at most the RMSE of the same row."""
     row = printed.INTEGER_ROWS["theta22"]
     mean = row.error / printed.PULSE_COUNT
@@ -547,15 +516,12 @@ _RULE_NUMBERS = {
     "error_ratio": MAX_ERROR_RATIO,
     "explaining_nr": MAX_EXPLAINING_NR,
     "standard_errors": MAX_STANDARD_ERRORS,
-    "coefficient_ratio": printed.MAX_COEFFICIENT_RATIO,
-    "min_order": printed.MIN_GRID_ORDER,
-    "max_order": printed.MAX_GRID_ORDER,
-    "increment": printed.GRID_INCREMENT,
+    "published": printed,
 }
 
 
 #: Checks in the order of the page; their texts are in claims.toml, by the names of the functions.
-CLAIM_CHECKS: tuple[Callable[[Reproduction], Outcome], ...] = (
+CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
     movement,
     stability,
     returned_coefficients,
@@ -576,16 +542,18 @@ CLAIM_CHECKS: tuple[Callable[[Reproduction], Outcome], ...] = (
 )
 
 
-def make_check(check: Callable[[Reproduction], Outcome], reproduction: Reproduction) -> Check | None:
-    """Return the check of one claim; None if there are no numbers for it."""
-    outcome = check(reproduction)
-    if outcome is None:
-        return None
-    fields = {"counts": outcome[0].counts} | _RULE_NUMBERS | outcome[1]
-    texts = read_texts("claims")[check.__name__]
-    return Check(ruling=outcome[0], **{name: text.format(**fields) for name, text in texts.items()})
+def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduction) -> Check:
+    """Return the check of one claim."""
+    ruling, fields = check(reproduction)
+    texts, values = read_texts("claims")[check.__name__], {"counts": ruling.counts} | _RULE_NUMBERS | fields
+    return Check(ruling=ruling, **{n: texts[n].format(**values) for n in ("claim", "computed", "printed", "rule")})
 
 
 def checks(reproduction: Reproduction) -> list[Check]:
-    """Compare the claims of the paper, and its errors, with computed numbers."""
-    return [result for check in CLAIM_CHECKS if (result := make_check(check, reproduction)) is not None]
+    """Compare the claims of the paper, and its errors, with computed numbers; claims without numbers are left out."""
+    texts = read_texts("claims")
+    return [
+        make_check(check, reproduction)
+        for check in CLAIM_CHECKS
+        if all(attrgetter(name)(reproduction) for name in texts[check.__name__].get("needs", ()))
+    ]

@@ -22,8 +22,7 @@ from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import Progress
 from ftlm.report.html_report import grouped_findings
 from ftlm.report.typesetting import equation_html
-from ftlm.reproduction.figures import angle_chart
-from ftlm.reproduction.report import make_section, make_table
+from ftlm.reproduction.report import angle_chart, make_section, make_table, table_text
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
 from ftlm.structure.structure import Structure
 from ftlm.svg.figure import SMALL_WIDTH_PX
@@ -46,7 +45,7 @@ FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
 }
 WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 #: Most samples of a run in a fit; the arm's modes are a decade below the reduced rate of a 20 s run.
-MOST_ROWS = 1250
+MAX_SAMPLES = 1250
 #: Label of the structures of ``Deflection.without_rate``.
 WITHOUT_RATE_LABEL = "without the rate of the other deflection"
 
@@ -356,7 +355,7 @@ def cross_validate_orders(
     notes: list[str] = []
     runs_used = []
     for run in runs:
-        every = -(-run.length // MOST_ROWS)
+        every = -(-run.length // MAX_SAMPLES)
         if every > 1:
             notes.append(f"of run {run.name} one of {every} rows is used, {every * run.step:.4g} s apart")
         runs_used.append(decimate_run(run, every) if every > 1 else run)
@@ -547,8 +546,8 @@ def _deflection_section(full: Deflection) -> Section:
 def _method_section(result: OrderCrossValidation) -> Section:
     rows = ([r.name, r.length, Exact(round(r.step, 9)), r.duration] for r in result.runs)
     filtered = " Both deflections passed the 2 Hz low-pass of the arm's stock model." if result.filtered else ""
-    fields = {"filtered": filtered, "min_gain": MIN_FIT_GAIN}
-    return make_section("cross_validation", *result.notes, fields=fields, tables=[make_table("cross_runs", rows)])
+    values = {"filtered": filtered, "min_gain": MIN_FIT_GAIN}
+    return make_section("cross_validation", *result.notes, values=values, tables=[make_table("cross_runs", rows)])
 
 
 def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[str], *, force: bool = False) -> Path:
@@ -591,16 +590,7 @@ def cross_validation_text(result: OrderCrossValidation) -> str:
         if full.without_rate is not None:
             lines += ["", f"{symbol(output)}, {WITHOUT_RATE_LABEL}:"]
             lines += [f"    {verdict_sentence(output, verdict)}" for verdict in full.without_rate.verdicts]
-    names = [run.name or "" for run in result.runs]
-    for heading, deflection in _structures(result):
-        lines += ["", f"{heading}: fit of the free run in percent, fitted to the first, judged on the second"]
-        lines.append(" " * 24 + "numbers".rjust(8) + "".join(f"{a} → {b}".rjust(18) for a in names for b in names))
-        lines += [_line(kind, deflection, names) for kind in FREE_ORDERS_BY_KIND]
+    table = fits_table(result)
+    widths = (13, *[max(18, len(head) + 2) for head in table.columns[2:]])
+    lines += ["", table.title, *table_text(table, 26, widths)]
     return "\n".join([*lines, *(f"note: {n}" for n in result.notes)])
-
-
-def _line(kind: str, deflection: Deflection, names: Sequence[str]) -> str:
-    each = deflection.fits[kind]
-    numbers = next((str(f.numbers) for f in each.values()), "–")
-    percentages = [percent(each[a].fit(b)) if a in each else "no fit" for a in names for b in names]
-    return kind.ljust(24) + numbers.rjust(8) + "".join(text.rjust(18) for text in percentages)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from ftlm.data.run import Run
 from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
-from ftlm.model.model import Model
 from ftlm.order_search.options import OrderGrid
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import compared_bars, comparison_charts
@@ -24,16 +24,24 @@ from ftlm.plot.model_charts import pole_charts
 from ftlm.progress import ShareTracker
 from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
 from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
-from ftlm.reproduction.figures import convergence_chart, derivative_chart
-from ftlm.reproduction.published_values import COEFFICIENT_LETTERS, INNOVATION_LENGTHS, ORDER_LETTERS
-from ftlm.reproduction.report import criteria_cells, fits_text, joint_equations, letters_of, make_table, number_cells
+from ftlm.reproduction.published_values import INNOVATION_LENGTHS
+from ftlm.reproduction.report import (
+    convergence_chart,
+    criteria_cells,
+    derivative_chart,
+    fits_text,
+    joint_equations,
+    letters_of,
+    make_table,
+    number_cells,
+    table_text,
+)
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
 from ftlm.reproduction.stage import GRID_ALPHA, Candidate, DroppedDerivative, Preset, StageWork
 from ftlm.svg.figure import Figure
-from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, write_page
+from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
-from ftlm.utils.formatting import DIVERGED_TEXT, SIGNIFICANT_DIGITS, Cell, json_value, symbol, truncate_text, wrap_text
-from ftlm.validation.comparison import Comparison, Metrics
+from ftlm.utils.formatting import Cell, json_value, symbol, wrap_text
 
 #: Candidates that the result of an order search keeps.
 TOP_CANDIDATES = 20
@@ -45,6 +53,8 @@ PARTS_OF_A_STAGE = len(INNOVATION_LENGTHS) + 2
 SAVED_MODELS = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
 #: Models in the terminal summary, with the paper's names of the methods.
 SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
+#: Column widths of the tables of parameters and errors, and of estimates, in the text.
+PAPER_TABLE_WIDTHS, ESTIMATES_WIDTHS = (5,) * 4 + (9,) * 4 + (8, 8, 7, 8, 8, 8), (12, 16, 12, 12, 12)
 TABLE_NOTE = (
     "Equation error: measured signals on the right-hand side. Free run: output error, with the other output measured; "
     "the integer-order model has explicit Euler at 2 ms from the current alone, as published, and output error has the "
@@ -54,102 +64,16 @@ TABLE_NOTE = (
 )
 
 
-@dataclass(frozen=True)
-class PaperRow:
-    """Row of a table in the form of the paper's Tables 4 and 5.
+def paper_table(models: Mapping[str, Candidate], *, title: str = "Identified models") -> Table:
+    """Return a table in the form of the paper's Tables 4 and 5, with both errors, of models with the same outputs."""
 
-    Parameters
-    ----------
-    label
-        Label, such as "integer order" or "p = 7".
-    output
-        Output of the equation.
-    orders
-        ``alpha``, ``beta``, ``gamma``, ``mu``; orders of absent terms are missing.
-    coefficients
-        ``a``, ``b``, ``d``, ``g``, likewise.
-    equation_error, output_error, validation
-        Errors on the estimation run, and output error on another run; None if they were not computed.
-    """
+    def cells(label: str, candidate: Candidate, output: str) -> list[Cell]:
+        both = (candidate.estimation.equation_error[output], candidate.estimation.output_error[output])
+        return [label, *number_cells(*letters_of(candidate.model, output)), *chain(*map(criteria_cells, both))]
 
-    label: str
-    output: str
-    orders: Mapping[str, float]
-    coefficients: Mapping[str, float]
-    equation_error: Metrics | None
-    output_error: Metrics | None
-    validation: Metrics | None = None
-
-
-def paper_row(
-    label: str, model: Model, comparison: Comparison, output: str, validation: Comparison | None = None
-) -> PaperRow:
-    """Return the row of one equation of an arm's model with coefficients a, b, d, g and an index.
-
-    Raises
-    ------
-    ModelError
-        No such output.
-    """
-    errors = comparison.equation_error.get(output), comparison.output_error.get(output)
-    prediction = None if validation is None else validation.output_error[output]
-    return PaperRow(label, output, *letters_of(model, output), *errors, prediction)
-
-
-def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -> Table:
-    """Return a table in the form of the paper's Tables 4 and 5, with both errors.
-
-    Parameters
-    ----------
-    rows
-        For each output the integer-order model, then one row for each p; rows of one output are adjacent.
-    title
-        Caption.
-    """
-
-    def cells(row: PaperRow) -> list[Cell]:
-        errors = [*criteria_cells(row.equation_error), *criteria_cells(row.output_error)]
-        return [row.label, *number_cells(row.orders, row.coefficients), *errors]
-
-    by_output = {output: [cells(r) for r in rows if r.output == output] for output in [r.output for r in rows]}
-    return make_table("both_errors", by_output, title=title)
-
-
-#: Column widths of the text: label, four orders, four coefficients, twice error, RMSE, NR. Together 119 of 120.
-_LABEL_WIDTH, _TEXT_WIDTHS = 17, (5,) * 4 + (9,) * 4 + (8, 8, 7) * 2
-
-
-def paper_table_text(rows: Sequence[PaperRow]) -> str:
-    """Return the same table as text of 120 columns; numbers lose digits in narrow columns."""
-    heads = [*map(symbol, (*ORDER_LETTERS, *COEFFICIENT_LETTERS)), *("error", "RMSE", "NR") * 2]
-    indent, right = sum(_TEXT_WIDTHS[:8]) + _LABEL_WIDTH, sum(_TEXT_WIDTHS[8:11])
-    groups = (f" {words} ".center(right - 1, "-").rjust(right) for words in ("equation error", "free run"))
-    lines = [
-        " " * indent + "".join(groups),
-        "model".ljust(_LABEL_WIDTH) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
-    ]
-    table, infinite = paper_table(rows), False
-    for i, (label, *cells) in enumerate(table.rows):
-        if i in table.headings:
-            lines.append(symbol(rows[i].output))
-        numbers = "".join(
-            _fit_to_width(v, width - 1).rjust(width) for v, width in zip(cells, _TEXT_WIDTHS, strict=True)
-        )
-        lines.append(f"  {truncate_text(str(label), _LABEL_WIDTH - 3)}".ljust(_LABEL_WIDTH) + numbers)
-        infinite = infinite or any(isinstance(v, float) and not math.isfinite(v) for v in cells)
-    if infinite:
-        lines.append(f"∞: {DIVERGED_TEXT}, the response leaves the range of numbers")
-    return "\n".join(lines)
-
-
-def _fit_to_width(value: Cell, width: int) -> str:
-    """Format a number with as many of its five digits as fit."""
-    if value is None or isinstance(value, str):
-        return NOT_IN_MODEL
-    if not math.isfinite(value):
-        return "?" if math.isnan(value) else "∞"
-    texts = [f"{value:.{n}g}".replace("e-0", "e-").replace("e+0", "e") for n in range(SIGNIFICANT_DIGITS, 0, -1)]
-    return next((t for t in texts if len(t) <= width), texts[-1])
+    outputs = next(iter(models.values())).estimation.output_error
+    rows = {o: [cells(label, c, o) for label, c in models.items()] for o in outputs}
+    return make_table("both_errors", rows, title=title)
 
 
 @dataclass(frozen=True)
@@ -182,18 +106,6 @@ class Demo:
         """Identifications by stage and label."""
         return {n: {k: c.result for k, c in m.items() if c.result is not None} for n, m in self.models.items()}
 
-    @property
-    def rows(self) -> dict[int, list[PaperRow]]:
-        """Table rows by stage, those of one output together."""
-        return {
-            n: [
-                paper_row(label, c.model, c.estimation, output, c.validation)
-                for output in models["output error"].model.outputs
-                for label, c in models.items()
-            ]
-            for n, models in self.models.items()
-        }
-
     @cached_property
     def validations(self) -> dict[int, Validation]:
         """Validation of the output-error models on the sine run, by stage."""
@@ -205,14 +117,9 @@ class Demo:
         return {stage: truth_of(stage) for stage in STAGE_NUMBERS}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return rows and estimates for JSON."""
+        """Return models and their errors for JSON."""
         return {
-            "rows": json_value(self.rows),
-            "warnings": {
-                f"stage {stage}, {label}": list(result.warnings)
-                for stage, results in self.results.items()
-                for label, result in results.items()
-            },
+            "models": json_value(self.models),
             "correlation with the current": {d.output: json_value(d.correlations) for d in self.derived.values()},
             "files": [str(f) for f in self.files],
         }
@@ -279,7 +186,7 @@ def run_demo(
         log(label)
 
     grid = OrderGrid(increment=increment, alpha=GRID_ALPHA)
-    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY, common_pulses=False)
+    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY)
     for stage in STAGE_NUMBERS:
         work = StageWork(stage, square, sine, preset, threads, begin_part, None)
         models = {"integer order": work.euler_candidate("integer order", work.manual("integer order"))}
@@ -323,14 +230,12 @@ def demo_text(demo: Demo) -> str:
 def demo_details(demo: Demo) -> str:
     """All tables for a terminal of 120 columns, followed by the warnings."""
     lines = []
-    for stage in demo.rows:
+    for stage, models in demo.models.items():
         lines += [f"Stage {stage}, square current (the shape of the paper's Table {3 + stage})"]
-        lines += [paper_table_text(demo.rows[stage]), ""]
+        lines += [*table_text(paper_table(models), 16, PAPER_TABLE_WIDTHS), ""]
     lines += ["Fit of the free run in percent: on the square run, and on the sine run that no model has seen"]
     for models in demo.models.values():
-        outputs = models["output error"].model.outputs
-        lines.append(" " * 24 + "".join(f"{o + ' square':>18}{o + ' sine':>16}" for o in outputs))
-        lines += fits_text(models, 24, (18, 16) * len(outputs))
+        lines += fits_text(models)
     lines += ["", TABLE_NOTE, "", "Which way a link bends: correlation of the deflection with its current"]
     heads = ("simulated arm", "(14)–(15) identified", "the same in (22)–(25)")
     lines.append(" " * 24 + "".join(f"{words:>26}" for words in heads))
@@ -338,12 +243,8 @@ def demo_details(demo: Demo) -> str:
         lines.append(d.output.ljust(24) + "".join(f"{v:>26.2f}" for v in d.correlations.values()))
     lines.append("")
     for stage, results in demo.results.items():
-        best = results["output error"]
-        lines.append(f"Stage {stage}, output error: estimate ± standard error (truth of the simulated arm)")
-        for n in best.names:
-            p = best.parameters[n]
-            lines.append(f"  {n:<8}{p.value:>12.6g} ± {p.standard_error:<9.2g} ({demo.truth[stage][n]:.6g})")
-    lines.append("")
+        lines.append(f"Stage {stage}, output error")
+        lines += [*table_text(estimates_table(results["output error"], demo.truth[stage]), 8, ESTIMATES_WIDTHS), ""]
     for stage, results in demo.results.items():
         for label, result in results.items():
             lines += [f"warning (stage {stage}, {label}): {w}" for w in result.warnings]
@@ -367,10 +268,11 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
         )
     ]
     validated: list[list[Cell]] = [
-        [r.output, r.label, r.output_error.fit, r.validation.fit, r.validation.error, r.validation.nr]
-        for rows in demo.rows.values()
-        for r in rows
-        if r.output_error is not None and r.validation is not None
+        [o, label, c.estimation.output_error[o].fit, prediction.fit, prediction.error, prediction.nr]
+        for models in demo.models.values()
+        for o in models["output error"].model.outputs
+        for label, c in models.items()
+        if c.validation is not None and (prediction := c.validation.output_error[o])
     ]
     heads = ("output", "model", "fit % on the square", "fit % on the sine", "error (45) on the sine", "NR on the sine")
     table = Table("Validation on the other input", heads, validated, note="Free runs; error in rad.")
@@ -414,7 +316,7 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         tables=[
             *behavior_tables(best.model),
             estimates_table(best, demo.truth[stage]),
-            paper_table(demo.rows[stage], title=f"Stage {stage}, square current"),
+            paper_table(demo.models[stage], title=f"Stage {stage}, square current"),
             search_summary(searches),
         ],
         figures=[*charts, derivative_chart(demo.derived[stage])],

@@ -113,9 +113,10 @@ GENETIC_ROWS = {o: _ROWS_BY_PLACE["6", o, "genetic"] for o in ANGLE_NAMES}
 TABLE_7_CRITERIA = {
     o: tuple(_ROWS_BY_PLACE["7", o, model].criteria for model in ("genetic", "multi-innovation")) for o in ANGLE_NAMES
 }
-#: Table 3: value and printed unit, with the paper's names.
+#: Table 3: value, printed unit, stage and field of `LinkParameters`, with the paper's names.
 TABLE_3 = {
-    each["parameter"]: (float(each["value"]), each["unit"]) for each in read_paper_table("published_parameters.csv")
+    each["parameter"]: (float(each["value"]), each["unit"], int(each["stage"]), each["field"])
+    for each in read_paper_table("published_parameters.csv")
 }
 
 

@@ -9,6 +9,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,13 +18,14 @@ from markupsafe import Markup
 
 from ftlm.arm.flexible_link import PARAMETER_SETS
 from ftlm.errors import ModelError
+from ftlm.estimation.linear import MultiInnovationTrace, trace_chart
 from ftlm.model.model import Model
+from ftlm.plot.comparison_charts import error_chart, pulse_times
 from ftlm.plot.model_charts import bode_charts, response_frequencies
 from ftlm.report.html_report import estimates_table, grouped_findings
 from ftlm.report.typesetting import equation_html
-from ftlm.reproduction import figures
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.checks import deviation_text, table_3_coefficients
+from ftlm.reproduction.checks import Ruling, deviation_text, table_3_coefficients
 from ftlm.reproduction.published_values import (
     ANGLE_NAMES,
     COEFFICIENT_LETTERS,
@@ -42,13 +44,28 @@ from ftlm.reproduction.stage import (
     RIVAL_ALPHA,
     TRACE_EVERY,
     Candidate,
+    DroppedDerivative,
     Stage,
 )
 from ftlm.structure.equation import format_equation
-from ftlm.svg.html_page import Section, Table, write_page
+from ftlm.svg.figure import Figure, StaticFigure
+from ftlm.svg.html_page import NOT_IN_MODEL, Section, Table, write_page
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import check_free
-from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Cell, Exact, number, symbol, symbol_html
-from ftlm.validation.comparison import Metrics
+from ftlm.utils.formatting import (
+    DIVERGED_TEXT,
+    SIGNIFICANT_DIGITS,
+    SUPERSCRIPT_DIGITS,
+    Cell,
+    Exact,
+    format_bound,
+    number,
+    symbol,
+    symbol_html,
+    truncate_text,
+)
+from ftlm.utils.validation import Floats
+from ftlm.validation.comparison import Comparison, Metrics, metrics
 
 if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
@@ -69,13 +86,188 @@ COLUMN_HEADS: Mapping[str, Sequence[str]] = {
     "@weak_prior": (_WEAK_PRIOR,),
     "@curve": (Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)"),),
 }
+#: Points per line: some fifty charts keep the page below 2 MB.
+LINE_POINTS = 500
+#: Largest drawn excursion relative to the reference line, and largest drawn error of the recursion relative to its last
+#: value. Diverging lines would hide all others.
+MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
+
+
+def angle_chart(
+    time: Floats, lines: Sequence[tuple[str, Floats]], output: str, title: str, caption: str, **options: Any
+) -> LineChart:
+    """Chart of an angle over time by several models; the options are those of a line chart."""
+    options = {"points": LINE_POINTS, "caption": caption.replace(" -", " −"), **options}
+    return LineChart(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
+
+
+def reference_label(*, simulated: bool) -> str:
+    """Label of the line that models are compared with."""
+    return "simulated arm" if simulated else "measured"
+
+
+def fit_chart(
+    models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
+) -> LineChart:
+    """Chart of an angle and its simulations by some models, without far excursions."""
+    first = models[0][1]
+    reference, time = first.measured[output][0], pulse_times(first)
+    middle = float(np.mean(reference))
+    limit = MAX_EXCURSION_RATIO * float(np.max(np.abs(reference - middle)))
+    lines, remarks = [(reference_label(simulated=simulated), reference)], []
+    for label, comparison in models:
+        response = comparison.simulated[output][0]
+        with np.errstate(invalid="ignore"):
+            response = np.where(np.abs(response - middle) <= limit, response, np.nan)
+        out_of_range = np.flatnonzero(np.isnan(response))
+        if out_of_range.size:
+            remarks.append(f"{label} leaves the drawing after {time[out_of_range[0]]:.2g} s")
+        if out_of_range.size < response.size:
+            lines.append((label, response))
+    words = " ".join(part for part in (caption, "; ".join(remarks) + "." if remarks else "") if part)
+    return angle_chart(time, lines, output, title, words)
+
+
+def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
+    """Charts of the printed hub models under the paper's current, beside an angle of the implied standard deviation."""
+    charts: list[Figure] = []
+    for output in dict.fromkeys(r.output for r in reproduction.ran if r.output.endswith("1")):
+        rows = [r for r in reproduction.ran if r.output == output]
+        last = rows[-1]
+        caption = (
+            f"The printed equations of Table {3 + int(output[-2])} from the current alone, and the simulated arm, "
+            f"scaled to the deviation that the printed RMSE / NR implies ({last.implied_deviation:.2g} rad). p = "
+            f"{last.p} moves {last.deviation_ratio:.0f} times less than the angle that it was identified from."
+        )
+        lines = [("simulated arm", last.arm), *((f"printed, p = {r.p}", r.response) for r in rows)]
+        title = f"{symbol(output)}: the printed models under the paper's current"
+        charts.append(angle_chart(last.time, lines, output, title, caption))
+    return charts
+
+
+def share_picture(ruling: Ruling) -> Markup:
+    """Bar of the share of cases in which a claim holds, for every level of the deciding factor."""
+    levels = ruling.levels or (("", ruling.cases, ruling.holding_cases),)
+    height = 10 * len(levels) - 2
+    words = "; ".join(f"{level + ': ' if level else ''}{holding} of {count}" for level, count, holding in levels)
+    out = [Markup('<svg class="share" viewBox="0 0 88 {}" role="img" aria-label="holds in {}">').format(height, words)]
+    for k, (_, count, holding) in enumerate(levels):
+        filled = 88 * holding / max(count, 1)
+        out.append(Markup('<rect class="held" x="0" y="{}" width="{:.1f}" height="8"/>').format(10 * k, filled))
+        out.append(Markup('<rect x=".5" y="{}" width="87" height="7"/>').format(10 * k + 0.5))
+    return Markup("").join([*out, Markup("</svg>")])
+
+
+def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> LineChart:
+    """Chart of the error (45) over the steps of the recursion, one line per p."""
+    end = max(float(t.error[-1]) for t in traces.values())
+    labeled_traces, gaps = [], False
+    for p, trace in traces.items():
+        with np.errstate(invalid="ignore"):
+            near = np.where(trace.error <= MAX_ERROR_RATIO * end, trace.error, np.nan)
+        near = near if np.isfinite(near).any() else trace.error
+        gaps = gaps or bool(np.isnan(near).any())
+        labeled_traces.append((f"p = {p}", replace(trace, error=near)))
+    figure = trace_chart(labeled_traces, title=title, log_x=log_x)
+    words = f"Errors above {MAX_ERROR_RATIO:g} times the last ones are not drawn."
+    return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
+
+
+def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> Figure:
+    """Chart of the measured deflection, of (14)-(15), and of the published form with the same parameters."""
+    nr, bent = metrics(derived.derived, derived.published).nr, derived.correlations
+    own = reference_label(simulated=simulated)
+    lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
+    caption = (
+        f"Equal parameters in both forms; the order of the current is 0 instead of {derived.order:.3g}. NR between "
+        f"both: {nr:.3g}. Correlation with the current: {own} {bent['measured']:.2f}, (14)–(15) {bent['derived']:.2f}, "
+        f"(22)–(25) {bent['published']:.2f}."
+    )
+    title = f"{symbol(derived.output)}: which way the link bends"
+    return angle_chart(derived.time, lines, derived.output, title, caption)
+
+
+def _fits_chart(
+    models: Mapping[str, Candidate], output: str, place: str, *, sine: bool, simulated: bool
+) -> list[Figure]:
+    """Charts of the models' fits on one input; empty without that run."""
+    compared = {label: c.validation if sine else c.estimation for label, c in models.items()}
+    present = [(label, c) for label, c in compared.items() if c is not None]
+    if not present:
+        return []
+    fits = ", ".join(f"{label} {c.output_error[output].fit:.4g} %" for label, c in present)
+    caption = f"Fit: {fits.replace('inf', '∞').replace('-', '−')}."
+    if output.endswith("2") and any(label.startswith("p = ") for label in models):
+        caption += " Rows of p are (23), from which a derivative of the current is missing."
+    title = f"Figure {place}. {symbol(output)}, {'sine' if sine else 'square'} input"
+    return [fit_chart(present, output, title, caption, simulated=simulated)]
+
+
+def _beside_integer(stage: Stage) -> dict[str, Candidate]:
+    """Models of Figures 6, 9 and 10; Euler's method needs a start at rest."""
+    manual = "integer, Euler" if stage.traces else "integer, exact"
+    last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
+    labels = {"integer, manual": manual, last: last, "output error": "output error"}
+    return {heading: stage.candidates[label] for heading, label in labels.items()}
+
+
+def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
+    """Figures 4-6 or 7-9."""
+    first = 4 if stage.number == 1 else 7
+    errors = [(f"p = {p}", stage.candidates[f"p = {p}"].estimation) for p in printed.INNOVATION_LENGTHS]
+    figures: list[Figure] = []
+    for place, output in enumerate(stage.outputs, first):
+        title = f"Figure {place}(a). {symbol(output)}: absolute error of the free run"
+        figures.append(error_chart(errors, output, title=title, units={output: "rad"}, points=LINE_POINTS))
+        if output in stage.traces:
+            title = f"Figure {place}(b). {symbol(output)}: error (45) after each step"
+            figures.append(convergence_chart(stage.traces[output], title))
+    for letter, output in zip("ab", stage.outputs, strict=True):
+        number = f"{first + 2}({letter})"
+        figures += _fits_chart(_beside_integer(stage), output, number, sine=False, simulated=simulated)
+    return figures
+
+
+def _place(figure: int, output: str) -> str:
+    return f"{figure}({'abcd'[printed.ANGLE_NAMES.index(output)]})"
+
+
+def sine_figures(reproduction: Reproduction) -> list[Figure]:
+    """Figure 10."""
+    return [
+        figure
+        for stage, output in reproduction.angles
+        for figure in _fits_chart(
+            _beside_integer(stage), output, _place(10, output), sine=True, simulated=reproduction.simulated
+        )
+    ]
+
+
+def rival_figures(reproduction: Reproduction) -> list[Figure]:
+    """Figure 11, on the validation run, or on the estimation run without one."""
+    names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
+    figures = []
+    for output, rival in reproduction.rivals.items():
+        models = {names.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
+        has_validation = rival.models["genetic"].validation is not None
+        figures += _fits_chart(
+            models, output, _place(11, output), sine=has_validation, simulated=reproduction.simulated
+        )
+    return figures
+
+
+def flow_chart() -> Figure:
+    """Figure 2: from the physics to the model, a drawing for wide and one for narrow screens."""
+    files = (Path(__file__).with_name(f"flow_chart_{screen}.svg") for screen in ("wide", "narrow"))
+    drawings = (Markup(file.read_text(encoding="utf-8")) for file in files)  # our own files
+    return StaticFigure("Figure 2. From the physics to the identified model", *drawings)
 
 
 def make_table(
     key: str,
     rows: Iterable[Sequence[Any]] | Mapping[str, Iterable[Sequence[Any]]],
     heads: Mapping[str, Sequence[str]] | None = None,
-    **fields: Any,
+    **values: Any,
 ) -> Table:
     """Return a table of page.toml.
 
@@ -87,13 +279,13 @@ def make_table(
         Rows, or the rows of every angle by name, or those of other groups by heading.
     heads
         Heads of columns besides `COLUMN_HEADS`.
-    **fields
+    **values
         Values of the placeholders in its title and note.
     """
     texts = read_texts("page")["tables"][key]
     heads_by_name = {**COLUMN_HEADS, **(heads or {})}
     columns = [head for name in texts["columns"] for head in heads_by_name.get(name, (name,))]
-    title, note = (texts.get(name, "").format(printed_note=PRINTED_NOTE, **fields) for name in ("title", "note"))
+    title, note = (texts.get(name, "").format(printed_note=PRINTED_NOTE, **values) for name in ("title", "note"))
     options = {name: texts[name] for name in ("groups", "wrap", "stacked") if name in texts}
     if isinstance(rows, Mapping):
         groups: dict[str, list[Any]] = {
@@ -103,15 +295,12 @@ def make_table(
     return Table(title, columns, list(rows), note=note, **options)
 
 
-def make_section(key: str, *paragraphs: str, fields: Mapping[str, Any] | None = None, **content: Any) -> Section:
-    """Return a section of page.toml with these fields; further paragraphs follow its own, `content` is a section's."""
+def make_section(key: str, *paragraphs: str, values: Mapping[str, Any] | None = None, **content: Any) -> Section:
+    """Return a section of page.toml, its placeholders filled with `values`, with further paragraphs and content."""
     texts = read_texts("page")["sections"][key]
-    if fields is not None:
-        texts = {
-            n: v.format(**fields) if isinstance(v, str) else [p.format(**fields) for p in v] for n, v in texts.items()
-        }
-    options = {"fold": texts["fold"]} if "fold" in texts else {}
-    return Section(texts["heading"], [*texts.get("paragraphs", ()), *paragraphs], **options, **content)
+    templates = (texts["heading"], texts.get("fold", Section.fold), *texts.get("paragraphs", ()))
+    heading, fold, *own = (template.format(**values or {}) for template in templates)
+    return Section(heading, [*own, *paragraphs], fold=fold, **content)
 
 
 def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, float]]:
@@ -208,19 +397,9 @@ def description_tables() -> list[Table]:
 
 def parameter_tables() -> list[Table]:
     """Table 3 beside the manufacturer's effective parameters, and the coefficients that follow from both."""
-    fields = {
-        "J": ("hub_inertia", "link_inertia"),
-        "B": ("hub_friction", "link_friction"),
-        "K_s": ("stiffness",),
-        "K_τ": ("torque_constant",),
-    }
     rows: list[list[Cell]] = []
-    for name, (value, unit) in printed.TABLE_3.items():
-        stem = letter_of(name)
-        stage, *place = map(int, name[len(stem) :])
-        effective = None
-        if (fields_by_stem := fields.get(stem.rstrip("_"))) is not None:
-            effective = Exact(getattr(PARAMETER_SETS["effective"][stage], fields_by_stem[place[0] - 1 if place else 0]))
+    for name, (value, unit, stage, field) in printed.TABLE_3.items():
+        effective = Exact(getattr(PARAMETER_SETS["effective"][stage], field)) if field else None
         name_html = Markup("<i>{}</i><sub>{}</sub>").format(name[0], name.partition("_")[2])
         rows.append([name_html, Exact(value), unit, effective, value / effective if effective else None])
     coefficients = table_3_coefficients().items()
@@ -353,7 +532,7 @@ def _verdict_section(reproduction: Reproduction) -> Section:
         [
             typeset(c.claim),
             Markup("<strong>{}</strong>").format(typeset(c.verdict)),
-            figures.share_picture(c.ruling),
+            share_picture(c.ruling),
             typeset(c.brief),
         ]
         for c in reproduction.checks
@@ -378,8 +557,8 @@ def _stage_section(reproduction: Reproduction, stage: Stage) -> Section:
     return make_section(
         "stage",
         *joint_equations(joint.model),
-        fields={"stage": number, "table": 3 + number, "warnings": ", warnings" if warned else ""},
-        figures=figures.stage_figures(stage, simulated=reproduction.simulated),
+        values={"stage": number, "table": 3 + number, "warnings": ", warnings" if warned else ""},
+        figures=stage_figures(stage, simulated=reproduction.simulated),
         folded_tables=tables,
     )
 
@@ -388,7 +567,7 @@ def _sections(reproduction: Reproduction) -> list[Section]:
     """All sections in their order; those without content are left out."""
     simulated, stages = reproduction.simulated, list(reproduction.stages.values())
     near = [
-        figures.fit_chart(
+        fit_chart(
             [("printed orders", s.printed_orders.estimation)],
             s.outputs[1],
             f"{symbol(s.outputs[1])}: the orders of Table {3 + s.number} with the best coefficients for this run",
@@ -397,9 +576,7 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         for s in stages
     ]
     weak = [
-        figures.convergence_chart(t, f"{symbol(o)}: error (45), weak prior")
-        for s in stages
-        for o, t in s.weak_traces.items()
+        convergence_chart(t, f"{symbol(o)}: error (45), weak prior") for s in stages for o, t in s.weak_traces.items()
     ]
     landscapes = {s.number: s.landscape for s in stages if s.landscape is not None}
     correlated = [
@@ -419,18 +596,18 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         make_section(
             "printed_models",
             *(sentences if reproduction.ran else ()),
-            figures=figures.printed_model_charts(reproduction),
+            figures=printed_model_charts(reproduction),
             folded_tables=[printed_runs_table(reproduction)],
         ),
         make_section("as_printed", folded_tables=[printed_reading_table(reproduction, stage) for stage in stages]),
         *(_stage_section(reproduction, stage) for stage in stages),
     ]
     if reproduction.sine is not None:
-        every.append(make_section("sine", figures=figures.sine_figures(reproduction)))
+        every.append(make_section("sine", figures=sine_figures(reproduction)))
     if reproduction.rivals:
-        charts = figures.rival_figures(reproduction)
+        charts = rival_figures(reproduction)
         every.append(make_section("optimizers", figures=charts, folded_tables=optimizer_tables(reproduction)))
-    derived = [figures.derivative_chart(s.derived, simulated=simulated) for s in stages]
+    derived = [derivative_chart(s.derived, simulated=simulated) for s in stages]
     return [
         *every,
         make_section("innovation_length", figures=weak, small=True, folded_tables=[saturation_table(reproduction)]),
@@ -439,7 +616,7 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         make_section("landscape", *correlated, figures=[*landscapes.values()], small=True),
         make_section("frequency_response", figures=bode, small=True),
         make_section("parameters", folded_tables=parameter_tables()),
-        make_section("description", figures=[figures.flow_chart()], folded_tables=description_tables()),
+        make_section("description", figures=[flow_chart()], folded_tables=description_tables()),
         _runs_section(reproduction),
     ]
 
@@ -449,7 +626,7 @@ def _runs_section(reproduction: Reproduction) -> Section:
     for run in reproduction.runs:
         currents = (f"{symbol(n)} ±{np.max(np.abs(run[n])):.3g} {run.units[n]}" for n in run.inputs)
         rows.append([run.name, run.length, Exact(run.step), run.duration, ", ".join(currents)])
-    fields = {
+    values = {
         "m": next(iter(reproduction.stages.values())).candidates["p = 7"].estimation.m,
         "increment": reproduction.order_grid.increment,
         "alpha": reproduction.order_grid.alpha,
@@ -457,7 +634,7 @@ def _runs_section(reproduction: Reproduction) -> Section:
         "coarse_increment": COARSE_INCREMENT,
         "refined_candidates": REFINED_CANDIDATES,
     }
-    return make_section("runs", *reproduction.notes, fields=fields, tables=[make_table("runs", rows)])
+    return make_section("runs", *reproduction.notes, values=values, tables=[make_table("runs", rows)])
 
 
 def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], *, force: bool = False) -> Path:
@@ -482,13 +659,43 @@ def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], 
     return write_page(path, title="The paper reproduced", sections=_sections(reproduction), lead=lead, force=force)
 
 
-def fits_text(models: Mapping[str, Candidate], label: int, widths: Sequence[int]) -> list[str]:
-    """Fits of the free runs in percent as text, one line per model, in columns of these widths."""
-    lines = []
-    for name, candidate in models.items():
-        texts = ("–" if math.isnan(fit) else f"{fit:.2f}" for fit in candidate.fits)
-        lines.append(name.ljust(label) + "".join(text.rjust(w) for text, w in zip(texts, widths, strict=True)))
+def table_text(table: Table, label: int, widths: Sequence[int]) -> list[str]:
+    """Lines of a table with columns of these widths, the first of `label`; numbers lose digits in narrow ones."""
+    plain, all_widths, at, head = [Markup(head).striptags() for head in table.columns], (label, *widths), 0, ""
+    for words, count in table.groups:
+        width = sum(all_widths[at : at + count])
+        head += f" {words} ".center(width - 1, "-").rjust(width) if words else " " * width
+        at += count
+    lines = [head] if head else []
+    heads = (truncate_text(name, width - 1).rjust(width) for name, width in zip(plain[1:], widths, strict=True))
+    lines.append(plain[0].ljust(label) + "".join(heads))
+    for i, (name, *cells) in enumerate(table.rows):
+        if i in table.headings:
+            lines.append(Markup(table.headings[i]).striptags())
+        own = f"  {Markup(name).striptags()}" if table.headings else Markup(name).striptags()
+        texts = (_fit_to_width(v, width - 1).rjust(width) for v, width in zip(cells, widths, strict=True))
+        lines.append(truncate_text(own, label - 1).ljust(label) + "".join(texts))
+    if any(isinstance(v, float) and math.isinf(v) for row in table.rows for v in row):
+        lines.append(f"∞: {DIVERGED_TEXT}, the response leaves the range of numbers")
     return lines
+
+
+def _fit_to_width(value: Cell, width: int) -> str:
+    """Format a number with as many of its five digits as fit."""
+    if value is None or isinstance(value, str):
+        return value or NOT_IN_MODEL
+    if not math.isfinite(value):
+        return "?" if math.isnan(value) else format_bound(value)
+    texts = [f"{value:.{n}g}".replace("e-0", "e-").replace("e+0", "e") for n in range(SIGNIFICANT_DIGITS, 0, -1)]
+    return next((t for t in texts if len(t) <= width), texts[-1])
+
+
+def fits_text(models: Mapping[str, Candidate]) -> list[str]:
+    """Table of the fits of the free runs in percent as text, one line per model."""
+    outputs = next(iter(models.values())).estimation.output_error
+    heads = ["", *(f"{o} {run}" for o in outputs for run in ("square", "sine"))]
+    rows = [[n, *("–" if math.isnan(v) else f"{v:.2f}" for v in c.fits)] for n, c in models.items()]
+    return table_text(Table("", heads, rows), 26, [16] * 4)
 
 
 def reproduction_text(reproduction: Reproduction) -> str:
@@ -498,8 +705,7 @@ def reproduction_text(reproduction: Reproduction) -> str:
         lines += [f"{check.verdict.upper()}: {check.claim}", f"    {check.brief}"]
     for stage in reproduction.stages.values():
         lines += ["", f"Stage {stage.number}: fit of the free run in percent, driven as identified"]
-        lines.append(" " * 26 + "".join(f"{o + run:>16}" for o in stage.outputs for run in (" square", " sine")))
-        lines += fits_text(stage.candidates, 26, [16] * 4)
+        lines += fits_text(stage.candidates)
         best = stage.candidates["output error"].model
         lines += [f"  {format_equation(e, best.structure.describe_inputs('.6g'))}" for e in best.equations]
     return "\n".join([*lines, *(f"note: {n}" for n in reproduction.notes)])

@@ -250,7 +250,7 @@ def reproduce(
     seconds = seconds_of_all(increment, len(numbers), *more, rivals_increment=compared_increment)
     expected = estimate_duration(seconds, min(check_threads(threads), len(STAGE_NUMBERS)))
     log(f"this takes {format_time_left(expected).removesuffix(' left')}")
-    preset = Preset(lattice, 1, TRACE_EVERY, common_pulses=True, rivals_increment=compared_increment)
+    preset = Preset(lattice, None, TRACE_EVERY, compared_increment)
     seeds = [seed + k for k in range(records)]
     run, other = square, sine
 

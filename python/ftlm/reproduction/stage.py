@@ -67,12 +67,12 @@ PANEL_STEP = 0.25
 INSTRUMENTAL_RADIUS_STEPS = 2
 #: Runs with more samples than the first number are decimated to at most the second for joint fits, whose cost grows
 #: with the samples. The arm's modes are two decades below the reduced rate.
-MOST_ROWS, JOINT_ROWS = 6000, 2500
+MAX_FULL_SAMPLES, DECIMATED_SAMPLES = 6000, 2500
 #: Increment of a first search on finer grids, among orders of multi-innovation that no bound excludes, and number of
 #: the best candidates around which the grid's own increment follows.
 COARSE_INCREMENT, REFINED_CANDIDATES = 0.1, 10
 #: Samples of fits with integer orders, whose systematic residuals do not shrink with more samples.
-WHOLE_ROWS = 1250
+INTEGER_FIT_SAMPLES = 1250
 #: Note on a reproduction without the optimizer comparison, with a placeholder for the reason.
 RIVALS_OMITTED = "Tables 6 and 7 and Figure 11 are left out: {}"
 
@@ -179,14 +179,10 @@ class DroppedDerivative:
     @property
     def correlations(self) -> dict[str, float]:
         """Correlation of the deflection with the current: measured, (14)-(15), published; NaN at rest."""
-        correlations = {}
-        for name in ("measured", "derived", "published"):
-            parts = [v - np.mean(v) for v in (getattr(self, name), self.current)]
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                correlations[name] = float(
-                    np.dot(*parts) / np.sqrt(np.dot(parts[0], parts[0]) * np.dot(parts[1], parts[1]))
-                )
-        return correlations
+        names = ("measured", "derived", "published")
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            matrix = np.corrcoef([getattr(self, n) for n in names] + [self.current])
+        return dict(zip(names, matrix[-1].tolist(), strict=False))
 
 
 @dataclass(frozen=True)
@@ -205,8 +201,6 @@ class Stage:
         Optimizer comparisons by output; empty without PyGAD or for a run that does not start at rest.
     printed_orders
         Model with the printed orders and least-squares coefficients on this run.
-    by_equation
-        Model with the orders of the smallest equation error on the grid.
     derived
         Effect of the dropped derivative of the current.
     landscape
@@ -219,7 +213,6 @@ class Stage:
     weak_traces: dict[str, dict[int, MultiInnovationTrace]]
     rivals: dict[str, Rival]
     printed_orders: Candidate
-    by_equation: Candidate
     derived: DroppedDerivative
     landscape: Landscape | None
 
@@ -241,7 +234,7 @@ class Stage:
         return {
             "models": json_value(self.candidates),
             "derived input order": attributes(self.derived, ("output", "order", "correlations")),
-        } | attributes(self, ("printed_orders", "by_equation", "weak", "rivals"))
+        } | attributes(self, ("printed_orders", "weak", "rivals"))
 
 
 def rivals_order_grid(increment: float, smallest: float = CONTEST_STEP) -> OrderGrid:
@@ -381,6 +374,17 @@ class OrderComparison:
     gains: dict[str, float] = field(default_factory=dict)
     is_degenerate: bool = False
 
+    @classmethod
+    def of(cls, arm: str, stage: int, integer: Candidate, free: Candidate) -> OrderComparison:
+        """Return the comparison of two identified models."""
+        before, after = ({} if c.validation is None else c.validation.fit for c in (integer, free))
+        gains = {o: after[o] - before[o] for o in after if math.isfinite(after[o] - before[o])}
+        nr, free_nr = ({o: f.nr for o, f in c.estimation.output_error.items()} for c in (integer, free))
+        if free.result is None:
+            raise ModelError(f"model {free.label} was not identified; its orders have no intervals")
+        orders = {n: (v, *free.result.intervals[n]) for n, v in free.result.orders.items()}
+        return cls(arm, stage, nr, free_nr, orders, gains, not are_usable(integer, free))
+
     def earns(self, output: str) -> bool | None:
         """Whether free orders earn their place on an angle by the rule of ``ftlm orders``; None if it is not known."""
         if self.is_degenerate or output not in self.gains:
@@ -495,37 +499,20 @@ def compare_orders(
             identify(run, item, method=JOINT_METHOD, threads=threads, progress=progress)
             for item in (integer_orders(structure), structure)
         ]
-    models = [replace(fit.model, m=default_m([own], power_of_two=True)) for fit in fits]
-    estimation, validation_data = ([compare_means(model, each) for model in models] for each in (own, other))
-    return _order_comparison(arm, stage, estimation, validation_data, fits)
-
-
-def _order_comparison(
-    arm: str,
-    stage: int,
-    estimation: Sequence[Comparison],
-    validation: Sequence[Comparison | None],
-    fits: Sequence[Identification],
-) -> OrderComparison:
-    """Return the comparison of integer and free orders, in this order."""
-    nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in estimation)
-    fits_before, fits_after = ({} if c is None else c.fit for c in validation)
-    gains = {
-        o: fits_after[o] - fits_before[o]
-        for o in nr
-        if o in fits_before and math.isfinite(fits_after[o] - fits_before[o])
-    }
-    orders = {n: (v, *fits[1].intervals[n]) for n, v in fits[1].orders.items()}
-    return OrderComparison(arm, stage, nr, free_nr, orders, gains, any(map(is_degenerate, fits)))
+    m, candidates = default_m([own], power_of_two=True), []
+    for fit in fits:
+        model = replace(fit.model, m=m)
+        candidates.append(Candidate("", model, compare_means(model, own), compare_means(model, other), {}, fit))
+    return OrderComparison.of(arm, stage, *candidates)
 
 
 def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
     """Return the cases of one run and its stage results; trials only for runs that start at rest."""
-    both = [stage.candidates[n] for n in ("integer, identified", "output error")]
-    estimation, validation, fits = ([getattr(c, f) for c in both] for f in ("estimation", "validation", "result"))
-    freed = (_order_comparison(arm, stage.number, estimation, validation, fits),)
+    freed = OrderComparison.of(
+        arm, stage.number, stage.candidates["integer, identified"], stage.candidates["output error"]
+    )
     trials = trials_of(stage.number, square, arm, seed, threads) if stage.traces else ()
-    return Panel(tuple(trials), tuple(Contest.of(arm, o, rival) for o, rival in stage.rivals.items()), freed)
+    return Panel(tuple(trials), tuple(Contest.of(arm, o, rival) for o, rival in stage.rivals.items()), (freed,))
 
 
 def simulated_panel(
@@ -574,11 +561,8 @@ class Preset:
     """Settings that differ between the reproduction and the demonstration."""
 
     order_grid: OrderGrid
-    top: int  # rows of an order search
+    top: int | None  # rows of an order search with the statistics of an identification; None: a search alone
     trace_every: int  # steps between two points of a convergence curve
-    # Whether all models are compared on the paper's pulses (a sum over other pulses is another number) and from the
-    # currents alone as well, or each with the pulses of its method.
-    common_pulses: bool
     # Of the order grid of the optimizer comparison; None without PyGAD or SciPy.
     rivals_increment: float | None = CONTEST_STEP
 
@@ -635,7 +619,7 @@ class StageWork:
         self.begin("convergence", "traces")
         traces: dict[str, dict[int, MultiInnovationTrace]] = {}
         weak: dict[str, dict[int, MultiInnovationTrace]] = {}
-        if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
+        if self.measured.initial == "rest":
             models = {p: candidates[f"p = {p}"].model for p in INNOVATION_LENGTHS}
             traces = self.traces(models)
             weak = self.traces(dict.fromkeys(models, models[INNOVATION_LENGTHS[-1]]), WEAK_PRIOR)
@@ -650,25 +634,21 @@ class StageWork:
         near = self.search_candidate(
             "printed orders", replace(self.preset.order_grid, orders=axes), coefficients="least-squares"
         )
-        self.begin("orders by the equation error", "equation")
-        options = {"coefficients": "least-squares", "criterion": "equation-error", "norm": "l2"}
-        by_equation = self.search_candidate("smallest equation error", self.preset.order_grid, **options)
         derived = self.dropped_derivative(joint.model)
         self.begin("the landscape of its orders", "landscape")
         landscape = None
         if joint.result is not None and joint.result.joint is not None:
             landscape = output_error_landscape(joint.result)
-        return Stage(self.number, candidates, traces, weak, rivals, near, by_equation, derived, landscape)
+        return Stage(self.number, candidates, traces, weak, rivals, near, derived, landscape)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
         """Return a model with both errors on both runs, and its simulation from the currents alone."""
-        alike = self.preset.common_pulses
-        m = default_m([self.on], power_of_two=True) if alike else model.m
-        model = model if model.m == m else replace(model, m=m)
+        # Errors are sums over the paper's pulses; over other pulses they would be other numbers.
+        model = replace(model, m=default_m([self.on], power_of_two=True))
         runs = [run for run in (self.on, self.off) if run is not None]
         on, *off = (compare_means(model, run) for run in runs)
         alone = {}
-        if alike and len(model.equations) > 1:
+        if len(model.equations) > 1:
             coupled = replace(model, structure=replace(model.structure, coupling="simulated"))
             alone = {run.name: compare_means(coupled, run).output_error for run in runs}
         return Candidate(label, model, on, off[0] if off else None, alone, result)
@@ -689,10 +669,7 @@ class StageWork:
 
         def by_euler(run: Run, comparison: Comparison) -> Comparison:
             means = euler_means(exact.model, run, comparison.m)
-            if self.preset.common_pulses:
-                errors = {n: metrics(comparison.measured[n][0], mean) for n, mean in means.items()}
-            else:
-                errors = {n: metrics(run[n], samples) for n, samples in explicit_euler(exact.model, run).items()}
+            errors = {n: metrics(comparison.measured[n][0], mean) for n, mean in means.items()}
             simulated, parts = {n: [mean] for n, mean in means.items()}, [(run.name, comparison.equation_error, errors)]
             return replace(comparison, simulated=simulated, output_error=errors, per_run=parts, findings=())
 
@@ -712,7 +689,7 @@ class StageWork:
         candidates, grid = {}, self.preset.order_grid
         for label, (coefficients, options) in (kinds | {"least squares": ("least-squares", {})}).items():
             self.begin(f"orders on the lattice, {label}", "search")
-            if self.preset.common_pulses:
+            if self.preset.top is None:
                 candidates[label] = self.search_candidate(label, grid, coefficients=coefficients, **options)
             else:
                 method = method_with_options(coefficients, {"order_grid": grid, "top": self.preset.top, **options})
@@ -762,7 +739,7 @@ class StageWork:
         for name, value in start.model.orders.items():
             steps = 1 if name.startswith("alpha") else INSTRUMENTAL_RADIUS_STEPS
             axes[name] = [v for v in neighboring_values(value, grid.increment, steps) if 0 <= v <= grid.alpha[1]]
-        method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=self.preset.top)
+        method = InstrumentalVariables(order_grid=replace(grid, orders=axes), top=1)
         return self.identify_candidate("instrumental variables", self.on, self.measured, method)
 
     def joint(
@@ -771,10 +748,10 @@ class StageWork:
         """Fit by joint output error, to the whole run or to a decimated one."""
         self.begin(words, step)
         run = self.on
-        if step == "whole orders" and run.length >= 2 * WHOLE_ROWS:
-            run = decimate_run(run, run.length // WHOLE_ROWS)
-        elif run.length > MOST_ROWS:
-            every = -(-run.length // JOINT_ROWS)
+        if step == "whole orders" and run.length >= 2 * INTEGER_FIT_SAMPLES:
+            run = decimate_run(run, run.length // INTEGER_FIT_SAMPLES)
+        elif run.length > MAX_FULL_SAMPLES:
+            every = -(-run.length // DECIMATED_SAMPLES)
             self.notes.append(
                 f"run {run.name} has {run.length} rows: joint fits by output error take one of {every} rows, "
                 f"{every * run.step:.6g} s apart, with the means of held currents in between; all models are compared "

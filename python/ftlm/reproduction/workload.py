@@ -18,7 +18,6 @@ STEP_COSTS: Mapping[str, tuple[float, int, int]] = {
     "published": (1.5, 1, 0),
     "traces": (0.8, 1, 0),
     "rivals": (5.2, 2, 2),
-    "equation": (0.1, 1, 0),
     "landscape": (2.4, 1, 0),
     "printed": (0.4, 1, 0),
     "trials": (2.0, 1, 0),
