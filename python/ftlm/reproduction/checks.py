@@ -51,7 +51,7 @@ FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 
 
 @dataclass(frozen=True)
-class Ruling:
+class ClaimVerdict:
     """Verdict over all cases of a claim.
 
     Parameters
@@ -89,7 +89,7 @@ def case(holds: bool, **factors: str) -> Case:
     return holds, {name.replace("_", " "): level for name, level in factors.items()}
 
 
-def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Ruling:
+def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> ClaimVerdict:
     """Return the verdict over all cases.
 
     A claim holds if it holds in every case, and does not hold if it holds in none. Otherwise it depends on those
@@ -109,10 +109,10 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Rul
         groups = outcomes(lambda factors: tuple(level for n, level in factors.items() if n != name))
         return sum(sum(g) * (len(g) - sum(g)) for g in groups.values())
 
-    def verdict(word: Word, factors: Sequence[str] = (), by: str | None = None) -> Ruling:
+    def verdict(word: Word, factors: Sequence[str] = (), by: str | None = None) -> ClaimVerdict:
         groups = {} if by is None else outcomes(itemgetter(by))
         levels = tuple((level, len(each), sum(each)) for level, each in groups.items())
-        return Ruling(word, tuple(factors), len(cases), holding, levels)
+        return ClaimVerdict(word, tuple(factors), len(cases), holding, levels)
 
     if not cases:
         return verdict("cannot be told")
@@ -147,7 +147,7 @@ class Check:
     """
 
     claim: str
-    ruling: Ruling
+    ruling: ClaimVerdict
     computed: str
     printed: str
     rule: str
@@ -184,15 +184,15 @@ def format_list(values: Iterable[float], digits: int = 3) -> str:
     return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
-def _of_angles(holding: Mapping[str, bool], **of: bool) -> Ruling:
+def _of_angles(holding: Mapping[str, bool], **of: bool) -> ClaimVerdict:
     return combine_cases([case(v, the_angle=symbol(o)) for o, v in holding.items()], **of)
 
 
-def _of_rows(reproduction: Reproduction, holds: Callable[[PrintedModelRun], bool]) -> Ruling:
+def _of_rows(reproduction: Reproduction, holds: Callable[[PrintedModelRun], bool]) -> ClaimVerdict:
     return combine_cases([case(holds(r), the_angle=symbol(r.output), p=str(r.p)) for r in reproduction.ran])
 
 
-def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: bool) -> Ruling:
+def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: bool) -> ClaimVerdict:
     cases = [
         case(bool(holds(t)), K0=prior_text(t.prior), the_arm=t.arm, the_angle=symbol(t.output), the_record=str(t.seed))
         for t in trials
@@ -236,8 +236,8 @@ def deviation_text(reproduction: Reproduction) -> str:
     )
 
 
-#: Ruling on a claim, and the computed fields of its texts in claims.toml.
-Evidence = tuple[Ruling, dict[str, Any]]
+#: Verdict on a claim, and the computed fields of its texts in claims.toml.
+Evidence = tuple[ClaimVerdict, dict[str, Any]]
 
 
 def movement(reproduction: Reproduction) -> Evidence:

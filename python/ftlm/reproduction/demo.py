@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,14 +15,12 @@ from typing import Any
 from markupsafe import Markup
 
 from ftlm.data.run import Run
-from ftlm.estimation.linear import MultiInnovationTrace
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation
 from ftlm.order_search.options import OrderGrid
 from ftlm.order_search.result import search_summary
 from ftlm.plot.comparison_charts import compared_bars, comparison_charts
 from ftlm.plot.model_charts import pole_charts
-from ftlm.progress import ShareTracker
 from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
 from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
 from ftlm.reproduction.published_values import INNOVATION_LENGTHS
@@ -29,6 +28,7 @@ from ftlm.reproduction.report import (
     convergence_chart,
     criteria_cells,
     derivative_chart,
+    fits_table,
     fits_text,
     joint_equations,
     letters_of,
@@ -37,7 +37,8 @@ from ftlm.reproduction.report import (
     table_text,
 )
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, demo_run, truth_of
-from ftlm.reproduction.stage import GRID_ALPHA, Candidate, DroppedDerivative, Preset, StageWork
+from ftlm.reproduction.stage import GRID_ALPHA, Candidate, Preset, Stage, StageWork
+from ftlm.reproduction.workload import TotalProgress, WorkerProgress, seconds_of
 from ftlm.svg.figure import Figure
 from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
@@ -47,8 +48,6 @@ from ftlm.utils.formatting import Cell, json_value, symbol, wrap_text
 TOP_CANDIDATES = 20
 #: Steps between two points of a convergence curve; 128 points are more than a page shows.
 TRACE_EVERY = 16
-#: Steps of a stage that are announced: an order search for each p and for least squares, and the joint fit.
-PARTS_OF_A_STAGE = len(INNOVATION_LENGTHS) + 2
 #: Models that are saved, by the suffix of their file name.
 SAVED_MODELS = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
 #: Models in the terminal summary, with the paper's names of the methods.
@@ -84,27 +83,24 @@ class Demo:
     ----------
     square, sine
         The runs.
-    models
-        Models by stage and label.
-    traces
-        Convergence by output and p.
-    derived
-        Effect of the dropped derivative of the current, by stage.
+    stages
+        Results by stage, without a comparison of optimizers and a weak prior.
     files
         Written files.
     """
 
     square: Run
     sine: Run
-    models: dict[int, dict[str, Candidate]]
-    traces: dict[str, dict[int, MultiInnovationTrace]]
-    derived: dict[int, DroppedDerivative]
+    stages: dict[int, Stage]
     files: list[Path]
 
     @property
     def results(self) -> dict[int, dict[str, Identification]]:
         """Identifications by stage and label."""
-        return {n: {k: c.result for k, c in m.items() if c.result is not None} for n, m in self.models.items()}
+        return {
+            n: {label: c.result for label, c in stage.candidates.items() if c.result is not None}
+            for n, stage in self.stages.items()
+        }
 
     @cached_property
     def validations(self) -> dict[int, Validation]:
@@ -118,11 +114,7 @@ class Demo:
 
     def to_dict(self) -> dict[str, Any]:
         """Return models and their errors for JSON."""
-        return {
-            "models": json_value(self.models),
-            "correlation with the current": {d.output: json_value(d.correlations) for d in self.derived.values()},
-            "files": [str(f) for f in self.files],
-        }
+        return {"stages": json_value(self.stages), "files": [str(f) for f in self.files]}
 
 
 def run_demo(
@@ -170,35 +162,28 @@ def run_demo(
     check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)
     log("recording both stages on the virtual rig, under a square and a sine current")
     square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
-    demo = Demo(square, sine, {}, {}, {}, [])
+    demo = Demo(square, sine, {}, [])
     for run in (square, sine):
         demo.files.append(folder / f"{run.name}.csv")
         run.to_csv(demo.files[-1], force=force)
-    course = ShareTracker(progress)
-    parts = len(STAGE_NUMBERS) * PARTS_OF_A_STAGE
-    at = 0
-
-    def begin_part(label: str) -> None:
-        nonlocal at
-        course.advance_to(at / parts)
-        at += 1
-        work.progress = course.subtask(at / parts)
-        log(label)
-
     grid = OrderGrid(increment=increment, alpha=GRID_ALPHA)
-    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY)
+    preset = Preset(grid, TOP_CANDIDATES, TRACE_EVERY, None)
+    seconds = (len(INNOVATION_LENGTHS) + 1) * seconds_of("search", increment) + seconds_of("output error", increment)
+    whole = TotalProgress(len(STAGE_NUMBERS) * seconds, progress)
+    steps = WorkerProgress(whole, threading.Event())
     for stage in STAGE_NUMBERS:
-        work = StageWork(stage, square, sine, preset, threads, begin_part, None)
+        work = StageWork(stage, square, sine, preset, threads, log, steps)
         models = {"integer order": work.euler_candidate("integer order", work.manual("integer order"))}
         models |= work.searches()
         words = "all orders and coefficients together by output error, from the current alone"
         models["output error"] = work.joint("output error", work.coupled, words)
-        demo.models[stage] = models
-        demo.traces.update(work.traces({p: models[f"p = {p}"].model for p in INNOVATION_LENGTHS}))
-        demo.derived[stage] = work.dropped_derivative(models["output error"].model)
+        traces = work.traces({p: models[f"p = {p}"].model for p in INNOVATION_LENGTHS})
+        derived = work.dropped_derivative(models["output error"].model)
+        demo.stages[stage] = Stage(stage, models, traces, {}, {}, work.printed_orders(), derived, None)
         for stem, label in SAVED_MODELS.items():
             demo.files.append(folder / f"stage{stage}-{stem}.json")
             models[label].model.save(demo.files[-1], force=force)
+    whole.end()
     return demo
 
 
@@ -213,11 +198,11 @@ def demo_text(demo: Demo) -> str:
         lines += [f"  {line}" for line in equation_lines(best.model)]
         lines += [line for line in behavior_lines(best.model) if "mode" in line or "integrates" in line][:3]
         lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
-    outputs = list(demo.traces)
+    outputs = [output for stage in demo.stages.values() for output in stage.outputs]
     lines.append(f"{'free run, fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
     lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
     for label in SHOWN_MODELS:
-        fits = [fit for models in demo.models.values() for fit in models[label].fits]
+        fits = [fit for stage in demo.stages.values() for fit in stage.candidates[label].fits]
         texts = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
         lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(texts)))
     lines += ["", "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well."]
@@ -230,24 +215,17 @@ def demo_text(demo: Demo) -> str:
 def demo_details(demo: Demo) -> str:
     """All tables for a terminal of 120 columns, followed by the warnings."""
     lines = []
-    for stage, models in demo.models.items():
-        lines += [f"Stage {stage}, square current (the shape of the paper's Table {3 + stage})"]
-        lines += [*table_text(paper_table(models), 16, PAPER_TABLE_WIDTHS), ""]
-    lines += ["Fit of the free run in percent: on the square run, and on the sine run that no model has seen"]
-    for models in demo.models.values():
-        lines += fits_text(models)
-    lines += ["", TABLE_NOTE, "", "Which way a link bends: correlation of the deflection with its current"]
-    heads = ("simulated arm", "(14)–(15) identified", "the same in (22)–(25)")
-    lines.append(" " * 24 + "".join(f"{words:>26}" for words in heads))
-    for d in demo.derived.values():
-        lines.append(d.output.ljust(24) + "".join(f"{v:>26.2f}" for v in d.correlations.values()))
-    lines.append("")
-    for stage, results in demo.results.items():
-        lines.append(f"Stage {stage}, output error")
-        lines += [*table_text(estimates_table(results["output error"], demo.truth[stage]), 8, ESTIMATES_WIDTHS), ""]
-    for stage, results in demo.results.items():
+    for number, stage in demo.stages.items():
+        lines += [f"Stage {number}, square current (the shape of the paper's Table {3 + number})"]
+        lines += [*table_text(paper_table(stage.candidates), 16, PAPER_TABLE_WIDTHS), ""]
+        lines += ["Fit of the free run in percent: on the square run, and on the sine run that no model has seen"]
+        lines += [*fits_text(stage.candidates), "", derivative_chart(stage.derived).caption, "", "Output error"]
+        estimates = estimates_table(stage.candidates["output error"].result, demo.truth[number])
+        lines += [*table_text(estimates, 8, ESTIMATES_WIDTHS), ""]
+    lines += [TABLE_NOTE, ""]
+    for number, results in demo.results.items():
         for label, result in results.items():
-            lines += [f"warning (stage {stage}, {label}): {w}" for w in result.warnings]
+            lines += [f"warning (stage {number}, {label}): {w}" for w in result.warnings]
     return "\n".join(lines)
 
 
@@ -261,25 +239,16 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
     runs = {"square, fitted to": "estimation", "sine, not seen": "validation"}
     bars = [
         chart
-        for models in demo.models.values()
+        for stage in demo.stages.values()
         for chart in compared_bars(
-            [(label, [(run, getattr(c, part)) for run, part in runs.items()]) for label, c in models.items()],
+            [(label, [(run, getattr(c, part)) for run, part in runs.items()]) for label, c in stage.candidates.items()],
             title="Fit of the free run",
         )
     ]
-    validated: list[list[Cell]] = [
-        [o, label, c.estimation.output_error[o].fit, prediction.fit, prediction.error, prediction.nr]
-        for models in demo.models.values()
-        for o in models["output error"].model.outputs
-        for label, c in models.items()
-        if c.validation is not None and (prediction := c.validation.output_error[o])
-    ]
-    heads = ("output", "model", "fit % on the square", "fit % on the sine", "error (45) on the sine", "NR on the sine")
-    table = Table("Validation on the other input", heads, validated, note="Free runs; error in rad.")
     sections = [
         Section("Which model predicts", figures=bars, small=True),
         *(_stage_section(demo, stage) for stage in demo.results),
-        Section("Validation", tables=[table]),
+        Section("Validation", tables=[fits_table(stage) for stage in demo.stages.values()]),
     ]
     lead = (
         "Both stages of a simulated flexible two-link arm with fractional damping, identified from a noisy square run: "
@@ -304,7 +273,7 @@ def _stage_section(demo: Demo, stage: int) -> Section:
     charts += [*pole_charts(best.model), *best.model.step().figures()]
     for output in best.model.outputs:
         title = f"Error (45) of {symbol(output)} after each step of the recursion"
-        charts.append(convergence_chart(demo.traces[output], title, log_x=False))
+        charts.append(convergence_chart(demo.stages[stage].traces[output], title, log_x=False))
     first, rest = first_findings(best.findings)
     others = grouped_findings({n: r for n, r in results.items() if n != "output error"})
     searches = {f"{n}, {o}": s for n, r in results.items() for o, s in r.searches.items()}
@@ -316,8 +285,8 @@ def _stage_section(demo: Demo, stage: int) -> Section:
         tables=[
             *behavior_tables(best.model),
             estimates_table(best, demo.truth[stage]),
-            paper_table(demo.models[stage], title=f"Stage {stage}, square current"),
+            paper_table(demo.stages[stage].candidates, title=f"Stage {stage}, square current"),
             search_summary(searches),
         ],
-        figures=[*charts, derivative_chart(demo.derived[stage])],
+        figures=[*charts, derivative_chart(demo.stages[stage].derived)],
     )

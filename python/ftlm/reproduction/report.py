@@ -25,7 +25,7 @@ from ftlm.plot.model_charts import bode_charts, response_frequencies
 from ftlm.report.html_report import estimates_table, grouped_findings
 from ftlm.report.typesetting import equation_html
 from ftlm.reproduction import published_values as printed
-from ftlm.reproduction.checks import Ruling, deviation_text, table_3_coefficients
+from ftlm.reproduction.checks import ClaimVerdict, deviation_text, table_3_coefficients
 from ftlm.reproduction.published_values import (
     ANGLE_NAMES,
     COEFFICIENT_LETTERS,
@@ -145,7 +145,7 @@ def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
     return charts
 
 
-def share_picture(ruling: Ruling) -> Markup:
+def share_picture(ruling: ClaimVerdict) -> Markup:
     """Bar of the share of cases in which a claim holds, for every level of the deciding factor."""
     levels = ruling.levels or (("", ruling.cases, ruling.holding_cases),)
     height = 10 * len(levels) - 2
@@ -173,7 +173,7 @@ def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *,
     return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
 
 
-def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> Figure:
+def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> LineChart:
     """Chart of the measured deflection, of (14)-(15), and of the published form with the same parameters."""
     nr, bent = metrics(derived.derived, derived.published).nr, derived.correlations
     own = reference_label(simulated=simulated)

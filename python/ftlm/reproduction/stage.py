@@ -630,16 +630,12 @@ class StageWork:
                 "of the recursion, and with it Figures 4(b) to 8(b), and the weak prior are left out"
             )
         rivals = self.rivals(genetic)
-        axes = {n: [v] for output in self.measured.outputs for n, v in last_orders(output).items()}
-        near = self.search_candidate(
-            "printed orders", replace(self.preset.order_grid, orders=axes), coefficients="least-squares"
-        )
         derived = self.dropped_derivative(joint.model)
         self.begin("the landscape of its orders", "landscape")
         landscape = None
         if joint.result is not None and joint.result.joint is not None:
             landscape = output_error_landscape(joint.result)
-        return Stage(self.number, candidates, traces, weak, rivals, near, derived, landscape)
+        return Stage(self.number, candidates, traces, weak, rivals, self.printed_orders(), derived, landscape)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
         """Return a model with both errors on both runs, and its simulation from the currents alone."""
@@ -710,6 +706,12 @@ class StageWork:
         units = {n: u for n, u in self.on.units.items() if n in structure.signals}
         about = {"origin": label, "run": self.on.name}
         return self.candidate(label, Model(structure, orders=orders, units=units, about=about))
+
+    def printed_orders(self) -> Candidate:
+        """Return the model with the printed orders and least-squares coefficients."""
+        axes = {n: [v] for output in self.measured.outputs for n, v in last_orders(output).items()}
+        grid = replace(self.preset.order_grid, orders=axes)
+        return self.search_candidate("printed orders", grid, coefficients="least-squares")
 
     def _best_orders(self, single: Structure, own: OrderGrid, options: Mapping[str, Any]) -> SearchResult:
         """Return the best candidate of an order grid.
