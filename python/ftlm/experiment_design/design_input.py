@@ -143,7 +143,6 @@ class DesignTask:
     criterion: Criterion
     period: int
     seed: int
-    findings: tuple[Finding, ...]
 
 
 @check_arguments
@@ -214,22 +213,48 @@ def design_input(
         zones; if it is too uncertain; or if an argument is invalid or a limit cannot be met.
     """
     if progress is not None and not callable(progress):
-        raise ModelError(f"progress is a {type(progress).__name__}; give a function of (done, total)")
-    task = _check_arguments(
-        model,
-        reference_run,
-        duration,
-        step,
-        peak,
-        slew,
-        limits,
-        parameters,
-        criterion,
-        noise,
-        period,
-        seed,
-    )
-    fit, bounds, goal = task.fit, task.bounds, task.criterion
+        raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
+    solved = model.model if isinstance(model, Identification) else model
+    check_model(solved)
+    check_linear(solved.equations, "a design of the next experiment")
+    check_no_input_nonlinearity(solved, "a design of the next experiment")
+    if reference_run is None and isinstance(model, Identification) and model.task is not None:
+        reference_run = model.task.runs[0]
+    if reference_run is not None and not isinstance(reference_run, Run):
+        raise ModelError(f"reference_run is {type(reference_run).__name__}, not a Run; give a run of the machine")
+    free = parameter_set_of(solved)
+    fit = ModelFit.of(solved, per_signal_values("noise", noise, solved.outputs, free.noise))
+    _check_signals(fit, reference_run)
+    if free.covariance is None:
+        _raise_too_uncertain(fit, "some of its numbers have infinite intervals", None)
+    stated = (solved.about.get("step"), None) if reference_run is None else (reference_run.step, reference_run.duration)
+    time = _positive("step", stated[0] if step is None else step, "a step [s]")
+    length = _positive("duration", stated[1] if duration is None else duration, "a length [s]")
+    rows = round(min(length / time, 1e9)) + 1
+    if not MIN_RUN_SAMPLES <= rows <= MAX_RUN_SAMPLES:
+        raise ModelError(
+            f"{setting('duration')} {length:g} s in steps of {time:g} s are {rows} rows; give a run of "
+            f"{MIN_RUN_SAMPLES} to {MAX_RUN_SAMPLES} rows"
+        )
+    bounds = _bounds_of(fit, reference_run, peak, slew, limits)
+    _check_slew(bounds, time, rows)
+    _check_stable(fit, bounds)
+    _check_uncertainty(fit, time, length)
+    at = _parameter_indices(fit, parameters)
+    if not isinstance(criterion, str) or criterion not in ("D", "E"):
+        raise ModelError(
+            f"{setting('criterion')} {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
+        )
+    # An order is of size 1 by itself; what else is known, is known as a share of itself.
+    units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in at]
+    goal = Criterion(criterion, at, tuple(units))
+    seed = check_seed(seed)
+    wave = _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]")
+    if not 2 <= round(wave / time) <= 2 * rows:
+        raise ModelError(
+            f"{setting('period')} {period:g} s is out of range; give two samples to twice the duration of the run"
+        )
+    task = DesignTask(fit, time, rows, bounds, goal, round(wave / time), seed)
     if isinstance(progress, Progress):
         size = len(fit.names) * len(fit.outputs) * task.rows
         progress.expect("the design", *duration_bounds(estimate_duration(0.3 + 2e-5 * size, 1), TIME_FACTOR_RANGE))
@@ -248,8 +273,7 @@ def design_input(
     commands = best.commands * _robust_scale(task, sensitivities, best.commands)
     run = fit.run(sensitivities.rig_commands(commands), task.step, "designed")
     errors = _errors(fit, reference, run)
-    at = list(goal.indices)
-    ratios = np.log(errors["square"][at]) - np.log(errors["designed"][at])
+    ratios = np.log(errors["square"][list(at)]) - np.log(errors["designed"][list(at)])
     course.advance_to(1.0)
     return DesignedInput(
         run=run,
@@ -264,7 +288,7 @@ def design_input(
         predicted_extremes=_predicted_extremes(run, bounds),
         spectrum=spectrum,
         efficiency=math.exp(best.score - spectrum.bound),
-        findings=task.findings,
+        findings=_prediction_findings(solved, noise_given=noise is not None),
     )
 
 
@@ -316,101 +340,52 @@ def _design_candidates(
     return sorted([*feasible, *ends], key=lambda d: -d.score)
 
 
-def _check_arguments(
-    model: Identification | Model,
+def _bounds_of(
+    fit: ModelFit,
     reference_run: Run | None,
-    duration: float | None,
-    step: float | None,
     peak: float | Mapping[str, float] | None,
     slew: float | Mapping[str, float] | None,
     limits: Mapping[str, float] | None,
-    parameters: Sequence[str] | None,
-    criterion: str,
-    noise: Mapping[str, float] | None,
-    period: float | None,
-    seed: int,
-) -> DesignTask:
-    """Return the validated task of an input design; raise ModelError for invalid arguments or an unsuitable model."""
-    solved = model.model if isinstance(model, Identification) else model
-    check_model(solved)
-    check_linear(solved.equations, "a design of the next experiment")
-    check_no_input_nonlinearity(solved, "a design of the next experiment")
-    if reference_run is None and isinstance(model, Identification) and model.task is not None:
-        reference_run = model.task.runs[0]
-    if reference_run is not None and not isinstance(reference_run, Run):
-        raise ModelError(f"reference_run is {type(reference_run).__name__}, not a Run; give a run of the machine")
-    free = parameter_set_of(solved)
-    outputs = solved.outputs
-    fit = ModelFit.of(solved, per_signal_values("noise", noise, outputs, free.noise))
-    _check_signals(fit, reference_run)
-    if free.covariance is None:
-        _raise_too_uncertain(fit, "some of its numbers have infinite intervals", None)
-    stated_step = solved.about.get("step") if reference_run is None else reference_run.step
-    time = _positive("step", stated_step if step is None else step, "a step [s]")
-    length = _positive(
-        "duration",
-        duration if duration is not None else None if reference_run is None else reference_run.duration,
-        "a length [s]",
-    )
-    rows = round(min(length / time, 1e9)) + 1
-    if not MIN_RUN_SAMPLES <= rows <= MAX_RUN_SAMPLES:
-        raise ModelError(
-            f"{setting('duration')} {length:g} s in steps of {time:g} s are {rows} rows; give a run of "
-            f"{MIN_RUN_SAMPLES} to {MAX_RUN_SAMPLES} rows"
-        )
-    swings = dict.fromkeys(outputs, math.inf) | (
-        {} if reference_run is None else _largest_values(reference_run, outputs, from_start=True)
-    )
+) -> Bounds:
+    """Return the limits of the machine; a run gives the defaults of peaks and outputs."""
+    peaks, swings = None, dict.fromkeys(fit.outputs, math.inf)
+    if reference_run is not None:
+        peaks = _largest_values(reference_run, fit.inputs, from_start=False)
+        swings |= _largest_values(reference_run, fit.outputs, from_start=True)
     bounds = Bounds(
-        per_signal_values(
-            "peak",
-            peak,
-            fit.inputs,
-            None if reference_run is None else _largest_values(reference_run, fit.inputs, from_start=False),
-        ),
+        per_signal_values("peak", peak, fit.inputs, peaks),
         per_signal_values("slew", slew, fit.inputs, dict.fromkeys(fit.inputs, math.inf)),
-        per_signal_values("limits", limits, outputs, swings),
+        per_signal_values("limits", limits, fit.outputs, swings),
     )
     for name, value in bounds.peaks.items():
         if math.isinf(value):
             raise ModelError(f"peak of {name} is infinite; give the largest value that the machine allows")
-    ramp = bounds.ramp_samples(time)
+    return bounds
+
+
+def _check_slew(bounds: Bounds, step: float, rows: int) -> None:
+    """Raise if a change from one peak to the other takes more than a quarter of the run."""
+    ramp = bounds.ramp_samples(step)
     if ramp > rows // 4:
         slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
         raise ModelError(
-            f"slew of {slow} = {bounds.slews[slow]:g} a second takes {ramp * time:.3g} s from one peak to the other, "
-            f"of {length:g} s in all: no input of that peak can be kept within it; lower {parameter('peak')}, or "
-            f"raise {parameter('slew')} or {parameter('duration')}"
+            f"slew of {slow} = {bounds.slews[slow]:g} a second takes {ramp * step:.3g} s from one peak to the other, "
+            f"of {(rows - 1) * step:g} s in all: no input of that peak can be kept within it; lower "
+            f"{parameter('peak')}, or raise {parameter('slew')} or {parameter('duration')}"
         )
-    _check_stable(fit, bounds)
-    _check_uncertainty(fit, time, length)
-    at = _parameter_indices(fit, parameters)
-    if not isinstance(criterion, str) or criterion not in ("D", "E"):
-        raise ModelError(
-            f"{setting('criterion')} {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
-        )
-    # An order is of size 1 by itself; what else is known, is known as a share of itself.
-    units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in at]
-    seed_value = check_seed(seed)
-    every = round(
-        _positive("period", length / REFERENCE_SQUARE_PERIODS if period is None else period, "a time [s]") / time
-    )
-    if not 2 <= every <= 2 * rows:
-        raise ModelError(
-            f"{setting('period')} {period:g} s is out of range; give two samples to twice the duration of the run"
-        )
-    findings = () if solved.estimate is None or solved.estimate.findings is UNSET else solved.estimate.findings
+
+
+def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, ...]:
+    """Return a finding if the model lacks dynamics, or if the noise of its fit is not white."""
+    findings = () if model.estimate is None or model.estimate.findings is UNSET else model.estimate.findings
     missing = [f for f in findings if f.code in LEFT_OUT_CODES]
     doubt = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
-    colour = next((f for f in findings if f.code in NOT_WHITE_CODES), None)
-    words: tuple[Finding, ...] = ()
     if doubt is not None:
-        words = (make_finding("prediction_in_doubt", output=doubt.output, text=doubt.text),)
-    elif colour is not None and noise is None:
-        words = (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
-    return DesignTask(
-        fit, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, seed_value, words
-    )
+        return (make_finding("prediction_in_doubt", output=doubt.output, text=doubt.text),)
+    colour = next((f for f in findings if f.code in NOT_WHITE_CODES), None)
+    if colour is None or noise_given:
+        return ()
+    return (make_finding("designed_for_white_noise", output=colour.output, text=colour.text),)
 
 
 def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
