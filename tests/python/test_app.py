@@ -30,6 +30,7 @@ from ftlm.app.subprocess_task import Task, TaskError
 from ftlm.app.web_application import CLIENT_TIMEOUT_S, TimedConnection, WebApplication
 from ftlm.cli.main import app
 from ftlm.errors import DataError, FtlmError, ModelError
+from ftlm.svg.html_page import read_resource
 from ftlm.utils.resources import python_child
 
 TOKEN, HOST = "0123456789abcdef", "127.0.0.1:8347"
@@ -218,7 +219,7 @@ def test_the_page_names_nothing_that_is_not_its_own():
     assets = [
         view.script(),
         view.style(),
-        *(view._read(f"{n}.html.j2") for n in ("page", "file", "model", "comparison")),
+        *(read_resource(f"{n}.html.j2", "ftlm.app") for n in ("page", "file", "model", "comparison")),
     ]
     assert [re.findall(r"(?:https?:)?//\w+[.]\w+|@import|url\(", text) for text in assets] == [[]] * len(assets)
     # Nothing in a template runs as a script or brings a style of its own: the policy would refuse it.

@@ -6,10 +6,9 @@ import json
 import re
 from collections.abc import Sequence
 from functools import cache
-from importlib import resources
 from typing import Any
 
-from jinja2 import Environment, FunctionLoader, StrictUndefined
+from jinja2 import Environment
 from markupsafe import Markup
 
 from ftlm._core import __version__
@@ -23,9 +22,9 @@ from ftlm.plot.comparison_charts import comparison_charts
 from ftlm.report.html_report import behavior_tables, first_findings, title_of, verdict_box
 from ftlm.report.typesetting import equations_html, parameter_table
 from ftlm.svg.figure import Figure
-from ftlm.svg.html_page import chart_script, style_sheet
+from ftlm.svg.html_page import read_resource, style_sheet, templates
 from ftlm.svg.line_chart import chart_css
-from ftlm.utils.formatting import finite, number
+from ftlm.utils.formatting import finite
 
 #: Label of the form field of each Python argument.
 _FIELD_LABELS = {
@@ -61,16 +60,10 @@ def _field_label(match: re.Match[str]) -> str:
     return f"{label} {value}" if value else label
 
 
-def _read(name: str) -> str:
-    return resources.files("ftlm.app").joinpath(name).read_text("utf-8")
-
-
 @cache
 def _templates() -> Environment:
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(_read)
-    )
-    environment.filters |= {"number": number, "page_words": page_words, "safe_markup": Markup}
+    environment = templates("ftlm.app")
+    environment.filters |= {"page_words": page_words, "safe_markup": Markup}
     return environment
 
 
@@ -80,14 +73,14 @@ def _render_template(template: str, **context: Any) -> str:
 
 @cache
 def script() -> str:
-    """Return the JavaScript of the page, including that of charts."""
-    return f"{chart_script()}\n{_read('app.js')}"
+    """Return the script of the page, after that of its charts."""
+    return f"{read_resource('charts.js')}\n{read_resource('app.js', 'ftlm.app')}"
 
 
 @cache
 def style() -> str:
-    """Return the style sheet of the page, including that of reports."""
-    return f"{style_sheet()}\n{chart_css()}\n{_read('app.css')}"
+    """Return the style of reports and of the page."""
+    return f"{style_sheet()}\n{chart_css()}\n{read_resource('app.css', 'ftlm.app')}"
 
 
 def page_words(text: str) -> str:

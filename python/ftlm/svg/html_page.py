@@ -14,7 +14,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined, Template
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from ftlm._core import __version__
@@ -101,48 +101,15 @@ class Table:
             at += width
         return starts
 
-    def _classes(self) -> list[str]:
-        pairs = zip(self.is_numeric, self.starts_group, strict=True)
-        return [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
-
     def to_html(self) -> Markup:
-        """Return the table as HTML, in a container that scrolls horizontally on narrow screens."""
-        classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
-        # The title is outside the scrolling container, so that it wraps; the label repeats it for screen readers.
-        dense = " dense" if len(self.columns) >= DENSE_MIN_COLUMNS else " wrap" if self.wrap else ""
-        dense += " stacked" if self.stacked else ""
-        out = [Markup('<div class="table{}"><p class="title">{}</p>').format(dense, self.title)]
-        out.append(Markup('<div class="scroll" role="group" tabindex="0" aria-label="{}">').format(self.title))
-        out.append(Markup('<table aria-label="{}"><thead>').format(self.title))
-        if self.groups:
-            heads = Markup("").join(
-                Markup('<th scope="colgroup" colspan="{}" class="g">{}</th>').format(width, text)
-                if text
-                else Markup('<td colspan="{}"></td>').format(width)
-                for text, width in self.groups
-            )
-            out.append(Markup("<tr>{}</tr>").format(heads))
-        heads = Markup("").join(
-            Markup('<th scope="col"{}>{}</th>').format(c, head) for c, head in zip(classes, self.columns, strict=True)
-        )
-        out.append(Markup("<tr>{}</tr></thead><tbody>").format(heads))
-        for i, row in enumerate(self.rows):
-            if i in self.headings:
-                out.append(
-                    Markup('<tr class="heading"><th scope="rowgroup" colspan="{}"><span>{}</span></th></tr>').format(
-                        len(self.columns), self.headings[i]
-                    )
-                )
-            cells = [Markup('<th scope="row"{}>{}</th>').format(classes[0], cell_html(row[0]))]
-            cells += [
-                Markup("<td{}>{}</td>").format(c, cell_html(v)) for c, v in zip(classes[1:], row[1:], strict=True)
-            ]
-            out.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
-        out.append(Markup("</tbody></table></div>"))
-        if self.note:
-            out.append(Markup('<p class="note">{}</p>').format(self.note))
-        out.append(Markup("</div>"))
-        return Markup("\n").join(out)
+        """Return the table in a container that scrolls horizontally on narrow screens."""
+        pairs = zip(self.is_numeric, self.starts_group, strict=True)
+        words = [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
+        classes = [Markup(' class="{}"').format(w) if w else "" for w in words]
+        kind = " dense" if len(self.columns) >= DENSE_MIN_COLUMNS else " wrap" if self.wrap else ""
+        kind += " stacked" if self.stacked else ""
+        template = templates("ftlm.svg").get_template("table.html.j2")
+        return Markup(template.render(table=self, classes=classes, kind=kind))  # the template escapes
 
 
 @dataclass(frozen=True)
@@ -190,27 +157,34 @@ class Section:
 
 
 @cache
-def _template() -> Template:
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(resources.files("ftlm.svg").joinpath("page.html.j2").read_text("utf-8"))
+def templates(package: str) -> Environment:
+    """Templates of HTML in the files of a package; what they insert is escaped unless it is ``Markup``."""
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=FunctionLoader(lambda name: read_resource(name, package)),
+    )
+    environment.filters |= {"cell": cell_html, "number": number}
+    return environment
 
 
 @cache
+def read_resource(name: str, package: str = "ftlm.svg") -> str:
+    """Return the text of a file of a package."""
+    return resources.files(package).joinpath(name).read_text("utf-8")
+
+
 def style_sheet() -> Markup:
-    """Return the style sheet of all pages."""
-    return Markup(resources.files("ftlm.svg").joinpath("style.css").read_text("utf-8"))  # our own file
-
-
-@cache
-def chart_script() -> str:
-    """Return the JavaScript for zooming charts and reading values with a slider."""
-    return resources.files("ftlm.svg").joinpath("charts.js").read_text("utf-8")
+    """Common style sheet of all pages."""
+    return Markup(read_resource("style.css"))  # our own file
 
 
 @cache
 def _script() -> tuple[Markup, str]:
-    """Return the script element and its hash for the content security policy."""
-    text = chart_script()
+    """Return the script and its hash for the content security policy."""
+    text = read_resource("charts.js")
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return Markup(text), f"sha256-{digest}"  # our own file
 
@@ -252,16 +226,20 @@ def write_page(
         If the file exists and ``force`` is False, or it cannot be written.
     """
     script, digest = _script()
-    page = _template().render(
-        title=title,
-        lead=lead,
-        sections=list(sections),
-        version=__version__,
-        look=style_sheet(),
-        chart_css=chart_css(),
-        script=script,
-        script_hash=digest,
-        verdict=verdict,
+    page = (
+        templates("ftlm.svg")
+        .get_template("page.html.j2")
+        .render(
+            title=title,
+            lead=lead,
+            sections=list(sections),
+            version=__version__,
+            look=style_sheet(),
+            chart_css=chart_css(),
+            script=script,
+            script_hash=digest,
+            verdict=verdict,
+        )
     )
     # A name may hold half a surrogate pair, which no file can.
     return write_atomically(path, page.encode("utf-8", "backslashreplace"), force=force)
