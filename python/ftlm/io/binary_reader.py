@@ -160,16 +160,6 @@ def check_size(rows: int, columns: int) -> None:
         )
 
 
-def timestamp_array(nanoseconds: Any, is_missing: Any) -> tuple[dict[str, Any], Any]:
-    """Return the header entry of a column of timestamps, and its values in nanoseconds since the first valid one."""
-    numpy: Any = importlib.import_module("numpy")
-    rows = numpy.flatnonzero(~is_missing)
-    since = int(nanoseconds[rows[0]]) if rows.size else 0
-    values = (nanoseconds - since).astype(numpy.float64)
-    values[is_missing] = numpy.nan
-    return {"type": "moments", "since": since}, values
-
-
 def read_feather(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     """Return the header of a feather file (version 2, Arrow's IPC format) and its columns."""
     arrow: Any = importlib.import_module("pyarrow")
@@ -201,33 +191,25 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
     numpy: Any = importlib.import_module("numpy")
     types: Any = importlib.import_module("pyarrow.types")
     compute: Any = importlib.import_module("pyarrow.compute")
-    header: dict[str, Any] = {"arrays": [], "skipped": {}, "text": True}
+    arrays = Arrays()
+    arrays.header["text"] = True
     metadata = (table.schema.metadata or {}).get(b"ftlm-run")
     if metadata is not None:
-        header["ftlm-run"] = metadata.decode("utf-8", errors="replace")
+        arrays.header["ftlm-run"] = metadata.decode("utf-8", errors="replace")
     units = _arrow_units(table.schema)
-    arrays = []
     digest = hashlib.sha256(metadata or b"")
     for name, column in zip(table.column_names, table.columns, strict=True):
         kind = column.type
         if types.is_timestamp(kind) or types.is_date(kind):
-            whole = compute.cast(compute.cast(column, "timestamp[ns]"), "int64").combine_chunks()
-            is_missing = numpy.asarray(whole.is_null())
-            entry, values = timestamp_array(whole.fill_null(0).to_numpy(zero_copy_only=False), is_missing)
-            header["arrays"].append({"name": name, "rows": len(values), "columns": 1, **entry})
-            arrays.append(values)
-            continue
-        if not (types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)):
-            header["skipped"][name] = str(kind)
-            continue
-        values = compute.cast(column, "float64").combine_chunks().to_numpy(zero_copy_only=False)
-        single = "single" if types.is_float32(kind) else "double"
-        header["arrays"].append(
-            {"name": name, "rows": len(values), "columns": 1, "type": single, **units.get(name, {})}
-        )
-        arrays.append(numpy.asarray(values, dtype=numpy.float64))
-        digest.update(f"\0{name}\0{len(values)}\0".encode())
-        digest.update(numpy.ascontiguousarray(arrays[-1], dtype="<f8").tobytes())
+            arrays.add(name, compute.cast(column, "timestamp[ns]").to_numpy())
+        elif types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind):
+            form = "float32" if types.is_float32(kind) else "float64"
+            values = compute.cast(column, form).combine_chunks().to_numpy(zero_copy_only=False)
+            arrays.add(name, values, units.get(name, ""))
+            digest.update(f"\0{name}\0{len(values)}\0".encode())
+            digest.update(numpy.ascontiguousarray(values, dtype="<f8").tobytes())
+        else:
+            arrays.header["skipped"][name] = str(kind)
     # Runs written by ftlm store row count and digest.
     check = (table.schema.metadata or {}).get(b"ftlm-check")
     if check is not None and check != f"{table.num_rows} {digest.hexdigest()}".encode():
@@ -235,11 +217,11 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
         raise UnreadableError(
             f"the file is damaged: {table.num_rows} rows were read instead of {entry}, or the checksum differs"
         )
-    return header, arrays
+    return arrays.header, arrays.values
 
 
-def _arrow_units(schema: Any) -> dict[str, dict[str, str]]:
-    """Return the units by column that fields, or the attributes of a pandas frame, state."""
+def _arrow_units(schema: Any) -> dict[str, str]:
+    """Return the units of columns, as fields or the attributes of a pandas frame state them."""
     try:
         whole = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
         units = {str(name): str(unit) for name, unit in whole.items()}
@@ -250,13 +232,13 @@ def _arrow_units(schema: Any) -> dict[str, dict[str, str]]:
         unit = own.get(b"units", own.get(b"unit"))
         if unit is not None:
             units[item.name] = unit.decode("utf-8", errors="replace")
-    return {name: {"unit": unit[:40]} for name, unit in units.items()}
+    return units
 
 
 class Arrays:
     """List of arrays whose total size is limited in bytes."""
 
-    def __init__(self, budget: int) -> None:
+    def __init__(self, budget: int = SIZE_LIMIT) -> None:
         self.header: dict[str, Any] = {"arrays": [], "skipped": {}}
         self.values: list[Any] = []
         self.left = budget
@@ -302,8 +284,12 @@ class Arrays:
                 self.header["skipped"][name] = "a matrix of dates"
                 return
             flat = values.ravel().astype("datetime64[ns]")
-            fields, matrix = timestamp_array(flat.astype(numpy.int64), numpy.isnat(flat))
-            matrix = matrix.reshape(-1, 1)
+            nanoseconds, is_missing = flat.astype(numpy.int64), numpy.isnat(flat)
+            valid = numpy.flatnonzero(~is_missing)
+            since = int(nanoseconds[valid[0]]) if valid.size else 0
+            matrix = (nanoseconds - since).astype(numpy.float64)[:, None]
+            matrix[is_missing] = numpy.nan
+            fields = {"type": "moments", "since": since}
         if unit:
             fields["unit"] = unit[:40]
         self.header["arrays"].append({"name": name, "rows": matrix.shape[0], "columns": matrix.shape[1], **fields})
