@@ -22,6 +22,7 @@ from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import Progress
 from ftlm.report.html_report import grouped_findings
 from ftlm.report.typesetting import equation_html
+from ftlm.reproduction.published_values import page_text
 from ftlm.reproduction.report import angle_chart, make_section, make_table, table_text
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
 from ftlm.structure.structure import Structure
@@ -573,10 +574,7 @@ def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[
         _method_section(result),
     ]
     names = ", ".join(run.name or "" for run in result.runs)
-    lead = (
-        f"Deflections of a flexible arm in runs {names}: each model is fitted to one run and simulated on another, "
-        "with integer orders and with fractional ones in the same terms."
-    )
+    lead = page_text("cross_validation_lead", names=names)
     return write_page(path, title="Integer against fractional orders", sections=sections, lead=lead, force=force)
 
 

@@ -23,7 +23,7 @@ from ftlm.plot.comparison_charts import compared_bars, comparison_charts
 from ftlm.plot.model_charts import pole_charts
 from ftlm.report.html_report import behavior_tables, estimates_table, first_findings, grouped_findings, verdict_box
 from ftlm.report.text_summary import behavior_lines, equation_lines, finding_lines
-from ftlm.reproduction.published_values import INNOVATION_LENGTHS
+from ftlm.reproduction.published_values import INNOVATION_LENGTHS, page_text
 from ftlm.reproduction.report import (
     convergence_chart,
     criteria_cells,
@@ -54,13 +54,6 @@ SAVED_MODELS = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "outpu
 SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
 #: Column widths of the tables of parameters and errors, and of estimates, in the text.
 PAPER_TABLE_WIDTHS, ESTIMATES_WIDTHS = (5,) * 4 + (9,) * 4 + (8, 8, 7, 8, 8, 8), (12, 16, 12, 12, 12)
-TABLE_NOTE = (
-    "Equation error: measured signals on the right-hand side. Free run: output error, with the other output measured; "
-    "the integer-order model has explicit Euler at 2 ms from the current alone, as published, and output error has the "
-    "coupled response to the current alone. Output error has (14)–(15), whose deflection moves with the hub and has no "
-    "current. Integer order, p and least squares have the paper's (22)–(25), in which a derivative of the current is "
-    "missing. p weighs the data against the prior K0 = 1 with coefficients near zero; least squares has no prior."
-)
 
 
 def paper_table(models: Mapping[str, Candidate], *, title: str = "Identified models") -> Table:
@@ -222,7 +215,7 @@ def demo_details(demo: Demo) -> str:
         lines += [*fits_text(stage.candidates), "", derivative_chart(stage.derived).caption, "", "Output error"]
         estimates = estimates_table(stage.candidates["output error"].result, demo.truth[number])
         lines += [*table_text(estimates, 8, ESTIMATES_WIDTHS), ""]
-    lines += [TABLE_NOTE, ""]
+    lines += [page_text("demo_tables"), ""]
     for number, results in demo.results.items():
         for label, result in results.items():
             lines += [f"warning (stage {number}, {label}): {w}" for w in result.warnings]
@@ -250,12 +243,9 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
         *(_stage_section(demo, stage) for stage in demo.results),
         Section("Validation", tables=[fits_table(stage) for stage in demo.stages.values()]),
     ]
-    lead = (
-        "Both stages of a simulated flexible two-link arm with fractional damping, identified from a noisy square run: "
-        "by output error in the arm's own equations, and in the paper's equations with every order on a grid. All "
-        "models are checked on a sine run."
+    return write_page(
+        path, title="ftlm demo", sections=sections, lead=page_text("demo_lead"), force=force, verdict=boxes
     )
-    return write_page(path, title="ftlm demo", sections=sections, lead=lead, force=force, verdict=boxes)
 
 
 def _stage_section(demo: Demo, stage: int) -> Section:
@@ -279,7 +269,7 @@ def _stage_section(demo: Demo, stage: int) -> Section:
     searches = {f"{n}, {o}": s for n, r in results.items() for o, s in r.searches.items()}
     return Section(
         f"Stage {stage}",
-        [*joint_equations(best.model), TABLE_NOTE],
+        [*joint_equations(best.model), page_text("demo_tables")],
         warnings=first,
         more=[*rest, *others],
         tables=[

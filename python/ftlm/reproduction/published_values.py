@@ -83,6 +83,12 @@ def read_texts(name: str) -> dict[str, Any]:
     return tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
 
 
+def page_text(key: str, **values: Any) -> str:
+    """Return a text of page.toml with these values in the place of its placeholders."""
+    text: str = read_texts("page")["texts"][key]
+    return text.format(**values)
+
+
 def _read_rows() -> dict[tuple[str, str, str], PublishedRow]:
     """Return the rows of Tables 4 to 7 by table, angle and model."""
 

@@ -32,6 +32,7 @@ from ftlm.reproduction.published_values import (
     ORDER_LETTERS,
     PRIOR_COVARIANCES,
     WEAK_PRIOR,
+    page_text,
     parameter_name,
     prior_text,
     read_texts,
@@ -70,11 +71,6 @@ from ftlm.validation.comparison import Comparison, Metrics, metrics
 if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
 
-PAPER_REFERENCE = (
-    "Wang, Li, Li, Liang, Gao: Establishment and Identification of Fractional-Order Model for Structurally Symmetric "
-    "Flexible Two-Link Manipulator System, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072"
-)
-PRINTED_NOTE = "Rows in which “printed” stands are the paper's numbers, from the authors' arm; all others are computed."
 OPTIMIZER_LABELS = {"genetic": "genetic algorithm", "differential evolution": "differential evolution"}
 _STRONG_PRIOR, _WEAK_PRIOR = (Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in PRIOR_COVARIANCES)
 #: Heads of columns that page.toml names by @.
@@ -134,11 +130,7 @@ def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
     for output in dict.fromkeys(r.output for r in reproduction.ran if r.output.endswith("1")):
         rows = [r for r in reproduction.ran if r.output == output]
         last = rows[-1]
-        caption = (
-            f"The printed equations of Table {3 + int(output[-2])} from the current alone, and the simulated arm, "
-            f"scaled to the deviation that the printed RMSE / NR implies ({last.implied_deviation:.2g} rad). p = "
-            f"{last.p} moves {last.deviation_ratio:.0f} times less than the angle that it was identified from."
-        )
+        caption = page_text("printed_model_caption", table=3 + int(output[-2]), run=last)
         lines = [("simulated arm", last.arm), *((f"printed, p = {r.p}", r.response) for r in rows)]
         title = f"{symbol(output)}: the printed models under the paper's current"
         charts.append(angle_chart(last.time, lines, output, title, caption))
@@ -175,14 +167,10 @@ def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *,
 
 def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> LineChart:
     """Chart of the measured deflection, of (14)-(15), and of the published form with the same parameters."""
-    nr, bent = metrics(derived.derived, derived.published).nr, derived.correlations
     own = reference_label(simulated=simulated)
     lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
-    caption = (
-        f"Equal parameters in both forms; the order of the current is 0 instead of {derived.order:.3g}. NR between "
-        f"both: {nr:.3g}. Correlation with the current: {own} {bent['measured']:.2f}, (14)–(15) {bent['derived']:.2f}, "
-        f"(22)–(25) {bent['published']:.2f}."
-    )
+    nr = metrics(derived.derived, derived.published).nr
+    caption = page_text("derivative_caption", order=derived.order, nr=nr, own=own, **derived.correlations)
     title = f"{symbol(derived.output)}: which way the link bends"
     return angle_chart(derived.time, lines, derived.output, title, caption)
 
@@ -198,7 +186,7 @@ def _fits_chart(
     fits = ", ".join(f"{label} {c.output_error[output].fit:.4g} %" for label, c in present)
     caption = f"Fit: {fits.replace('inf', '∞').replace('-', '−')}."
     if output.endswith("2") and any(label.startswith("p = ") for label in models):
-        caption += " Rows of p are (23), from which a derivative of the current is missing."
+        caption += f" {page_text('filtered_rows')}"
     title = f"Figure {place}. {symbol(output)}, {'sine' if sine else 'square'} input"
     return [fit_chart(present, output, title, caption, simulated=simulated)]
 
@@ -285,7 +273,9 @@ def make_table(
     texts = read_texts("page")["tables"][key]
     heads_by_name = {**COLUMN_HEADS, **(heads or {})}
     columns = [head for name in texts["columns"] for head in heads_by_name.get(name, (name,))]
-    title, note = (texts.get(name, "").format(printed_note=PRINTED_NOTE, **values) for name in ("title", "note"))
+    title, note = (
+        texts.get(name, "").format(printed_note=page_text("printed_note"), **values) for name in ("title", "note")
+    )
     options = {name: texts[name] for name in ("groups", "wrap", "stacked") if name in texts}
     if isinstance(rows, Mapping):
         groups: dict[str, list[Any]] = {
@@ -522,8 +512,10 @@ def typeset(words: str) -> str:
 
 def joint_equations(model: Model) -> list[str]:
     """Return the equations of a joint model as paragraphs."""
-    words = "(14)–(15) by joint output error, order law and coefficient law imposed:"
-    return [words, *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations)]
+    return [
+        page_text("equations"),
+        *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations),
+    ]
 
 
 def _verdict_section(reproduction: Reproduction) -> Section:
@@ -538,11 +530,10 @@ def _verdict_section(reproduction: Reproduction) -> Section:
         for c in reproduction.checks
     ]
     numbers = ([typeset(text) for text in (c.claim, c.computed, c.printed, c.rule)] for c in reproduction.checks)
-    missing = "No second run was given: nothing is validated, Figure 10 is left out."
     return make_section(
         "verdicts",
         tables=[make_table("verdicts", rows)],
-        warnings=[missing] * (reproduction.sine is None),
+        warnings=[page_text("no_second_run")] if reproduction.sine is None else [],
         folded_tables=[make_table("claims", numbers), *case_tables(reproduction)],
     )
 
@@ -570,7 +561,7 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         fit_chart(
             [("printed orders", s.printed_orders.estimation)],
             s.outputs[1],
-            f"{symbol(s.outputs[1])}: the orders of Table {3 + s.number} with the best coefficients for this run",
+            page_text("printed_orders", angle=symbol(s.outputs[1]), table=3 + s.number),
             simulated=simulated,
         )
         for s in stages
@@ -579,23 +570,23 @@ def _sections(reproduction: Reproduction) -> list[Section]:
         convergence_chart(t, f"{symbol(o)}: error (45), weak prior") for s in stages for o, t in s.weak_traces.items()
     ]
     landscapes = {s.number: s.landscape for s in stages if s.landscape is not None}
-    correlated = [
-        f"Stage {n}: the two orders that this run distinguishes least are {symbol(each.names[0])} and "
-        f"{symbol(each.names[1])} (correlation {number(each.correlation, 3)})."
-        for n, each in landscapes.items()
-    ]
+    correlated = []
+    for n, each in landscapes.items():
+        first, second = map(symbol, each.names)
+        correlation = number(each.correlation, 3)
+        correlated.append(page_text("correlated_orders", stage=n, first=first, second=second, correlation=correlation))
     joint = [s.candidates["output error"].model for s in stages]
     bode = [
         c
         for m in joint
         for c in bode_charts(m, response_frequencies(m, reproduction.square.step, reproduction.square.duration))
     ]
-    sentences = [f"Standard deviations implied by RMSE / NR over those of the models: {deviation_text(reproduction)}."]
+    sentences = [page_text("implied_deviations", ratios=deviation_text(reproduction))] if reproduction.ran else []
     every = [
         _verdict_section(reproduction),
         make_section(
             "printed_models",
-            *(sentences if reproduction.ran else ()),
+            *sentences,
             figures=printed_model_charts(reproduction),
             folded_tables=[printed_runs_table(reproduction)],
         ),
@@ -641,21 +632,9 @@ def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], 
     """Write the reproduction as one HTML page; see :meth:`ftlm.Reproduction.page`."""
     check_free(path, force=force)
     names = " and ".join(f"“{run.name}”" for run in reproduction.runs)
-    origin = (
-        "a simulated arm whose links move with their hubs, truth known,"
-        if reproduction.simulated
-        else f"the runs {names},"
-    )
-    strongest = (
-        f"The printed models, run under the paper's current: {reproduction.checks[0].brief}. "
-        if reproduction.ran
-        else ""
-    )
-    lead = (
-        f"Section 5 of the paper, recomputed on {origin} beside what the paper prints. {typeset(strongest)}Numbers in "
-        f"rows marked “printed” are the paper's; every other number, figure and verdict on this page is computed. "
-        f"{PAPER_REFERENCE}."
-    )
+    origin = page_text("simulated_origin") if reproduction.simulated else f"the runs {names},"
+    strongest = page_text("strongest", brief=reproduction.checks[0].brief) if reproduction.ran else ""
+    lead = page_text("lead", origin=origin, strongest=typeset(strongest))
     return write_page(path, title="The paper reproduced", sections=_sections(reproduction), lead=lead, force=force)
 
 

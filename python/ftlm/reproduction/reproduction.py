@@ -18,12 +18,11 @@ from ftlm.estimation.genetic import GeneticAlgorithm, load_differential_evolutio
 from ftlm.order_search.options import OrderGrid
 from ftlm.progress import format_time_left
 from ftlm.reproduction.checks import Check, checks
-from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, run_printed_models
+from ftlm.reproduction.published_values import AsPrinted, PrintedModelRun, as_printed, page_text, run_printed_models
 from ftlm.reproduction.report import reproduction_page
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, STAGE_NUMBERS, StageNumber, demo_run, truth_of
 from ftlm.reproduction.stage import (
     GRID_ALPHA,
-    RIVALS_OMITTED,
     TRACE_EVERY,
     Panel,
     Preset,
@@ -239,7 +238,7 @@ def reproduce(
         load_pygad()
         load_differential_evolution()
     except ModelError as error:
-        omitted.append(RIVALS_OMITTED.format(error))
+        omitted.append(page_text("rivals_omitted", reason=error))
         log(omitted[0])
     compared_increment = None if omitted else rivals_increment
     if square is None:

@@ -35,6 +35,7 @@ from ftlm.reproduction.published_values import (
     best_orders,
     last_orders,
     neighboring_values,
+    page_text,
 )
 from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
 from ftlm.reproduction.workload import CONTEST_STEP, WorkerProgress, seconds_of, seeds_for
@@ -73,8 +74,6 @@ MAX_FULL_SAMPLES, DECIMATED_SAMPLES = 6000, 2500
 COARSE_INCREMENT, REFINED_CANDIDATES = 0.1, 10
 #: Samples of fits with integer orders, whose systematic residuals do not shrink with more samples.
 INTEGER_FIT_SAMPLES = 1250
-#: Note on a reproduction without the optimizer comparison, with a placeholder for the reason.
-RIVALS_OMITTED = "Tables 6 and 7 and Figure 11 are left out: {}"
 
 
 def published_structure(stage: StageNumber, **changes: Any) -> Structure:
@@ -624,11 +623,7 @@ class StageWork:
             traces = self.traces(models)
             weak = self.traces(dict.fromkeys(models, models[INNOVATION_LENGTHS[-1]]), WEAK_PRIOR)
         else:
-            self.notes.append(
-                f"run {self.on.name} does not start at rest: every model is fitted and compared with initial terms; "
-                "explicit Euler, which steps from rest as in the paper, is not, and its errors hold that; convergence "
-                "of the recursion, and with it Figures 4(b) to 8(b), and the weak prior are left out"
-            )
+            self.notes.append(page_text("moving_start", run=self.on.name))
         rivals = self.rivals(genetic)
         derived = self.dropped_derivative(joint.model)
         self.begin("the landscape of its orders", "landscape")
@@ -754,11 +749,7 @@ class StageWork:
             run = decimate_run(run, run.length // INTEGER_FIT_SAMPLES)
         elif run.length > MAX_FULL_SAMPLES:
             every = -(-run.length // DECIMATED_SAMPLES)
-            self.notes.append(
-                f"run {run.name} has {run.length} rows: joint fits by output error take one of {every} rows, "
-                f"{every * run.step:.6g} s apart, with the means of held currents in between; all models are compared "
-                "on the same block pulses of the whole run"
-            )
+            self.notes.append(page_text("decimated", run=run, every=every, step=every * run.step))
             run = decimate_run(run, every)
         if near is None:
             return self.identify_candidate(label, run, structure)
@@ -783,10 +774,7 @@ class StageWork:
         try:
             return self.joint(label, structure, words, step, near)
         except ConvergenceError as error:
-            self.notes.append(
-                f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
-                "other angle instead"
-            )
+            self.notes.append(page_text("measured_coupling", stage=self.number, label=label, error=error))
         return self.joint(label, replace(structure, coupling="measured"), words, step, near)
 
     def traces(
@@ -810,7 +798,7 @@ class StageWork:
                     self.on, single, grid, genetic, threads=self.threads, progress=self.progress
                 )
             except ModelError as error:
-                self.notes.append(RIVALS_OMITTED.format(error))
+                self.notes.append(page_text("rivals_omitted", reason=error))
                 return {}
             best = dict(zip(MULTI_INNOVATION_LABELS, contest.order_grid.values(), strict=True))
             ends: list[tuple[str, GeneticRun | SearchResult]] = [*contest.optimizers.items(), *best.items()]
