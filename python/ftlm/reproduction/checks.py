@@ -19,6 +19,7 @@ from ftlm.reproduction.published_values import (
     PRIOR_COVARIANCES,
     WEAK_PRIOR,
     PrintedModelRun,
+    page_text,
     prior_text,
     read_texts,
 )
@@ -35,18 +36,8 @@ Word = Literal["holds", "does not hold", "turns with", "cannot be told from a si
 Case = tuple[bool, dict[str, str]]
 #: Factor chosen by the simulation; a verdict that it alone decides reproduces this choice.
 ARM_FACTOR = "the arm"
-#: Relative difference below which two errors are equal.
-MIN_RELATIVE_DIFFERENCE = 0.02
-#: Largest ratio of output error to equation error, and largest NR, of a model that describes the data.
-MAX_ERROR_RATIO, MAX_EXPLAINING_NR = 5.0, 0.5
-#: Relative difference of two standard deviations of one record that the digits of Table 7 allow.
-MAX_DEVIATION_MISMATCH = 0.15
-#: Largest error of an estimate, in standard errors, that is due to chance.
-MAX_STANDARD_ERRORS = 4.0
-#: Smallest relative saving of steps that counts as faster convergence.
-MIN_STEP_SAVING = 0.1
-#: Largest ratio of the standard deviations of a model and of the machine.
-MAX_DEVIATION_RATIO = 2.0
+#: Numbers of the rules; relative differences in percent.
+RULES: Mapping[str, float] = read_texts("claims")["rules"]
 FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 
 
@@ -229,11 +220,8 @@ def deviation_text(reproduction: Reproduction) -> str:
     middle = f"from {ratios[0]:.3g} to {ratios[-1]:.3g}, median {statistics.median(ratios):.3g}"
     if not count:
         return middle
-    return (
-        f"{middle}. The NR of a free run is at least {min(floors):.2g} to {max(floors):.3g}, where {min(values):.2g} "
-        f"to {max(values):.2g} is printed: in {count} of {len(values)} rows Tables 4 and 5 do not hold errors of free "
-        "runs"
-    )
+    floor, nr = ((min(v), max(v)) for v in (floors, values))
+    return page_text("deviations", ratios=middle, floors=floor, values=nr, count=count, rows=len(values))
 
 
 #: Verdict on a claim, and the computed fields of its texts in claims.toml.
@@ -242,8 +230,8 @@ Evidence = tuple[ClaimVerdict, dict[str, Any]]
 
 def movement(reproduction: Reproduction) -> Evidence:
     """Return whether the printed models move as much as the paper's arm."""
-    worst = max(reproduction.ran, key=lambda r: r.deviation_ratio)
-    return _of_rows(reproduction, lambda r: 1 / MAX_DEVIATION_RATIO < r.deviation_ratio < MAX_DEVIATION_RATIO), {
+    worst, most = max(reproduction.ran, key=lambda r: r.deviation_ratio), RULES["deviation_ratio"]
+    return _of_rows(reproduction, lambda r: 1 / most < r.deviation_ratio < most), {
         "angle": symbol(worst.output),
         "p": worst.p,
         "deviation": worst.angle_deviation,
@@ -269,7 +257,7 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
     for r, k in product(reproduction.ran, PRIOR_COVARIANCES):
         a = r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan)
         away = abs(a / printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"] - 1)
-        cases.append(case(away < MIN_RELATIVE_DIFFERENCE, K0=prior_text(k), the_angle=symbol(r.output), p=str(r.p)))
+        cases.append(case(away < RULES["difference"] / 100, K0=prior_text(k), the_angle=symbol(r.output), p=str(r.p)))
         if r.p == LAST_P:
             last[k][r.output] = [a]
         if k in r.orders:
@@ -306,7 +294,7 @@ def printed_orders(reproduction: Reproduction) -> Evidence:
 def error_falls(t: Trial) -> bool:
     """Whether the error (45) never rises with p, and is smaller at the largest p than at the first."""
     e = [t.errors[p] for p in INNOVATION_LENGTHS]
-    return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - MIN_RELATIVE_DIFFERENCE) * e[0]
+    return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - RULES["difference"] / 100) * e[0]
 
 
 def converges_faster(arrived: Mapping[int, float]) -> bool | None:
@@ -315,7 +303,7 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
     if max(steps) <= TRACE_EVERY:
         return None
     # An error that never converges is not faster than another one that does not.
-    earlier = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - MIN_STEP_SAVING) * steps[0]
+    earlier = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - RULES["saving"] / 100) * steps[0]
     return math.isfinite(max(steps)) and earlier
 
 
@@ -414,7 +402,7 @@ def close_orders(reproduction: Reproduction) -> Evidence:
     """Return whether models with the printed orders describe the arm."""
     near = {o: s.printed_orders.estimation for s, o in reproduction.angles}
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
-    holding = {o: out < MAX_ERROR_RATIO * eq and out < MAX_EXPLAINING_NR for o, (eq, out) in nr.items()}
+    holding = {o: out < RULES["error_ratio"] * eq and out < RULES["explaining_nr"] for o, (eq, out) in nr.items()}
     return _of_angles(holding, of_the_machine=reproduction.simulated), {
         "errors": by_angle(nr),
         "stated": _printed_text(lambda row: row.nr, near, digits=4),
@@ -438,7 +426,7 @@ def published_form(reproduction: Reproduction) -> Evidence:
         for name, value in result.orders.items():
             # The one order that the published form alone leaves free is fixed in the other.
             truth, error = reproduction.truth[number].get(name, 2.0), result.standard_errors[name]
-            if not (math.isfinite(error) and abs(value - truth) <= MAX_STANDARD_ERRORS * error):
+            if not (math.isfinite(error) and abs(value - truth) <= RULES["standard_errors"] * error):
                 away.append(f"{symbol(name)} {value:.4g} ± {error:.2g} ({truth:g})")
         count += len(result.orders)
         cases.append(case(len(away) == count_before, the_stage=str(number)))
@@ -476,7 +464,7 @@ def table_3(_: Reproduction) -> Evidence:
     """Return whether Table 3 gives the printed integer-order models."""
     rows = table_3_coefficients()
     ratios = {n: t / p for n, (t, _, p) in rows.items()}
-    off = {n: r for n, r in ratios.items() if abs(r - 1) > MIN_RELATIVE_DIFFERENCE}
+    off = {n: r for n, r in ratios.items() if abs(r - 1) > RULES["difference"] / 100}
     worst = max(off, key=lambda n: abs(math.log(abs(off[n]))))
     return combine_cases([case(not off)]), {
         "off": len(off),
@@ -491,7 +479,7 @@ def table_3(_: Reproduction) -> Evidence:
 def one_record(_: Reproduction) -> Evidence:
     """Return whether Table 7 implies one standard deviation of each angle."""
     spreads = printed.implied_spreads()
-    agreeing = {o: abs(g / m - 1) <= MAX_DEVIATION_MISMATCH for o, (g, m) in spreads.items()}
+    agreeing = {o: abs(g / m - 1) <= RULES["mismatch"] / 100 for o, (g, m) in spreads.items()}
     return _of_angles(agreeing), {"deviations": by_angle(spreads)}
 
 
@@ -503,23 +491,14 @@ def possible_row(_: Reproduction) -> Evidence:
     return combine_cases([case(mean <= row.rmse, the_angle="θ₂₂")]), numbers
 
 
-#: Numbers of the rules, in percent where claims.toml says so.
-_RULE_NUMBERS = {
+#: Fields that the texts of several claims have.
+SHARED_FIELDS = {
     "first_p": FIRST_P,
     "last_p": LAST_P,
     "trace_every": TRACE_EVERY,
     "weak_prior": WEAK_PRIOR,
-    "difference": 100 * MIN_RELATIVE_DIFFERENCE,
-    "saving": 100 * MIN_STEP_SAVING,
-    "mismatch": 100 * MAX_DEVIATION_MISMATCH,
-    "deviation_ratio": MAX_DEVIATION_RATIO,
-    "error_ratio": MAX_ERROR_RATIO,
-    "explaining_nr": MAX_EXPLAINING_NR,
-    "standard_errors": MAX_STANDARD_ERRORS,
     "published": printed,
 }
-
-
 #: Checks in the order of the page; their texts are in claims.toml, by the names of the functions.
 CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
     movement,
@@ -545,7 +524,7 @@ CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
 def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduction) -> Check:
     """Return the check of one claim."""
     ruling, fields = check(reproduction)
-    texts, values = read_texts("claims")[check.__name__], {"counts": ruling.counts} | _RULE_NUMBERS | fields
+    texts, values = read_texts("claims")[check.__name__], {**RULES, "counts": ruling.counts, **SHARED_FIELDS, **fields}
     return Check(ruling=ruling, **{n: texts[n].format(**values) for n in ("claim", "computed", "printed", "rule")})
 
 

@@ -645,7 +645,7 @@ def table_text(table: Table, label: int, widths: Sequence[int]) -> list[str]:
         width = sum(all_widths[at : at + count])
         head += f" {words} ".center(width - 1, "-").rjust(width) if words else " " * width
         at += count
-    lines = [head] if head else []
+    lines = [head.rstrip()] if head else []
     heads = (truncate_text(name, width - 1).rjust(width) for name, width in zip(plain[1:], widths, strict=True))
     lines.append(plain[0].ljust(label) + "".join(heads))
     for i, (name, *cells) in enumerate(table.rows):
