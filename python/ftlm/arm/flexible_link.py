@@ -504,6 +504,26 @@ def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equati
     return _append_terms(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
 
 
+def link_structure(stage: Literal[1, 2, "both"], *, both: bool, filtered: bool = True, rate: bool = True) -> Structure:
+    """Deflection by (15) with the measured hub as input: elasticity and damping of any order, gauge and cable.
+
+    With the angles of the other stage it includes their accelerations, by the energies of the planar arm, and the rate
+    of the other deflection, an observer's gain (``rate``). Initial terms are Caputo's. A history would give fractional
+    orders more parameters on the validation run than integer ones.
+    """
+    structure = flexible_link(
+        stage=stage,
+        hub=False,
+        cross_stage="inertial" if both else False,
+        cross_sensitivity=True,
+        cross_damping=both and rate,
+        sensor_filter="stock" if filtered else None,
+        laws=("orders", "coefficients", "velocities"),
+        offset="constant",
+    )
+    return replace(structure, initial="caputo")
+
+
 @check_arguments
 def link_model(
     *,

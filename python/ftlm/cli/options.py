@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
-from ftlm.arm.flexible_link import Form, InputOrder, Law, flexible_link
+from ftlm.arm.flexible_link import Form, InputOrder, Law, flexible_link, link_structure
 from ftlm.cli.framework import OptionDetails, numbers, pairs, ranges
 from ftlm.data.run import Run
 from ftlm.errors import ModelError
@@ -192,17 +192,7 @@ class StructureOptions:
         stage = stages.get(text.partition(":")[2])
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use arm:1, :2 or :both")
-        built = flexible_link(
-            stage=stage,
-            hub=False,
-            cross_stage=False if alone else "inertial",
-            cross_sensitivity=True,
-            cross_damping=not alone,
-            sensor_filter="stock",
-            laws=("orders", "coefficients", "velocities"),
-            offset="constant",
-        )
-        built = replace(built, initial="caputo")
+        built = link_structure(stage, both=not alone)
         whole = ("beta", 0.0) if alone else ("mu", 1.0)
         return built.with_orders({n: whole[1] for n in built.order_names if n.startswith(whole[0])})
 

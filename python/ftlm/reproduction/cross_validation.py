@@ -11,7 +11,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ftlm.arm.flexible_link import flexible_link
+from ftlm.arm.flexible_link import link_structure
 from ftlm.data.run import Run
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.estimation.identify import identify
@@ -275,26 +275,6 @@ class OrderCrossValidation:
             },
             "notes": list(self.notes),
         }
-
-
-def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool = True) -> Structure:
-    """Deflection by (15) with the measured hub as input: elasticity and damping of any order, gauge and cable.
-
-    With the angles of the other stage it includes their accelerations, by the energies of the planar arm, and the rate
-    of the other deflection, an observer's gain (``rate``). Initial terms are Caputo's. A history would give fractional
-    orders more parameters on the validation run than integer ones.
-    """
-    structure = flexible_link(
-        stage=stage,
-        hub=False,
-        cross_stage="inertial" if both else False,
-        cross_sensitivity=True,
-        cross_damping=both and rate,
-        sensor_filter="stock" if filtered else None,
-        laws=("orders", "coefficients", "velocities"),
-        offset="constant",
-    )
-    return replace(structure, initial="caputo")
 
 
 def dead_channel_notes(runs: Sequence[Run], stages: Sequence[StageNumber]) -> list[str]:
