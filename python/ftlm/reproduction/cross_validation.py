@@ -22,7 +22,7 @@ from ftlm.plot.comparison_charts import pulse_times
 from ftlm.progress import Progress
 from ftlm.report.html_report import grouped_findings
 from ftlm.report.typesetting import equation_html
-from ftlm.reproduction.published_values import page_text
+from ftlm.reproduction.published_values import page_text, read_texts
 from ftlm.reproduction.report import angle_chart, make_section, make_table, table_text
 from ftlm.reproduction.simulated_arm import STAGE_NUMBERS, StageNumber, decimate_run, letter_of
 from ftlm.structure.structure import Structure
@@ -53,12 +53,8 @@ WITHOUT_RATE_LABEL = "without the rate of the other deflection"
 
 #: Structure in the charts: elasticity and damping fractional, as in the paper.
 CHARTED_KIND = "both fractional"
-#: Subject of a verdict for each kind; one of them is a plural.
-VERDICT_SUBJECTS = {
-    "fractional elasticity": "a fractional order of the elasticity",
-    "fractional damping": "a fractional order of the damping",
-    CHARTED_KIND: "fractional orders",
-}
+#: Kinds with a fractional order.
+FRACTIONAL_KINDS = tuple(kind for kind in FREE_ORDERS_BY_KIND if kind != INTEGER_KIND)
 #: Verdict in a table cell.
 VERDICT_CELLS = {True: "yes", False: "no", None: "cannot be told"}
 #: Points of a line.
@@ -187,7 +183,7 @@ class Deflection:
     @property
     def verdicts(self) -> list[Verdict]:
         """Verdicts of all kinds with a fractional order."""
-        return [self.verdict(kind) for kind in FREE_ORDERS_BY_KIND if kind != INTEGER_KIND]
+        return [self.verdict(kind) for kind in FRACTIONAL_KINDS]
 
     def verdict(self, kind: str) -> Verdict:
         """Verdict of one kind, from its gains and intervals."""
@@ -414,12 +410,8 @@ def _deflection(
 
 def verdict_sentence(output: str, verdict: Verdict) -> str:
     """Return a verdict as a sentence."""
-    several = verdict.kind == CHARTED_KIND
-    what, yes = VERDICT_SUBJECTS[verdict.kind], "earn their place" if several else "earns its place"
-    if verdict.earns is None:
-        return f"{symbol(output)}: whether {what} {yes} cannot be told."
-    no = f"do{'' if several else 'es'} not {yes.replace('earns', 'earn')}"
-    return f"{symbol(output)}: {what} {yes if verdict.earns else no}."
+    sentence: str = read_texts("page")["order_verdicts"][verdict.kind][VERDICT_CELLS[verdict.earns]]
+    return f"{symbol(output)}: {sentence}"
 
 
 def _structures(result: OrderCrossValidation) -> list[tuple[str, Deflection]]:
@@ -465,7 +457,7 @@ def rate_effect_table(result: OrderCrossValidation) -> Table | None:
     rows = {
         symbol(output): [
             [kind, *(VERDICT_CELLS[d.verdict(kind).earns] for d in (full.without_rate, full))]
-            for kind in VERDICT_SUBJECTS
+            for kind in FRACTIONAL_KINDS
         ]
         for output, full in result.deflections.items()
         if full.without_rate is not None
@@ -542,7 +534,7 @@ def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[
         See :meth:`ftlm.Identification.report`.
     """
     check_free(path, force=force)
-    each = {kind: [_verdict(o, d.verdict(kind)) for o, d in result.deflections.items()] for kind in VERDICT_SUBJECTS}
+    each = {kind: [_verdict(o, d.verdict(kind)) for o, d in result.deflections.items()] for kind in FRACTIONAL_KINDS}
     first = each.pop(CHARTED_KIND)
     charts = [chart for d in result.deflections.values() for chart in validation_charts(result, d)]
     places = rate_effect_table(result)

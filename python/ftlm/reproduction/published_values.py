@@ -173,12 +173,17 @@ def prior_text(prior: float) -> str:
     return "1" if prior == PRIOR_COVARIANCES[0] else f"10{str(round(math.log10(prior))).translate(SUPERSCRIPT_DIGITS)}"
 
 
-#: Angles in the terms a, b and d of an equation: its own angle, or the other one of its stage.
+#: Interpretations of the terms a, b, d and g: description, and the signal in each term of a hub and of a deflection,
+#: which is the angle itself, the other one of its stage, or the current.
 TERM_INTERPRETATIONS = {
-    "(22)–(25)": "as printed there",
-    "(26), one angle": "every term has the angle itself",
-    "own angle in a": "the angle itself in a, the other one in b and d",
-    "a and b exchanged": "the orders of (22)–(25), the columns a and b of the table exchanged",
+    "(22)–(25)": ("as printed there", "other own other u", "own other own u"),
+    "(26), one angle": ("every term has the angle itself", "own own own u", "own own own u"),
+    "own angle in a": ("the angle itself in a, the other one in b and d", "own other other u", "own other other u"),
+    "a and b exchanged": (
+        "the orders of (22)–(25), the columns a and b of the table exchanged",
+        "own other other u",
+        "other own own u",
+    ),
 }
 #: Values of K0: eight per decade.
 PRIOR_GRID = tuple(float(v) for v in np.logspace(-3, 5, 65))
@@ -313,15 +318,10 @@ class _Angle:
             self._transforms[key] = series, haar_transform(series)
         return self._transforms[key]
 
-    def places(self, terms: str) -> tuple[str, str, str, str]:
+    def places(self, terms: str) -> list[str]:
         """Signal in each of the terms a, b, d, g."""
-        hub = self.output.endswith("1")
-        return {
-            "(22)–(25)": ("other", "own", "other", "u") if hub else ("own", "other", "own", "u"),
-            "(26), one angle": ("own", "own", "own", "u"),
-            "own angle in a": ("own", "other", "other", "u"),
-            "a and b exchanged": ("own", "other", "other", "u") if hub else ("other", "own", "own", "u"),
-        }[terms]
+        _, hub, deflection = TERM_INTERPRETATIONS[terms]
+        return (hub if self.output.endswith("1") else deflection).split()
 
     def regressors(self, terms: str, orders: Mapping[str, float]) -> tuple[Floats, Floats]:
         """Columns a, b, d, g of (42)."""

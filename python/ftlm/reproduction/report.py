@@ -469,7 +469,7 @@ def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
         {o: rows(o) for o in stage.outputs},
         table=3 + stage.number,
         settings="; ".join(
-            f"{o}: {t.reading} ({printed.TERM_INTERPRETATIONS[t.reading.terms]})" for o, t in tables.items()
+            f"{o}: {t.reading} ({printed.TERM_INTERPRETATIONS[t.reading.terms][0]})" for o, t in tables.items()
         ),
         scales=", ".join(f"{o} by {t.scale:.3g}" for o, t in tables.items()),
     )
