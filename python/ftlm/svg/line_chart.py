@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from itertools import cycle
 from typing import Any
@@ -20,7 +20,6 @@ from ftlm.svg.figure import (
     MAX_LINE_POINTS,
     MAX_STRAY_HEIGHTS,
     NARROW_WIDTH_PX,
-    SMALL_WIDTH_PX,
     TENTHS_PER_PIXEL,
     TEXT_GROUP,
     Figure,
@@ -297,10 +296,6 @@ class LineChart(Figure):
         x_low, x_high, y_low, y_high = self.frame
         across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
         return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
-
-    def small(self, height: int = 220) -> LineChart:
-        """Return a copy with the width of charts that are placed side by side; `height` is in pixels."""
-        return replace(self, width=SMALL_WIDTH_PX, height=height)
 
     def draw(self, *, narrow: bool) -> Markup:
         """Return the chart as SVG markup, for a wide or a narrow screen."""
