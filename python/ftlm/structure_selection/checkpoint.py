@@ -25,6 +25,7 @@ from ftlm.structure_selection.cross_validation import Trial
 from ftlm.utils.checkpoint_file import DIGEST_BYTES, RECORD_ENCODER, CheckpointFile, decode_array
 
 Result = TypeVar("Result")
+Expected = TypeVar("Expected")
 #: Version of fit and validation. Results of different versions must not be combined.
 ALGORITHM_VERSION = 3
 #: Errors of a candidate's fit. Any other error is a defect.
@@ -209,9 +210,12 @@ class Store:
         if difference is not None:
             raise DataError(f"store {path} holds a selection {difference}; choose another file")
 
-    def _other(self, description: str, answer: Answer) -> DataError:
+    def _expect(self, answer: Answer, kind: type[Expected], description: str) -> Expected:
+        """Return an answer of the expected kind; raise for another one."""
+        if isinstance(answer, kind):
+            return answer
         words = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}
-        return DataError(
+        raise DataError(
             f"store {self._file.path} holds {words[type(answer)]} where {description} is expected; choose another file"
         )
 
@@ -254,16 +258,10 @@ class Store:
         """Return the stored or computed fit of a structure on all runs, or the error of the fit."""
 
         def write(result: JointFit | FtlmError) -> Answer | None:
-            if isinstance(result, JointFit):
-                return StoredFit.of(result)
-            return FitError.of(result)
+            return StoredFit.of(result) if isinstance(result, JointFit) else FitError.of(result)
 
         def read(answer: Answer) -> JointFit | FtlmError:
-            if isinstance(answer, StoredFit):
-                return answer.fit()
-            if isinstance(answer, FitError):
-                return answer.error()
-            raise self._other("a fit", answer)
+            return answer.error() if isinstance(answer, FitError) else self._expect(answer, StoredFit, "a fit").fit()
 
         return self.recall_or_compute(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
 
@@ -273,9 +271,7 @@ class Store:
         """Return the stored or computed trial of a fitted candidate on validation data."""
 
         def read(answer: Answer) -> Trial:
-            if not isinstance(answer, StoredTrial):
-                raise self._other("a validation", answer)
-            trial = answer.trial
+            trial = self._expect(answer, StoredTrial, "a validation").trial
             fit = None if trial.failed is not None else joint
             return replace(trial, name=name, structure=structure, joint=fit)
 
@@ -289,9 +285,7 @@ class Store:
         """Return the stored or computed result of the best-subset search."""
 
         def read(answer: Answer) -> list[ScreenedSubset]:
-            if not isinstance(answer, StoredSubsets):
-                raise self._other("subsets", answer)
-            return answer.subsets
+            return self._expect(answer, StoredSubsets, "subsets").subsets
 
         return self.recall_or_compute(("subsets", structure), compute, StoredSubsets, read)
 
