@@ -8,7 +8,7 @@ import math
 import os
 import signal
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -370,6 +370,34 @@ class Experiment:
     live: Streaming | None
     progress: Callable[[int, int], None] | None
 
+    def _selected_board(self) -> tuple[Board, dict[str, Any]]:
+        """Return the selected board, and its metadata for the run."""
+        virtual = isinstance(self.rig, str) and self.rig == "virtual"
+        if self.offset is not None and not virtual:
+            raise ModelError("offset is of the virtual arm; a board has its own, leave it out")
+        if virtual:
+            arm = ArmParameters.of(self.parameters)
+            if self.offset is not None:
+                try:
+                    first, second = (float(v) for v in self.offset)
+                except (TypeError, ValueError, OverflowError):
+                    first = second = math.nan
+                if isinstance(self.offset, str) or not (math.isfinite(first) and math.isfinite(second)):
+                    raise ModelError(
+                        f"{setting('offset')} {short_repr(self.offset)} is not a pair of currents [A], of motor 1 and "
+                        "motor 2"
+                    )
+                arm = replace(arm, current_offset=(first, second))
+            board = VirtualBoard(arm, seed=self.seed, real_time=self.real_time, horizon=self.limit)
+            return board, {"parameters": arm.to_dict()}
+        if isinstance(self.rig, str):
+            check_choice("rig", self.rig, ("virtual", "q8"))
+            return QuanserBoard(card=self.board), {"card": self.board}
+        if not hasattr(self.rig, "hardware"):
+            raise ModelError(f"rig is a {type(self.rig).__name__}; use 'virtual', 'q8' or a board of your own")
+        own = getattr(self.rig, "parameters", None)
+        return self.rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
+
     def record_run(self, source_on: Callable[[Board], CommandSource], more_details: dict[str, Any]) -> Run:
         """Run the experiment with a command source and return the recorded run."""
         # Flags that let an arm move must be bool; truthy values are rejected.
@@ -384,15 +412,7 @@ class Experiment:
             raise ModelError(
                 f"{setting('sensor_filter')} {short_repr(self.sensor_filter)} is not known; use 'stock' or None"
             )
-        board, details = _board(
-            self.rig,
-            self.parameters,
-            self.seed,
-            self.offset,
-            real_time=self.real_time,
-            horizon=self.limit,
-            board=self.board,
-        )
+        board, details = self._selected_board()
         paced = self.real_time or board.hardware or bool(getattr(board, "real_time", False))
         if board.hardware and not self.arm:
             raise ModelError(
@@ -511,24 +531,21 @@ def describe_interruption(ended: KeyboardInterrupt | SystemExit) -> str:
     return describe_signal(ended.code - 128 if isinstance(ended.code, int) else 0)
 
 
+@dataclass
 class _Recorder:
     """Recorder that stores the rows of a rig in memory and in a partial file."""
 
-    def __init__(
-        self,
-        partial: PartialRecording,
-        source: CommandSource,
-        progress: Callable[[int, int], None] | None,
-        live: Streaming | None,
-        columns: list[int],
-        block: int,
-    ) -> None:
-        self.partial, self.source, self.progress = partial, source, progress
-        self.live, self.columns, self.block = live, columns, block
-        self.live_error: str | None = None
-        self.taken: list[Floats] = []
-        #: Number of blocks passed on, and of their rows.
-        self.blocks = self.done = 0
+    partial: PartialRecording
+    source: CommandSource
+    progress: Callable[[int, int], None] | None
+    live: Streaming | None
+    columns: list[int]
+    block: int
+    live_error: str | None = None
+    taken: list[Floats] = field(default_factory=list)
+    #: Number of blocks passed on, and of their rows.
+    blocks: int = 0
+    done: int = 0
 
     def follow(self, rig: Rig) -> None:
         """Run the commands of the source, and store the measured rows in blocks."""
@@ -590,42 +607,6 @@ class _Recorder:
             *signals, step=step, units=units_of(extra_names), name=name, notes=facts, metadata=about
         )
         return Run._from_checked(**arguments.checked_fields())
-
-
-def _board(
-    rig: str | Board,
-    parameters: str | os.PathLike[str] | ArmParameters,
-    seed: int,
-    offset: tuple[float, float] | None,
-    *,
-    real_time: bool,
-    horizon: float,
-    board: str,
-) -> tuple[Board, dict[str, Any]]:
-    """Return the board that the arguments select, and metadata on it for the run."""
-    virtual = isinstance(rig, str) and rig == "virtual"
-    if offset is not None and not virtual:
-        raise ModelError("offset applies only to the virtual arm; leave it out for a board")
-    if virtual:
-        arm = ArmParameters.of(parameters)
-        if offset is not None:
-            try:
-                first, second = (float(v) for v in offset)
-            except (TypeError, ValueError, OverflowError):
-                first = second = math.nan
-            if isinstance(offset, str) or not (math.isfinite(first) and math.isfinite(second)):
-                raise ModelError(
-                    f"{setting('offset')} {short_repr(offset)} is not a pair of currents [A], of motor 1 and motor 2"
-                )
-            arm = replace(arm, current_offset=(first, second))
-        return VirtualBoard(arm, seed=seed, real_time=real_time, horizon=horizon), {"parameters": arm.to_dict()}
-    if isinstance(rig, str):
-        check_choice("rig", rig, ("virtual", "q8"))
-        return QuanserBoard(card=board), {"card": board}
-    if not hasattr(rig, "hardware"):
-        raise ModelError(f"rig is a {type(rig).__name__}; use 'virtual', 'q8' or a board of your own")
-    own = getattr(rig, "parameters", None)
-    return rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
 
 
 def _check_target(target: Path, *, force: bool) -> None:
