@@ -30,7 +30,7 @@ from ftlm.structure_selection.select import _predicts_equally, _rank_trials, _re
 from ftlm.structure_selection.stepwise import (
     CandidateEvaluator,
     FittedVariant,
-    _validate_variants,
+    StepwiseSelection,
     evaluate_list,
     format_duration,
     prescreen,
@@ -203,7 +203,7 @@ def test_what_cannot_matter_is_not_judged(runs):
     better, worse = (ahead[k] for k in order)
 
     def names(pair, **more):
-        return [t.name for t in _validate_variants(inside, CandidateEvaluator(folds, 1), pair, **more)]
+        return [t.name for t in StepwiseSelection(inside, CandidateEvaluator(folds, 1)).validate_variants(pair, **more)]
 
     both = names([better, worse])
     assert len(both) == 2

@@ -36,8 +36,8 @@ from ftlm.structure_selection.stepwise import (
     MAX_SCORE_TOLERANCE,
     SCORE_TOLERANCE,
     CandidateEvaluator,
+    StepwiseSelection,
     evaluate_list,
-    select_stepwise,
 )
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
@@ -248,7 +248,7 @@ def _run_selection(
         split = _select_automatically(replace(work, folds=folds, trials=[]), problems)
         return split if split.trials[split.chosen].validation_fit > winner.validation_fit else selection
     for structure in searched:
-        select_stepwise(NestedStructures(structure), work)
+        StepwiseSelection(NestedStructures(structure), work).run()
     if every:
         evaluate_list(every, work)
     return _identify_choice(work, _choose(work, prefers_integer_orders=False))

@@ -248,143 +248,242 @@ def initial_guesses(
     return [dict(zip(places, point, strict=True)) for point in itertools.product(*places.values())]
 
 
-def select_stepwise(inside: NestedStructures, work: CandidateEvaluator) -> list[Trial]:
-    """Select structures by forward selection and backward elimination, and return all trials in sequence.
+@dataclass
+class StepwiseSelection:
+    """Stepwise selection among the structures nested in another one.
 
-    Forward selection runs from a simplest structure for each integer value of the highest orders, because the best of
-    the simplest structures need not be nested in the best structure. With several inputs, one input may act as a proxy
-    for the others; backward elimination from the full structure at integer orders avoids this. If there are enough
-    input terms for best-subset screening, selection starts from the best subset. If no term is optional, it also starts
-    from the structure with all orders free.
+    Parameters
+    ----------
+    inside
+        The nested structures.
+    work
+        Evaluator of the candidates.
+    keys
+        Signatures of the structures that are not fitted again.
     """
-    subsets = work.best_subsets(inside)
-    ends_from_subsets = _select_from_subsets(inside, work, subsets)
-    if ends_from_subsets:
-        # Screened subsets are not fitted again as neighbors of other variants.
-        return _eliminate_from_ends(
-            inside, work, ends_from_subsets, {signature(inside.build(s.change.variant)) for s in subsets}
-        )
-    if not inside.droppable:
-        return _select_from_full(inside, work)
-    changes = _untried_changes(inside, inside.simplest(), set())
-    joints = work.map_candidates(lambda c: work.fit_candidate(inside.build(c.variant), [], refine=False), changes)
-    roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
-    for change, joint in zip(changes, joints, strict=True):
-        roots.setdefault(inside.highest_orders(change.variant), []).append((change, joint))
-    if all(isinstance(j, FtlmError) for j in joints):
-        work.trials += [
-            work.validate(c.words, inside.build(c.variant), j) for c, j in zip(changes, joints, strict=True)
+
+    inside: NestedStructures
+    work: CandidateEvaluator
+    keys: set[str] = field(default_factory=set)
+
+    def run(self) -> list[Trial]:
+        """Select structures from the simplest ones upwards, then downwards; return all validated trials in order.
+
+        Each integer value of the highest orders is an initial structure of its own: the best of the simplest structures
+        need not be nested in the best one. With several inputs, one may act as a proxy for the others, so the best
+        structure is also approached from the full structure at integer orders by backward elimination. If there are
+        enough input terms for best-subset screening, selection starts from the best subset. If no term is optional, the
+        structure with all orders free is a second initial structure.
+        """
+        subsets = self.work.best_subsets(self.inside)
+        ends_from_subsets = self._select_from_subsets(subsets)
+        if ends_from_subsets:
+            # Screened subsets are not fitted again as neighbors of other variants.
+            self.keys = {self._key(s.change) for s in subsets}
+            return self._eliminate_from_ends(ends_from_subsets)
+        if not self.inside.droppable:
+            return self._select_from_full()
+        pairs = self._fit_roughly(self._untried_changes(self.inside.simplest()))
+        fits = [joint.values_by_name for _, joint in pairs if not isinstance(joint, FtlmError)]
+        if not fits:
+            return self._validate_failures(pairs)
+        roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
+        for change, joint in pairs:
+            roots.setdefault(self.inside.highest_orders(change.variant), []).append((change, joint))
+        ends = [self._select_forward(best) for root in roots.values() for best in self._by_criterion(root)[:1]]
+        first = min(ends, key=lambda end: _ranking_key(end[0]))
+        from_above = self._eliminate_from_full(first[1], fits)
+        return self._eliminate_from_ends([*ends, *([] if from_above is None else [from_above])])
+
+    def _build(self, change: Change) -> Structure:
+        return self.inside.build(change.variant)
+
+    def _key(self, change: Change) -> str:
+        return signature(self._build(change))
+
+    def _untried_changes(self, changes: Iterable[Change]) -> list[Change]:
+        """Return changes to untried variants, each once."""
+        return list({key: c for c in changes if (key := self._key(c)) not in self.keys}.values())
+
+    def _fit_roughly(self, changes: Sequence[Change]) -> list[tuple[Change, JointFit | FtlmError]]:
+        """Fit changes from automatic initial guesses, on the first grid alone."""
+        joints = self.work.map_candidates(lambda c: self.work.fit_candidate(self._build(c), [], refine=False), changes)
+        return list(zip(changes, joints, strict=True))
+
+    def _validate_failures(self, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Trial]:
+        """Return the trials of structures none of which can be fitted."""
+        self.work.trials += [self.work.validate(c.words, self._build(c), joint) for c, joint in pairs]
+        return self.work.trials
+
+    def _eliminate_from_ends(self, ends: Sequence[tuple[Trial, FittedVariant]]) -> list[Trial]:
+        """Eliminate terms backward from each forward-selection result that is as good as the best."""
+        least = min(_ranking_key(trial) for trial, _ in ends)
+        for trial, at in ends:
+            if (trial.unstable, trial.score) <= (least[0], least[1] + SCORE_TOLERANCE):
+                self._eliminate_backward(trial, at)
+        return self.work.trials
+
+    def _select_from_full(self) -> list[Trial]:
+        """Select from integer orders upwards, and from all orders free downwards, for equations without optional terms.
+
+        Forward selection from integer orders is skipped if their validation residual far exceeds that with all orders
+        free.
+        """
+        structure = self.inside.structure
+        full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
+        everything = Change(describe_structure(self.inside.build(full)), full)
+        pairs = self._fit_roughly(self._untried_changes([*self.inside.simplest(), everything]))
+        roots = self._by_criterion([p for p in pairs if p[0].variant == full])
+        roots += self._by_criterion([p for p in pairs if p[0].variant != full])[:1]
+        if not roots:
+            return self._validate_failures(pairs)
+        first = self.validate_variants(roots, limit=-math.inf, margin=MAX_ROOT_SCORE_GAP)
+        self.keys = {self._key(r.change) for r in roots}
+        least = min(trial.score for trial in first)
+        ends = [
+            self._select_forward(at, trial)
+            for trial, at in reversed(list(zip(first, roots, strict=False)))
+            if trial.score <= least + MAX_ROOT_SCORE_GAP
         ]
-    ends: list[tuple[Trial, FittedVariant]] = []
-    keys: set[str] = set()
-    for pairs in roots.values():
-        best_changes = _by_criterion(inside, work, pairs)[:1]
-        ends += [_select_forward(inside, work, one, keys) for one in best_changes]
-    if not ends:
-        return work.trials
-    first = min(ends, key=lambda end: _ranking_key(end[0]))
-    joined = [j.values_by_name for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
-    from_above = _eliminate_from_full(inside, work, first[1], joined, keys)
-    ends += [] if from_above is None else [from_above]
-    return _eliminate_from_ends(inside, work, ends, keys)
+        return self._eliminate_from_ends(ends)
 
+    def _select_from_subsets(self, subsets: Sequence[ScreenedSubset]) -> list[tuple[Trial, FittedVariant]]:
+        """Fit and validate the best subsets; extend the best of them by free orders."""
+        if not subsets:
+            return []
+        best_subsets = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
+        by_size: dict[int, ScreenedSubset] = {}
+        for one in subsets:
+            by_size.setdefault(len(one.start), one)
+        best_subsets += [s for s in by_size.values() if s not in best_subsets]
+        joints = self.work.map_candidates(
+            lambda s: self.work.fit_candidate(self._build(s.change), [s.start], refine=False), best_subsets
+        )
+        steps = self._by_criterion([(s.change, j) for s, j in zip(best_subsets, joints, strict=True)])
+        if not steps:
+            return []
+        ends = list(zip(self.validate_variants(steps), steps, strict=True))
+        self.keys = {self._key(s.change) for s in subsets}
+        first = min(ends, key=lambda end: _ranking_key(end[0]))
+        return [first, self._select_forward(first[1], first[0])]
 
-def _eliminate_from_ends(
-    inside: NestedStructures, work: CandidateEvaluator, ends: Sequence[tuple[Trial, FittedVariant]], keys: set[str]
-) -> list[Trial]:
-    """Eliminate terms from each result of forward selection that is as good as the best; return the trials."""
-    least = min(_ranking_key(trial) for trial, _ in ends)
-    for trial, at in ends:
-        if (trial.unstable, trial.score) <= (least[0], least[1] + SCORE_TOLERANCE):
-            _eliminate_backward(inside, work, trial, at, keys)
-    return work.trials
+    def _select_forward(self, candidate: FittedVariant, validated: Trial | None = None) -> tuple[Trial, FittedVariant]:
+        """Add one term, free order or offset at a time while the prediction improves; return the best result."""
+        best = validated or self.validate_variants([candidate])[0]
+        best_at, idle = candidate, 0
+        self.keys.add(self._key(candidate.change))
+        while idle < MAX_IDLE_STEPS:
+            larger = self._untried_changes(self.inside.larger(candidate.change.variant))
+            changes = self._fit_changes(candidate, larger)[:VALIDATED_CHANGES]
+            if not changes:
+                break
+            trials = self.validate_variants(changes, limit=_max_relevant_score(best))
+            self.keys |= {self._key(s.change) for s in changes}
+            place = min(range(len(trials)), key=lambda k: (_ranking_key(trials[k]), k))
+            candidate = changes[place]
+            if _is_better(trials[place], best):
+                best, best_at, idle = trials[place], candidate, 0
+            else:
+                idle += 1
+        return best, best_at
 
+    def _eliminate_from_full(
+        self, low: FittedVariant, values: Sequence[Mapping[str, float]]
+    ) -> tuple[Trial, FittedVariant] | None:
+        """Eliminate one term at a time from the full structure at integer orders; return the best result."""
+        full = self.inside.richest(low.change.variant)
+        if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
+            return None
+        structure = self.inside.build(full)
+        known_values = (low.joint.values_by_name, *values)
+        starts = [initial_guesses(structure, known, full.integer_order_values())[0] for known in known_values]
+        (joint,) = self.work.map_candidates(lambda s: self.work.fit_candidate(s, starts, refine=False), [structure])
+        if isinstance(joint, FtlmError):
+            return None
+        at = FittedVariant(Change(describe_structure(structure), full), joint, 0.0)
+        (best,) = self.validate_variants([at])
+        best_at = at
+        while True:
+            variant = at.change.variant
+            smaller = [
+                c for c in self.inside.smaller(variant) if len(c.variant.coefficients) < len(variant.coefficients)
+            ]
+            fits = self._fit_changes(at, smaller)
+            if not fits:
+                return best, best_at
+            at = fits[0]
+            if self._key(at.change) in self.keys:
+                continue
+            self.keys.add(self._key(at.change))
+            (trial,) = self.validate_variants([at])
+            if _ranking_key(trial) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT):
+                best, best_at = trial, at
 
-def _select_from_full(inside: NestedStructures, work: CandidateEvaluator) -> list[Trial]:
-    """Return the trials for equations without optional terms, in which only orders are selected.
+    def validate_variants(
+        self, candidates: Sequence[FittedVariant], *, limit: float = math.inf, margin: float = 0.0
+    ) -> list[Trial]:
+        """Evaluate fitted variants on validation data, without those that cannot be the best.
 
-    Orders are made free one at a time, or fixed to integers one at a time from all orders free.
+        Variants from the first whose lower bound of the score exceeds `limit` are evaluated after those before it. They
+        are skipped if all their bounds exceed the best score so far by more than the margin.
+        """
 
-    The former is skipped if the validation residual with integer orders far exceeds that with all orders free.
-    """
-    structure = inside.structure
-    full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
-    changes = _untried_changes(
-        inside, [*inside.simplest(), Change(describe_structure(inside.build(full)), full)], set()
-    )
-    joints = work.map_candidates(lambda c: work.fit_candidate(inside.build(c.variant), [], refine=False), changes)
-    pairs = list(zip(changes, joints, strict=True))
-    roots = _by_criterion(inside, work, [p for p in pairs if p[0].variant == full])
-    roots += _by_criterion(inside, work, [p for p in pairs if p[0].variant != full])[:1]
-    if not roots:
-        work.trials += [work.validate(c.words, inside.build(c.variant), j) for c, j in pairs]
-        return work.trials
-    first = _validate_variants(inside, work, roots, limit=-math.inf, margin=MAX_ROOT_SCORE_GAP)
-    keys = {_key(inside, r.change) for r in roots}
-    least = min(trial.score for trial in first)
-    ends = [
-        _select_forward(inside, work, at, keys, trial)
-        for trial, at in reversed(list(zip(first, roots, strict=False)))
-        if trial.score <= least + MAX_ROOT_SCORE_GAP
-    ]
-    return _eliminate_from_ends(inside, work, ends, keys)
+        def one(candidate: FittedVariant) -> Trial:
+            structure = self._build(candidate.change)
+            return self.work.validate(describe_structure(structure), structure, candidate.joint)
 
+        least = [validation_score_bound(f.joint, self.work.folds) for f in candidates]
+        first = next((k for k, level in enumerate(least) if k > 0 and level > limit), len(candidates))
+        trials = self.work.map_candidates(one, candidates[:first])
+        best = min(trials, key=_ranking_key, default=None)
+        if best is not None and (best.unstable or any(level <= best.score + margin for level in least[first:])):
+            trials += self.work.map_candidates(one, candidates[first:])
+        self.work.trials += trials
+        return trials
 
-def _select_from_subsets(
-    inside: NestedStructures, work: CandidateEvaluator, subsets: Sequence[ScreenedSubset]
-) -> list[tuple[Trial, FittedVariant]]:
-    """Return the trials of the best subsets, of which the best are extended by free orders."""
-    if not subsets:
-        return []
-    best_subsets = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
-    by_size: dict[int, ScreenedSubset] = {}
-    for one in subsets:
-        by_size.setdefault(len(one.start), one)
-    best_subsets += [s for s in by_size.values() if s not in best_subsets]
+    def _fit_changes(self, at: FittedVariant, changes: Sequence[Change]) -> list[FittedVariant]:
+        """Fit changes from the current optimum, best first; for long records only survivors of the prescreening."""
+        values = at.joint.values_by_name
+        starts: list[Start] = []
+        for change in changes:
+            structure = self._build(change)
+            whole = {**at.change.variant.integer_order_values(), **change.variant.integer_order_values()}
+            starts.append((structure, initial_guesses(structure, values, whole)))
+        selection = prescreen(self.work.folds.runs, starts, VALIDATED_CHANGES, self.work)
+        joints = self.work.map_candidates(lambda k: self.work.fit_candidate(*starts[k], refine=False), selection)
+        return self._by_criterion([(changes[k], joint) for k, joint in zip(selection, joints, strict=True)])
 
-    def from_grid(subset: ScreenedSubset) -> JointFit | FtlmError:
-        return work.fit_candidate(inside.build(subset.change.variant), [subset.start], refine=False)
+    def _by_criterion(self, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[FittedVariant]:
+        """Sort fitted variants by Schwarz's criterion, with the smallest variance inflation of their residuals."""
+        fits = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
+        if not fits:
+            return []
+        inflation = min(residual_variance_inflation(j) for _, j in fits)
+        count = [parameter_count(self._build(c), j, self.work.folds) for c, j in fits]
+        every = [FittedVariant(c, j, schwarz_criterion(j, n, inflation)) for (c, j), n in zip(fits, count, strict=True)]
+        return sorted(every, key=lambda f: f.bic)
 
-    joints = work.map_candidates(from_grid, best_subsets)
-    steps = _by_criterion(inside, work, [(s.change, j) for s, j in zip(best_subsets, joints, strict=True)])
-    if not steps:
-        return []
-    ends = list(zip(_validate_variants(inside, work, steps), steps, strict=True))
-    keys = {signature(inside.build(s.change.variant)) for s in subsets}
-    first = min(ends, key=lambda end: _ranking_key(end[0]))
-    return [first, _select_forward(inside, work, first[1], keys, first[0])]
+    def _eliminate_backward(self, best: Trial, at: FittedVariant) -> None:
+        """Eliminate one term, free order or offset at a time while the prediction does not get worse."""
+        while True:
+            smaller = self._untried_changes(self.inside.smaller(at.change.variant))
+            changes = [c for c in smaller if _is_adjacent_integer(c, at)]
+            steps = self._fit_changes(at, changes)
+            self.keys |= {self._key(c) for c in changes}
+            trials = self.validate_variants(steps[:VALIDATED_CHANGES], limit=_max_relevant_score(best))
+            better = [
+                (t, s)
+                for t, s in zip(trials, steps, strict=False)
+                if _ranking_key(t) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT)
+            ]
+            if not better:
+                return
+            best, at = min(better, key=lambda pair: _ranking_key(pair[0]))
 
 
 def _ranking_key(trial: Trial) -> tuple[bool, float]:
     """Return the sort key of a trial: instability first, then the score."""
     return trial.unstable, trial.score
-
-
-def _select_forward(
-    inside: NestedStructures,
-    work: CandidateEvaluator,
-    candidate: FittedVariant,
-    keys: set[str],
-    validated: Trial | None = None,
-) -> tuple[Trial, FittedVariant]:
-    """Add one term, free order or offset at a time while the prediction improves; return the best trial."""
-    best = validated or _validate_variants(inside, work, [candidate])[0]
-    best_at, idle = candidate, 0
-    keys.add(_key(inside, candidate.change))
-    while idle < MAX_IDLE_STEPS:
-        larger = _untried_changes(inside, inside.larger(candidate.change.variant), keys)
-        changes = _fit_changes(inside, work, candidate, larger)[:VALIDATED_CHANGES]
-        if not changes:
-            break
-        trials = _validate_variants(inside, work, changes, limit=_max_relevant_score(best))
-        keys |= {_key(inside, s.change) for s in changes}
-        place = min(range(len(trials)), key=lambda k: (_ranking_key(trials[k]), k))
-        candidate = changes[place]
-        if _is_better(trials[place], best):
-            best, best_at, idle = trials[place], candidate, 0
-        else:
-            idle += 1
-    return best, best_at
 
 
 def _max_relevant_score(best: Trial) -> float:
@@ -397,143 +496,10 @@ def _is_better(trial: Trial, than: Trial) -> bool:
     return _ranking_key(trial) < (than.unstable, than.score - MIN_SCORE_IMPROVEMENT)
 
 
-def _eliminate_from_full(
-    inside: NestedStructures,
-    work: CandidateEvaluator,
-    low: FittedVariant,
-    others: Sequence[Mapping[str, float]],
-    keys: set[str],
-) -> tuple[Trial, FittedVariant] | None:
-    """Eliminate one term at a time from the full structure at integer orders; return the best trial, or None."""
-    full = inside.richest(low.change.variant)
-    if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
-        return None
-    structure = inside.build(full)
-    known_values = (low.joint.values_by_name, *others)
-    starts = [initial_guesses(structure, coefficients, full.integer_order_values())[0] for coefficients in known_values]
-    (joint,) = work.map_candidates(lambda item: work.fit_candidate(item, starts, refine=False), [structure])
-    if isinstance(joint, FtlmError):
-        return None
-    at = FittedVariant(Change(describe_structure(structure), full), joint, 0.0)
-    trials = _validate_variants(inside, work, [at])
-    best, best_at = trials[0], at
-    while True:
-        changes = [
-            c
-            for c in inside.smaller(at.change.variant)
-            if len(c.variant.coefficients) < len(at.change.variant.coefficients)
-        ]
-        fits = _fit_changes(inside, work, at, changes)
-        if not fits:
-            return best, best_at
-        at = fits[0]
-        if _key(inside, at.change) in keys:
-            continue
-        keys.add(_key(inside, at.change))
-        (trial,) = _validate_variants(inside, work, [at])
-        if _ranking_key(trial) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT):
-            best, best_at = trial, at
-
-
-def _validate_variants(
-    inside: NestedStructures,
-    work: CandidateEvaluator,
-    candidates: Sequence[FittedVariant],
-    *,
-    limit: float = math.inf,
-    margin: float = 0.0,
-) -> list[Trial]:
-    """Return the trials of fitted variants, except those that cannot be the best.
-
-    Variants are evaluated in two batches. The second starts with the first variant whose lower bound of the score
-    exceeds `limit`. It is skipped if all its bounds exceed the best score of the first batch by more than `margin`.
-    """
-
-    def one(candidate: FittedVariant) -> Trial:
-        return work.validate(_name(inside, candidate), inside.build(candidate.change.variant), candidate.joint)
-
-    least = [validation_score_bound(f.joint, work.folds) for f in candidates]
-    first = next((k for k, level in enumerate(least) if k > 0 and level > limit), len(candidates))
-    trials = work.map_candidates(one, candidates[:first])
-    best = min(trials, key=_ranking_key, default=None)
-    if best is not None and (best.unstable or any(level <= best.score + margin for level in least[first:])):
-        trials += work.map_candidates(one, candidates[first:])
-    work.trials += trials
-    return trials
-
-
-def _fit_changes(
-    inside: NestedStructures, work: CandidateEvaluator, at: FittedVariant, changes: Sequence[Change]
-) -> list[FittedVariant]:
-    """Return the fits of changed variants, sorted by BIC; they start from the current optimum.
-
-    For long records only survivors of the prescreening are fitted.
-    """
-    values = at.joint.values_by_name
-    starts: list[Start] = []
-    for change in changes:
-        structure = inside.build(change.variant)
-        whole = {**at.change.variant.integer_order_values(), **change.variant.integer_order_values()}
-        starts.append((structure, initial_guesses(structure, values, whole)))
-    selection = prescreen(work.folds.runs, starts, VALIDATED_CHANGES, work)
-    joints = work.map_candidates(lambda k: work.fit_candidate(*starts[k], refine=False), selection)
-    return _by_criterion(inside, work, [(changes[k], joint) for k, joint in zip(selection, joints, strict=True)])
-
-
-def _by_criterion(
-    inside: NestedStructures, work: CandidateEvaluator, pairs: Sequence[tuple[Change, JointFit | FtlmError]]
-) -> list[FittedVariant]:
-    """Return fitted variants sorted by BIC, which uses the smallest variance inflation of their residuals."""
-    fits = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
-    if not fits:
-        return []
-    inflation = min(residual_variance_inflation(j) for _, j in fits)
-    count = [parameter_count(inside.build(c.variant), j, work.folds) for c, j in fits]
-    every = [FittedVariant(c, j, schwarz_criterion(j, n, inflation)) for (c, j), n in zip(fits, count, strict=True)]
-    return sorted(every, key=lambda f: f.bic)
-
-
-def _eliminate_backward(
-    inside: NestedStructures, work: CandidateEvaluator, best: Trial, at: FittedVariant, keys: set[str]
-) -> None:
-    """Remove one term, free order or offset at a time while the prediction does not get worse.
-
-    The trials are stored in the evaluator.
-    """
-    while True:
-        changes = [
-            c for c in _untried_changes(inside, inside.smaller(at.change.variant), keys) if _is_adjacent_integer(c, at)
-        ]
-        steps = _fit_changes(inside, work, at, changes)
-        keys |= {_key(inside, c) for c in changes}
-        trials = _validate_variants(inside, work, steps[:VALIDATED_CHANGES], limit=_max_relevant_score(best))
-        better = [
-            (t, s)
-            for t, s in zip(trials, steps, strict=False)
-            if _ranking_key(t) <= (best.unstable, best.score + MIN_SCORE_IMPROVEMENT)
-        ]
-        if not better:
-            return
-        best, at = min(better, key=lambda pair: _ranking_key(pair[0]))
-
-
 def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
     """Whether each order that a change fixes to an integer moves by less than 1 from its estimate."""
     values = at.joint.values_by_name
     return all(abs(v - values[n]) < 1.0 for n, v in change.variant.integer_orders if n in values)
-
-
-def _key(inside: NestedStructures, change: Change) -> str:
-    return signature(inside.build(change.variant))
-
-
-def _untried_changes(inside: NestedStructures, changes: Iterable[Change], keys: set[str]) -> list[Change]:
-    """Return the changes whose variant has not been tried, each variant once."""
-    return list({key: c for c in changes if (key := _key(inside, c)) not in keys}.values())
-
-
-def _name(inside: NestedStructures, candidate: FittedVariant) -> str:
-    return describe_structure(inside.build(candidate.change.variant))
 
 
 def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator) -> list[Trial]:
