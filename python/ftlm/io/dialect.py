@@ -325,9 +325,17 @@ def find_table(
         first if layout_options.skip is None or layout_options.header is None else min(layout_options.header, len(cut))
     )
     names, units, top = _header(cut, top, width, layout_options, source, own=own)
-    layout, assumed = _summarize_layout(cut, layout_options, separator, comma, mark, names, units, top, first)
+    header = 0 if names is None else 1 if units is None else 2
+    layout = Layout(
+        separator=_WORDS_BY_SEPARATOR[separator],
+        decimal="comma" if comma else "point",
+        thousands=mark,
+        skip=cut[top - header].at - 1 if 0 < top - header < len(cut) else 0,
+        header=header,
+    ).under(layout_options)
+    assumed = _layout_assumptions(cut, layout_options, layout, top, units)
     if layout_options.skip is None:
-        _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source, (comma, mark))
+        _check_above(cut[: top - header], width, source, (comma, mark))
     if not own and names is None and top < len(cut):
         _check_headless(cut[top], source, layout_options)
     if names is not None and not own and layout_options.separator is None:
@@ -646,62 +654,30 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
         )
 
 
-def _summarize_layout(
-    cut: list[_Line],
-    layout_options: Layout,
-    separator: str | None,
-    comma: bool,
-    mark: str | None,
-    names: list[str] | None,
-    units: list[str] | None,
-    top: int,
-    first: int,
-) -> tuple[Layout, tuple[Assumption, ...]]:
-    """Return the detected layout, and the assumptions in it."""
-    header = 0 if names is None else 2 if units is not None else 1
-    start = top - header
-    skip = (
-        layout_options.skip
-        if layout_options.skip is not None
-        else 0
-        if start == 0
-        else cut[start].at - 1
-        if start < len(cut)
-        else 0
-    )
-    layout = Layout(
-        separator=_WORDS_BY_SEPARATOR[separator],
-        decimal="comma" if comma else "point",
-        thousands=mark,
-        skip=skip,
-        header=header,
-    ).under(layout_options)
+def _layout_assumptions(
+    cut: list[_Line], given: Layout, layout: Layout, top: int, units: list[str] | None
+) -> tuple[Assumption, ...]:
+    """Return the assumptions in a detected layout; the first row is line `top` of the sample."""
     assumed = []
-    if layout_options.separator is None:
-        words = f"{SEPARATOR_WORDS[separator]} between cells"
-        assumed.append(
-            Assumption(
-                "separator", str(layout.separator), words, layout_parameter(separator=Placeholder("NAME")), False
-            )
-        )
-    if layout_options.decimal is None and comma:
-        example = _decimal_comma(cut)
-        words, otherwise = f"decimal commas, as in {example!r}", layout_parameter(decimal="point")
+    if given.separator is None:
+        words = f"{SEPARATOR_WORDS[SEPARATOR_CHARACTERS[str(layout.separator)]]} between cells"
+        otherwise = layout_parameter(separator=Placeholder("NAME"))
+        assumed.append(Assumption("separator", str(layout.separator), words, otherwise, False))
+    if given.decimal is None and layout.decimal == "comma":
+        words, otherwise = f"decimal commas, as in {_decimal_comma(cut)!r}", layout_parameter(decimal="point")
         assumed.append(Assumption("decimal", "comma", words, otherwise))
-    if layout_options.thousands is None and mark is not None:
-        example = next(
-            c.strip() for line in cut for c in line.cells if detect_thousands_separator(c, comma=comma) == mark
-        )
+    if given.thousands is None and (mark := layout.thousands) is not None:
+        cells, comma = (c for line in cut for c in line.cells), layout.decimal == "comma"
+        example = next(c.strip() for c in cells if detect_thousands_separator(c, comma=comma) == mark)
         words = f"{mark}s group thousands, as in {example!r}"
         assumed.append(Assumption("thousands", mark, words, layout_parameter(thousands="none")))
-    if layout_options.skip is None and skip:
+    if given.skip is None and (skip := layout.skip):
         words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
         assumed.append(Assumption("skip", skip, words, layout_parameter(skip=Placeholder("LINES"))))
-    if layout_options.header is None and units is not None:
+    if given.header is None and units is not None:
         words = f"line {cut[top - 1].at} holds units" if any(units) else f"line {cut[top - 1].at} is a remark"
         assumed.append(Assumption("header", 2, words, layout_parameter(header=1)))
-    elif layout_options.header is None and header == 0:
-        assumed.append(
-            Assumption("header", 0, "no line of names: columns are c1, c2, …", layout_parameter(header=1), False)
-        )
-    return layout, tuple(assumed)
+    elif given.header is None and layout.header == 0:
+        words = "no line of names: columns are c1, c2, …"
+        assumed.append(Assumption("header", 0, words, layout_parameter(header=1), False))
+    return tuple(assumed)

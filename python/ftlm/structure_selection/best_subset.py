@@ -284,8 +284,21 @@ def score_subsets(
     experiments, ends = grid.experiments, np.cumsum([0, *(count for _, count in grid.counts)]).tolist()
     places = [problem.coefficients.index(f"column{k}") for k in range(len(ground.columns))]
 
+    def products_at(point: tuple[float, ...]) -> Floats | None:
+        """Return, for each run, the inner products of the column responses and the residual; None if one diverges."""
+        values = ground.coefficients(point)
+        iterate = Iterate([], [values.get(n, 0.0) for n in problem.coefficients], "", {})
+        try:
+            outcome = minimize_cost(problem, experiments, iterate, evaluations=1, plain=True).outcome
+        except FtlmError:
+            return None
+        rows = np.vstack([np.asarray(outcome["jacobian"])[places], np.asarray(outcome["residuals"])])
+        if not np.isfinite(rows).all():
+            return None
+        return np.stack([rows[:, a:b] @ rows[:, a:b].T for a, b in itertools.pairwise(ends)])
+
     def one(points: Sequence[tuple[float, ...]]) -> list[Floats | None]:
-        return [_products(ground, problem, experiments, ends, places, p) for p in points]
+        return [products_at(point) for point in points]
 
     def all_of(points: Sequence[tuple[float, ...]]) -> list[tuple[tuple[float, ...], Floats]]:
         stable = [p for p in points if ground.is_stable(p)]
@@ -323,29 +336,6 @@ def score_subsets(
             values |= {ground.columns[k].coefficient: c for k, c in zip(subset, verdict.coefficients, strict=True)}
             out.append(ScreenedSubset(change, values, verdict.score))
     return out
-
-
-def _products(
-    ground: BaseModel,
-    problem: FreeProblem,
-    experiments: Sequence[_core.Experiment],
-    ends: Sequence[int],
-    places: Sequence[int],
-    point: tuple[float, ...],
-) -> Floats | None:
-    """Return, for each run, the inner products of column responses and residual at a grid point; None on divergence."""
-    values = ground.coefficients(point)
-    coefficients = [values.get(n, 0.0) for n in problem.coefficients]
-    try:
-        outcome = minimize_cost(
-            problem, experiments, Iterate([], coefficients, "", {}), evaluations=1, plain=True
-        ).outcome
-    except FtlmError:
-        return None
-    rows = np.vstack([np.asarray(outcome["jacobian"])[places], np.asarray(outcome["residuals"])])
-    if not np.isfinite(rows).all():
-        return None
-    return np.stack([rows[:, a:b] @ rows[:, a:b].T for a, b in itertools.pairwise(ends)])
 
 
 def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
