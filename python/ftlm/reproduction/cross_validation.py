@@ -329,6 +329,8 @@ def cross_validate_orders(
     if len({run.name for run in runs}) < len(runs):
         raise DataError(f"runs {join_names(r.name for r in runs)} do not all have names of their own; rename a file")
     stages = stages_in(runs)
+    both = len(stages) == 2
+    structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
     notes: list[str] = []
     runs_used = []
     for run in runs:
@@ -336,27 +338,38 @@ def cross_validate_orders(
         if every > 1:
             notes.append(f"of run {run.name} one of {every} rows is used, {every * run.step:.4g} s apart")
         runs_used.append(decimate_run(run, every) if every > 1 else run)
-    deflections = {}
-    both = len(stages) == 2
     notes += dead_channel_notes(runs, stages)
     if isinstance(progress, Progress):
-        structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
-        each = sum(
-            output_error_cost(run.length, len(s.order_names) + len(s.coefficient_names))
-            for s in structures
-            for run in runs_used
-        )
+        numbers = [len(s.order_names) + len(s.coefficient_names) for s in structures]
+        each = sum(output_error_cost(run.length, count) for count in numbers for run in runs_used)
         fits = len(FREE_ORDERS_BY_KIND) * (2 if both else 1) * each
         progress.expect("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
-    for stage in stages:
-        deflection = _deflection(
-            link_structure(stage, both=both, filtered=filtered), "", runs_used, threads, log, progress
-        )
+
+    def cross_validate(structure: Structure, suffix: str = "") -> Deflection:
+        """Fit every kind of structure to every run."""
+        output, own = structure.outputs[0], [run.select(list(structure.signals)) for run in runs_used]
+        fits: dict[str, dict[str, RunFit]] = {kind: {} for kind in FREE_ORDERS_BY_KIND}
+        failed = {}
+        for kind, free in FREE_ORDERS_BY_KIND.items():
+            letters = {n: letter_of(n) for n in structure.order_names}
+            fixed_orders = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
+            for run in own:
+                log(f"{output}{suffix}: {kind}, fitted to {run.name}")
+                try:
+                    result = identify(run, structure.with_orders(fixed_orders), threads=threads, progress=progress)
+                    fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in own})
+                except FtlmError as error:
+                    if kind == INTEGER_KIND:
+                        raise ModelError(f"{output}, whole orders, fitted to {run.name}: {error}") from error
+                    failed[kind, run.name] = str(error)
+        return Deflection(output, structure, fits, failed)
+
+    deflections = {}
+    for stage, structure in zip(stages, structures, strict=True):
+        deflection = cross_validate(structure)
         if both:
             less = link_structure(stage, both=True, filtered=filtered, rate=False)
-            deflection = replace(
-                deflection, without_rate=_deflection(less, f", {WITHOUT_RATE_LABEL}", runs_used, threads, log, progress)
-            )
+            deflection = replace(deflection, without_rate=cross_validate(less, f", {WITHOUT_RATE_LABEL}"))
         deflections[deflection.output] = deflection
     return OrderCrossValidation(tuple(runs_used), deflections, filtered, tuple(notes))
 
@@ -378,34 +391,6 @@ def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
             f"{parameter('outputs', {'theta11': Placeholder('COLUMN')})}"
         )
     return stages
-
-
-def _deflection(
-    structure: Structure,
-    suffix: str,
-    runs: Sequence[Run],
-    threads: int | None,
-    log: Callable[[str], None],
-    progress: Callable[[int, int], None] | None,
-) -> Deflection:
-    """Fit every kind of structure to every run."""
-    output = structure.outputs[0]
-    runs = [run.select(list(structure.signals)) for run in runs]
-    fits: dict[str, dict[str, RunFit]] = {kind: {} for kind in FREE_ORDERS_BY_KIND}
-    failed = {}
-    for kind, free in FREE_ORDERS_BY_KIND.items():
-        letters = {n: letter_of(n) for n in structure.order_names}
-        fixed_orders = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
-        for run in runs:
-            log(f"{output}{suffix}: {kind}, fitted to {run.name}")
-            try:
-                result = identify(run, structure.with_orders(fixed_orders), threads=threads, progress=progress)
-                fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in runs})
-            except FtlmError as error:
-                if kind == INTEGER_KIND:
-                    raise ModelError(f"{output}, whole orders, fitted to {run.name}: {error}") from error
-                failed[kind, run.name] = str(error)
-    return Deflection(output, structure, fits, failed)
 
 
 def verdict_sentence(output: str, verdict: Verdict) -> str:
