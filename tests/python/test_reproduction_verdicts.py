@@ -306,9 +306,9 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
     monkeypatch.setattr("ftlm.reproduction.stage.compare_optimizers", like)
     monkeypatch.setattr("ftlm.reproduction.stage.compare_optimizers", like)
     monkeypatch.setattr("ftlm.reproduction.stage.trials_of", lambda *_: [])
-    with pytest.raises(ftlm.ModelError):
-        simulated_panel(1, "whole orders", [1], 0.0, 1, order_grid=rivals_order_grid(step))
     preset = Preset(ftlm.OrderGrid(increment=step), None, 2)
+    with pytest.raises(ftlm.ModelError):
+        simulated_panel(1, "whole orders", [1], 0.0, preset, 1)
     work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None)
     assert work.rivals(None) == {}
     assert rivals_order_grid(step, 0.01).increment == step

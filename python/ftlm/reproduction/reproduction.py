@@ -31,10 +31,9 @@ from ftlm.reproduction.stage import (
     StageWork,
     panel_of,
     published_structure,
-    rivals_order_grid,
     simulated_panel,
 )
-from ftlm.reproduction.workload import CONTEST_STEP, TotalProgress, WorkerProgress, seconds_of, seconds_of_all
+from ftlm.reproduction.workload import CONTEST_STEP, TotalProgress, WorkerProgress, seconds_of_all
 from ftlm.utils.files import check_folder, write_atomically
 from ftlm.utils.formatting import attributes, json_value
 from ftlm.utils.parameters import Placeholder, parameter, setting
@@ -264,19 +263,8 @@ def reproduce(
 
     def compute_panel(arm: str, number: StageNumber, steps: WorkerProgress) -> StageOutcome:
         log(f"verdicts: the arm “{arm}”, stage {number}")
-        panel = simulated_panel(
-            number,
-            arm,
-            seeds[1:] if arm == MAIN_ARM else seeds,
-            noise,
-            threads,
-            genetic=genetic,
-            begin=lambda name: steps.begin(seconds_of(name, increment, compared_increment)),
-            progress=steps,
-            order_grid=None if arm == MAIN_ARM else rivals_order_grid(increment, rivals_increment),
-            has_contests=not omitted,
-        )
-        return StageOutcome(panel)
+        own = seeds[1:] if arm == MAIN_ARM else seeds
+        return StageOutcome(simulated_panel(number, arm, own, noise, preset, threads, genetic, steps))
 
     jobs: list[Job] = [partial(compute_stage, n) for n in numbers]
     jobs += [partial(compute_panel, a, n) for a in ([MAIN_ARM, *others] if simulated else []) for n in numbers]

@@ -37,7 +37,7 @@ from ftlm.reproduction.published_values import (
     neighboring_values,
     page_text,
 )
-from ftlm.reproduction.simulated_arm import ARM_VARIANTS, StageNumber, decimate_run, demo_run
+from ftlm.reproduction.simulated_arm import ARM_VARIANTS, MAIN_ARM, StageNumber, decimate_run, demo_run
 from ftlm.reproduction.workload import CONTEST_STEP, WorkerProgress, seconds_of, seeds_for
 from ftlm.simulation.discretization import default_m, prepare
 from ftlm.simulation.initial_conditions import starts_at_rest
@@ -514,47 +514,6 @@ def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None
     return Panel(tuple(trials), tuple(Contest.of(arm, o, rival) for o, rival in stage.rivals.items()), (freed,))
 
 
-def simulated_panel(
-    stage: StageNumber,
-    arm: str,
-    seeds: Sequence[int],
-    noise: float,
-    threads: int | None,
-    *,
-    genetic: GeneticAlgorithm | None = None,
-    order_grid: OrderGrid | None = None,
-    has_contests: bool = True,
-    begin: Callable[[str], None] = lambda _: None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Panel:
-    """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
-
-    Without an order grid there are neither; with ``has_contests=False`` there are no contests. Before each step `begin`
-    is called with its name, a key of `ftlm.reproduction.workload.STEP_COSTS`.
-    """
-    trials: list[Trial] = []
-    contests: list[Contest] = []
-    freed: list[OrderComparison] = []
-    for seed in seeds:
-        run, validation = (
-            demo_run(s, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm]) for s in ("square", "sine")
-        )
-        begin("trials")
-        trials += trials_of(stage, run, arm, seed, threads)
-        if order_grid is None or seed != seeds[0]:
-            continue
-        structure = published_structure(stage)
-        own = run.select(list(structure.signals))
-        work: dict[str, Any] = {"threads": threads, "progress": progress}
-        for output in structure.outputs if has_contests else ():
-            begin("rivals")
-            contest = compare_optimizers(own, structure.equation(output), order_grid, genetic, **work)
-            contests.append(Contest.of(arm, output, contest))
-        begin("freed")
-        freed.append(compare_orders(stage, run, arm, **work, validation=validation))
-    return Panel(tuple(trials), tuple(contests), tuple(freed))
-
-
 @dataclass(frozen=True)
 class Preset:
     """Settings that differ between the reproduction and the demonstration."""
@@ -564,6 +523,54 @@ class Preset:
     trace_every: int  # steps between two points of a convergence curve
     # Of the order grid of the optimizer comparison; None without PyGAD or SciPy.
     rivals_increment: float | None = CONTEST_STEP
+
+    def seconds_of(self, step: str) -> float:
+        """Processor time of a step [s]."""
+        return seconds_of(step, self.order_grid.increment, self.rivals_increment)
+
+
+def simulated_panel(
+    stage: StageNumber,
+    arm: str,
+    seeds: Sequence[int],
+    noise: float,
+    preset: Preset,
+    threads: int | None,
+    genetic: GeneticAlgorithm | None = None,
+    steps: WorkerProgress | None = None,
+) -> Panel:
+    """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
+
+    The main arm has trials alone: its first record is the estimation run, whose cases :func:`panel_of` returns.
+    """
+    trials: list[Trial] = []
+    contests: list[Contest] = []
+    freed: list[OrderComparison] = []
+
+    def begin(step: str) -> None:
+        if steps is not None:
+            steps.begin(preset.seconds_of(step))
+
+    for seed in seeds:
+        run, validation = (
+            demo_run(s, noise=noise, seed=seed, parameters=ARM_VARIANTS[arm]) for s in ("square", "sine")
+        )
+        begin("trials")
+        trials += trials_of(stage, run, arm, seed, threads)
+        if arm == MAIN_ARM or seed != seeds[0]:
+            continue
+        structure = published_structure(stage)
+        own = run.select(list(structure.signals))
+        if preset.rivals_increment is not None:
+            grid = rivals_order_grid(preset.order_grid.increment, preset.rivals_increment)
+            for output in structure.outputs:
+                begin("rivals")
+                single = structure.equation(output)
+                contest = compare_optimizers(own, single, grid, genetic, threads=threads, progress=steps)
+                contests.append(Contest.of(arm, output, contest))
+        begin("freed")
+        freed.append(compare_orders(stage, run, arm, threads, steps, validation=validation))
+    return Panel(tuple(trials), tuple(contests), tuple(freed))
 
 
 @dataclass
@@ -602,7 +609,7 @@ class StageWork:
         """Announce the next step and its share of the whole."""
         self.log(f"stage {self.number}: {words}")
         if isinstance(self.progress, WorkerProgress):
-            self.progress.begin(seconds_of(step, self.preset.order_grid.increment, self.preset.rivals_increment))
+            self.progress.begin(self.preset.seconds_of(step))
 
     def compute_stage(self, genetic: GeneticAlgorithm | None) -> Stage:
         """Compute all results of section 5 for a stage."""
