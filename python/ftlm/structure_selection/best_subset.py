@@ -173,12 +173,39 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
     return sorted(subsets.values(), key=lambda s: (s.score, s.change.words))
 
 
+#: Free own coefficients with the integer orders of their terms.
+Free = tuple[tuple[str, float], ...]
+
+
 def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[BaseModel]:
     """Yield the base models: at most two output terms at integer orders, with and without an offset."""
     structure = inside.structure
     item = structure.equations[0]
     own = [t for t in item.terms if t.signal == item.output]
     tops = inside.integer_values(item.order.names[0]) if item.order.is_single else [item.order.constant]
+    input_terms = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
+    droppable = [t for t in item.terms if t.signal != item.output and t.coefficient in inside.droppable]
+
+    def base_model(variant: Variant, present: Sequence[Term], top: float, free: Free) -> BaseModel | None:
+        """Return a base model with every valid column; None if there is none, or if two terms share a coefficient."""
+        if {t.coefficient for t in droppable} & {n for n, _ in free}:
+            return None
+        columns: list[Column] = []
+        terms: list[Term] = []
+        for term in droppable:
+            names = term.order.names
+            for place in inside.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
+                column = Column(str(term.coefficient), term.signal, place, tuple(names))
+                column_term = column.term(term, f"column{len(columns)}")
+                if _is_valid_input_set(structure, [*present, *input_terms, column_term], top, runs):
+                    columns.append(column)
+                    terms.append(column_term)
+        if not columns:
+            return None
+        offset: Offset = structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none"
+        whole = _with_terms(structure, [*present, *input_terms, *terms], top, offset)
+        return BaseModel(inside, variant, fix_initial_conditions(whole, runs), free, tuple(columns), runs)
+
     keys: set[str] = set()
     for top in (v for v in tops if v > 0):
         for places in itertools.product(*(_candidate_orders(inside, t, top) for t in own)):
@@ -193,7 +220,8 @@ def base_models(inside: NestedStructures, runs: tuple[Run, ...]) -> Iterator[Bas
             offsets = (False, True) if inside.offset_allowed else (False,)
             for offset in (True,) if structure.offset == "constant" else offsets:
                 variant = Variant(frozenset(n for n, _ in free), tuple(sorted(whole.items())), offset)
-                ground = _base_model(inside, variant, [(t, p) for t, p in terms_present], top, free, runs)
+                present = [replace(t, order=Order(p)) for t, p in terms_present]
+                ground = base_model(variant, present, top, free)
                 key = "" if ground is None else signature(ground.structure)
                 if ground is not None and key not in keys:
                     keys.add(key)
@@ -205,42 +233,6 @@ def _candidate_orders(inside: NestedStructures, term: Term, top: float) -> list[
     out: list[float | None] = [None] if term.coefficient in inside.droppable else []
     places = inside.integer_values(term.order.names[0]) if term.order.is_single else [term.order.constant]
     return out + [p for p in places if p < top]
-
-
-def _base_model(
-    inside: NestedStructures,
-    variant: Variant,
-    own: Sequence[tuple[Term, float]],
-    top: float,
-    free: tuple[tuple[str, float], ...],
-    runs: tuple[Run, ...],
-) -> BaseModel | None:
-    """Return a base model with all valid columns; None if there is no valid column or two terms share a coefficient."""
-    item = inside.structure.equations[0]
-    input_terms = [t for t in item.terms if t.signal != item.output and t.fixed is not None]
-    terms_of_output = [replace(t, order=Order(p)) for t, p in own]
-    columns: list[Column] = []
-    terms: list[Term] = []
-    reserved_names = {n for n, _ in free}
-    for term in item.terms:
-        if term.signal == item.output or term.coefficient not in inside.droppable:
-            continue
-        if term.coefficient in reserved_names:
-            return None
-        names = term.order.names
-        for place in inside.integer_values(names[0]) if term.order.is_single else [term.order.constant]:
-            column = Column(str(term.coefficient), term.signal, place, tuple(names))
-            column_term = column.term(term, f"column{len(columns)}")
-            if _is_valid_input_set(inside.structure, [*terms_of_output, *input_terms, column_term], top, runs):
-                columns.append(column)
-                terms.append(column_term)
-    if not columns:
-        return None
-    offset: Offset = (
-        inside.structure.offset if inside.structure.offset == "ramp" else "constant" if variant.offset else "none"
-    )
-    structure = _with_terms(inside.structure, [*terms_of_output, *input_terms, *terms], top, offset)
-    return BaseModel(inside, variant, fix_initial_conditions(structure, runs), free, tuple(columns), runs)
 
 
 def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset: Offset) -> Structure:
