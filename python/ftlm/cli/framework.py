@@ -22,7 +22,7 @@ from ftlm import cli
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.progress import Progress
-from ftlm.utils.files import COMMAND_MESSAGES, check_free, write_atomically
+from ftlm.utils.files import check_free, write_atomically
 from ftlm.utils.formatting import columns, wrap_text
 from ftlm.utils.parameters import use_interface
 from ftlm.utils.resources import duration_bounds, estimate_duration
@@ -277,7 +277,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
         }
         try:
             if outputs:
-                check_free(*(arguments[name] for name in outputs), force=arguments["force"], words=COMMAND_MESSAGES)
+                check_free(*(arguments[name] for name in outputs), force=arguments["force"])
             work(**arguments, **option_records)
             sys.stdout.flush()
         except KeyboardInterrupt:

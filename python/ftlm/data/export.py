@@ -22,7 +22,7 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import as_seconds, missing_mask, uniform_times
 from ftlm.data.units import is_time_name, parse_unit, time_unit_of
 from ftlm.errors import DataError
-from ftlm.utils.files import RUN_MESSAGES, check_new, write_atomically
+from ftlm.utils.files import check_new, write_atomically
 from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import CSV_TIME, Floats, is_run_name, join_names, names_to_columns, nearest
 
@@ -280,17 +280,17 @@ def header_of_line(path: Path, line: bytes) -> Header | None:
 
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
-    """Write a run to a csv file; see :meth:`ftlm.Run.to_csv`."""
-    check_new(path, force=force, words=RUN_MESSAGES)
+    """Write a run as text; see :meth:`ftlm.Run.to_csv`."""
+    check_new(path, force=force)
     columns = _columns(run)
     rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
     text = Header.of(run).line() + "\n".join([",".join(columns), *rows, ""])
-    write_atomically(path, text.encode(), force=force, words=RUN_MESSAGES)
+    write_atomically(path, text.encode(), force=force)
 
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
-    """Write a run to a parquet file; see :meth:`ftlm.Run.to_parquet`."""
-    target = check_new(path, force=force, words=RUN_MESSAGES)
+    """Write a run as a parquet file; see :meth:`ftlm.Run.to_parquet`."""
+    target = check_new(path, force=force)
     try:
         pyarrow = importlib.import_module("pyarrow")
         parquet = importlib.import_module("pyarrow.parquet")
@@ -302,7 +302,7 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> Non
     content = io.BytesIO()
     # Page checksums do not cover the footer with the row count; a digest of all rows does.
     parquet.write_table(table, content, write_page_checksum=True)
-    write_atomically(target, content.getvalue(), force=force, words=RUN_MESSAGES)
+    write_atomically(target, content.getvalue(), force=force)
 
 
 def digest(columns: Mapping[str, Floats], header: str) -> str:

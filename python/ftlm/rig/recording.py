@@ -25,7 +25,7 @@ from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.rig import MAX_RUN_DURATION_S, RIG_COLUMNS, Board, Limits, Rig, check_rate, check_thread, describe_signal
 from ftlm.rig.virtual_board import VirtualBoard
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.files import RUN_MESSAGES, check_free
+from ftlm.utils.files import check_free
 from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import CSV_TIME, Floats, check_choice, check_seed, is_run_name, short_repr
 
@@ -614,7 +614,7 @@ def _check_target(target: Path, *, force: bool) -> None:
         raise DataError(f"{str(target)!r} ends with neither .csv nor .parquet; runs are written as one of them")
     if target.suffix.lower() == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
-    check_free(target, force=force, words=RUN_MESSAGES)
+    check_free(target, force=force)
     partial = partial_path(target)
     # Rows would be written to the target of a dangling link.
     if os.path.lexists(partial) and not force:

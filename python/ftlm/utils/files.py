@@ -31,56 +31,19 @@ PACKAGE_LOGGER.addHandler(logging.NullHandler())
 _NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
-@dataclass(frozen=True)
-class FileMessages:
-    """Wording of error messages on files that cannot be written.
-
-    Parameters
-    ----------
-    quotes_path
-        Whether the path is in quotes.
-    folder
-        Remedy if a folder has the name of the file; empty if a folder is treated like an existing file.
-    failure
-        Message on a failure, with a placeholder for its reason.
-    """
-
-    quotes_path: bool = False
-    folder: str = ""
-    failure: str = "cannot be written: {}; choose another folder"
-
-    def format_path(self, path: Path) -> str:
-        """Return a path as text."""
-        return repr(str(path)) if self.quotes_path else str(path)
-
-
-#: Wording for models, pages and tables; for runs; for outputs of commands.
-DEFAULT_MESSAGES = FileMessages()
-RUN_MESSAGES = FileMessages(
-    quotes_path=True,
-    folder="give the name of a file in it",
-    failure="cannot be written ({}); check the folder and the space left",
-)
-COMMAND_MESSAGES = FileMessages(folder="name a file in it")
-
-
-def check_new(path: str | os.PathLike[str], *, force: bool, words: FileMessages = DEFAULT_MESSAGES) -> Path:
-    """Return a path; raise DataError if it is a folder, or an existing file and ``force`` is False."""
+def check_new(path: str | os.PathLike[str], *, force: bool) -> Path:
+    """Raise for the name of a folder, or of an existing file without ``force``."""
     file = Path(path)
-    if words.folder and file.is_dir():
-        raise DataError(f"{words.format_path(file)} is a folder; {words.folder}")
+    if file.is_dir():
+        raise DataError(f"{file} is a folder; name a file in it")
     status = _link_status(file)
     # A dangling link is a file that someone meant to be there.
     if status is not None and not force:
-        raise DataError(
-            f"{words.format_path(file)} exists; choose another name, or overwrite it with {parameter('force', True)}"
-        )
-    if status is not None and not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+        raise DataError(f"{file} exists; choose another name, or overwrite it with {parameter('force', True)}")
+    if status is not None and not stat.S_ISREG(status.st_mode):
         # A device of the system would be gone, and what stands behind a link is not what was asked for.
         kind = "a link" if stat.S_ISLNK(status.st_mode) else "a device, pipe or socket"
-        raise DataError(
-            f"{words.format_path(file)} is {kind}, no regular file, and is not overwritten; choose another name"
-        )
+        raise DataError(f"{file} is {kind}, no regular file, and is not overwritten; choose another name")
     return file
 
 
@@ -92,20 +55,17 @@ def _link_status(file: Path) -> os.stat_result | None:
         return None
 
 
-def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: FileMessages = DEFAULT_MESSAGES) -> None:
-    """Raise DataError, before a computation, for paths that could not be written after it; None is ignored."""
+def check_free(*paths: str | os.PathLike[str] | None, force: bool) -> None:
+    """Raise before the computation for paths that could not be written after it; None is skipped."""
     for path in paths:
         if path is None:
             continue
-        file = check_new(path, force=force, words=words)
+        file = check_new(path, force=force)
         folder = file.absolute().parent
         if not folder.is_dir():
-            raise DataError(f"{words.format_path(file.parent)} is not a folder; create it first")
+            raise DataError(f"{file.parent} is not a folder; make it first")
         if not os.access(folder, os.W_OK):
-            raise DataError(
-                f"{words.format_path(file)} cannot be written: {words.format_path(file.parent)} is read-only; "
-                "choose another folder"
-            )
+            raise DataError(f"{file} cannot be written: {file.parent} is read-only; choose another folder")
 
 
 def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
@@ -122,19 +82,15 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
         )
 
 
-def write_atomically(
-    path: str | os.PathLike[str], content: bytes, *, force: bool, words: FileMessages = DEFAULT_MESSAGES
-) -> Path:
-    """Write a file atomically, and return its path; readers see either the old or the new content.
-
-    A temporary file is written, flushed to disk and renamed.
+def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: bool) -> Path:
+    """Write a temporary file, flush it to disk and rename it: readers see the old content or the new one.
 
     Raises
     ------
     DataError
         If the file exists and ``force`` is False, or it cannot be written.
     """
-    file = check_new(path, force=force, words=words)
+    file = check_new(path, force=force)
     try:
         # In its folder, since no rename crosses disks; short, so that long names have room.
         beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
@@ -157,7 +113,7 @@ def write_atomically(
             with contextlib.suppress(OSError):
                 beside.unlink()
             # Somebody made it between the check and now.
-            check_new(file, force=False, words=words)
+            check_new(file, force=False)
             raise
         except BaseException:
             with contextlib.suppress(OSError):
@@ -165,7 +121,7 @@ def write_atomically(
             raise
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else None
-        raise DataError(f"{words.format_path(file)} {words.failure.format(why or error)}") from error
+        raise DataError(f"{file} cannot be written: {why or error}; choose another folder") from error
     # The rename itself survives a power cut only when the folder is on disk too; not every system can do that.
     with contextlib.suppress(OSError):
         descriptor = os.open(file.parent, os.O_RDONLY)
