@@ -37,7 +37,7 @@ Case = tuple[bool, dict[str, str]]
 #: Factor chosen by the simulation; a verdict that it alone decides reproduces this choice.
 ARM_FACTOR = "the arm"
 #: Numbers of the rules; relative differences in percent.
-RULES: Mapping[str, float] = read_texts("claims")["rules"]
+RULE_NUMBERS: Mapping[str, float] = read_texts("claims")["rules"]
 FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 
 
@@ -230,7 +230,7 @@ Evidence = tuple[ClaimVerdict, dict[str, Any]]
 
 def movement(reproduction: Reproduction) -> Evidence:
     """Return whether the printed models move as much as the paper's arm."""
-    worst, most = max(reproduction.ran, key=lambda r: r.deviation_ratio), RULES["deviation_ratio"]
+    worst, most = max(reproduction.ran, key=lambda r: r.deviation_ratio), RULE_NUMBERS["deviation_ratio"]
     return _of_rows(reproduction, lambda r: 1 / most < r.deviation_ratio < most), {
         "angle": symbol(worst.output),
         "p": worst.p,
@@ -257,7 +257,9 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
     for r, k in product(reproduction.ran, PRIOR_COVARIANCES):
         a = r.returned_coefficients.get(k, {}).get(printed.parameter_name("a", r.output), math.nan)
         away = abs(a / printed.FRACTIONAL_ROWS[r.output][r.p].coefficients["a"] - 1)
-        cases.append(case(away < RULES["difference"] / 100, K0=prior_text(k), the_angle=symbol(r.output), p=str(r.p)))
+        cases.append(
+            case(away < RULE_NUMBERS["difference"] / 100, K0=prior_text(k), the_angle=symbol(r.output), p=str(r.p))
+        )
         if r.p == LAST_P:
             last[k][r.output] = [a]
         if k in r.orders:
@@ -294,7 +296,7 @@ def printed_orders(reproduction: Reproduction) -> Evidence:
 def error_falls(t: Trial) -> bool:
     """Whether the error (45) never rises with p, and is smaller at the largest p than at the first."""
     e = [t.errors[p] for p in INNOVATION_LENGTHS]
-    return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - RULES["difference"] / 100) * e[0]
+    return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - RULE_NUMBERS["difference"] / 100) * e[0]
 
 
 def converges_faster(arrived: Mapping[int, float]) -> bool | None:
@@ -303,7 +305,7 @@ def converges_faster(arrived: Mapping[int, float]) -> bool | None:
     if max(steps) <= TRACE_EVERY:
         return None
     # An error that never converges is not faster than another one that does not.
-    earlier = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - RULES["saving"] / 100) * steps[0]
+    earlier = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - RULE_NUMBERS["saving"] / 100) * steps[0]
     return math.isfinite(max(steps)) and earlier
 
 
@@ -402,7 +404,9 @@ def close_orders(reproduction: Reproduction) -> Evidence:
     """Return whether models with the printed orders describe the arm."""
     near = {o: s.printed_orders.estimation for s, o in reproduction.angles}
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
-    holding = {o: out < RULES["error_ratio"] * eq and out < RULES["explaining_nr"] for o, (eq, out) in nr.items()}
+    holding = {
+        o: out < RULE_NUMBERS["error_ratio"] * eq and out < RULE_NUMBERS["explaining_nr"] for o, (eq, out) in nr.items()
+    }
     return _of_angles(holding, of_the_machine=reproduction.simulated), {
         "errors": by_angle(nr),
         "stated": _printed_text(lambda row: row.nr, near, digits=4),
@@ -426,7 +430,7 @@ def published_form(reproduction: Reproduction) -> Evidence:
         for name, value in result.orders.items():
             # The one order that the published form alone leaves free is fixed in the other.
             truth, error = reproduction.truth[number].get(name, 2.0), result.standard_errors[name]
-            if not (math.isfinite(error) and abs(value - truth) <= RULES["standard_errors"] * error):
+            if not (math.isfinite(error) and abs(value - truth) <= RULE_NUMBERS["standard_errors"] * error):
                 away.append(f"{symbol(name)} {value:.4g} ± {error:.2g} ({truth:g})")
         count += len(result.orders)
         cases.append(case(len(away) == count_before, the_stage=str(number)))
@@ -464,7 +468,7 @@ def table_3(_: Reproduction) -> Evidence:
     """Return whether Table 3 gives the printed integer-order models."""
     rows = table_3_coefficients()
     ratios = {n: t / p for n, (t, _, p) in rows.items()}
-    off = {n: r for n, r in ratios.items() if abs(r - 1) > RULES["difference"] / 100}
+    off = {n: r for n, r in ratios.items() if abs(r - 1) > RULE_NUMBERS["difference"] / 100}
     worst = max(off, key=lambda n: abs(math.log(abs(off[n]))))
     return combine_cases([case(not off)]), {
         "off": len(off),
@@ -479,7 +483,7 @@ def table_3(_: Reproduction) -> Evidence:
 def one_record(_: Reproduction) -> Evidence:
     """Return whether Table 7 implies one standard deviation of each angle."""
     spreads = printed.implied_spreads()
-    agreeing = {o: abs(g / m - 1) <= RULES["mismatch"] / 100 for o, (g, m) in spreads.items()}
+    agreeing = {o: abs(g / m - 1) <= RULE_NUMBERS["mismatch"] / 100 for o, (g, m) in spreads.items()}
     return _of_angles(agreeing), {"deviations": by_angle(spreads)}
 
 
@@ -524,7 +528,10 @@ CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
 def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduction) -> Check:
     """Return the check of one claim."""
     ruling, fields = check(reproduction)
-    texts, values = read_texts("claims")[check.__name__], {**RULES, "counts": ruling.counts, **SHARED_FIELDS, **fields}
+    texts, values = (
+        read_texts("claims")[check.__name__],
+        {**RULE_NUMBERS, "counts": ruling.counts, **SHARED_FIELDS, **fields},
+    )
     return Check(ruling=ruling, **{n: texts[n].format(**values) for n in ("claim", "computed", "printed", "rule")})
 
 
