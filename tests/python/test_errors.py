@@ -165,7 +165,11 @@ BAD = {
         "definition 'weyl' is not known",
         lambda: ftlm.fractional_derivative(Y, 0.5, step=1, definition="weyl"),
     ),
-    "a keyword that is none": (TypeError, "unexpected keyword argument 'thread'", lambda: search(thread=2)),
+    "a keyword that is none": (
+        TypeError,
+        "unexpected keyword argument 'thread'; did you mean threads=",
+        lambda: search(thread=2),
+    ),
     # Runs
     "no run": (DATA, "no run is given", lambda: identify([])),
     "no run to compare": (DATA, "no run is given", lambda: model().compare([])),

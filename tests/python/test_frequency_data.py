@@ -701,3 +701,19 @@ def test_two_tables_in_a_file_are_refused_with_the_line_of_the_second(tmp_path):
     )
     with pytest.raises(ftlm.DataError, match=words):
         ftlm.load_frequency(tmp_path / "two.csv")
+    (tmp_path / "two.csv").write_text(f"{table}{table}")
+    with pytest.raises(
+        ftlm.DataError, match="line 10 repeats the line of names; save the lines from 10 on as a second"
+    ):
+        ftlm.load_frequency(tmp_path / "two.csv")
+
+
+def test_a_record_with_its_names_repeated_or_a_word_in_a_cell_is_refused_with_the_line(tmp_path):
+    rows = [f"{k},{k % 3},{k % 5}\n" for k in range(20)]
+    (tmp_path / "run.csv").write_text("t,u,y\n" + "".join(rows) + "t,u,y\n" + "".join(rows))
+    with pytest.raises(ftlm.DataError, match="line 22 repeats the line of names"):
+        ftlm.load(tmp_path / "run.csv")
+    rows[7] = "7,ERR,2\n"
+    (tmp_path / "run.csv").write_text("t,u,y\n" + "".join(rows))
+    with pytest.raises(ftlm.DataError, match=r"no output is named, .* column 'u', line 9: 'ERR' is not a number"):
+        ftlm.load(tmp_path / "run.csv")

@@ -75,7 +75,9 @@ def test_forms_that_mean_the_same(text, plain):
     [
         ("D y = a y + b u(t - 0.06)", {"u": 0.06}, {}),
         ("D y = a y + b u(t - 0.06 s)", {"u": 0.06}, {}),
+        ("D y = a y + b u(t + 0.06 s)", {"u": -0.06}, {}),
         ("D y = a y + b u(t - 0:0.5)", {}, {"u": (0.0, 0.5)}),
+        ("D y = a y + b u(t - -0.02:0.5 s)", {}, {"u": (-0.02, 0.5)}),
         ("D y = a y + b D^0.5 u(t - 0.1) + k u(t - 0.1)", {"u": 0.1}, {}),
         ("D y = a y + b sat(u(t - 0.035 s), 0.94)", {"u": 0.035}, {}),
         ("y = 1/(s + 1) e^(-0.1 s) u + exp(-0.2*s)/(s + 2) v", {"u": 0.1, "v": 0.2}, {}),
@@ -84,6 +86,8 @@ def test_forms_that_mean_the_same(text, plain):
 def test_delays_are_read(text, delay, free):
     read = ftlm.equation(text)
     assert (dict(read.delay), dict(read.free_delays)) == (delay, free)
+    # As it is printed, a lead included.
+    assert ftlm.equation(str(read)) == read
 
 
 def test_a_delay_is_given_once():

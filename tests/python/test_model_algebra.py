@@ -89,6 +89,7 @@ def one_lag(delay=0.0):
     [
         (lambda: ftlm.transfer_function([1, 0, 0], [1, 1]), "numerator is of order 2 and the denominator of order 1"),
         (lambda: ftlm.transfer_function([1], [2]), "the denominator is of order 0"),
+        (lambda: ftlm.transfer_function([1], [1, 1], -0.1), "the delay of -0.1 s is below 0"),
         (lambda: ftlm.transfer_function([1], [1] + [0] * 11), "the denominator is of order 11"),
         (lambda: ftlm.transfer_function([], [1, 1]), "num has no coefficient"),
         (lambda: ftlm.transfer_function([1], [0, 0]), "den has no coefficient"),

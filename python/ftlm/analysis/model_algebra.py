@@ -96,14 +96,16 @@ def transfer_function(
     Raises
     ------
     ModelError
-        If the numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
-        a list is empty or of another form, or a number is not finite.
+        The numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
+        a list is empty or of another form, a number is not finite, or the delay is below 0.
 
     Examples
     --------
     >>> print(ftlm.transfer_function([1], [(2, 1.5), (1, 0)], 0.1).equations[0])
     D^1.5 y = -0.5 y + 0.5 u
     """
+    if isinstance(delay, Real) and delay < 0:
+        raise ModelError(f"the delay of {delay:g} s is below 0: the output would lead its input; give 0 or more")
     return Ratio(_polynomial("num", num), _polynomial("den", den), delay).model(output, input)
 
 

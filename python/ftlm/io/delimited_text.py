@@ -296,6 +296,12 @@ def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: st
         if not rows.ragged:
             rows.ragged_line, rows.ragged_cells = content[wrong[0]][0], cells[wrong[0]]
         rows.ragged += len(wrong)
+    repeated = next((at for (at, _), row in zip(content, cells, strict=True) if row == dialect.names), None)
+    if repeated is not None:
+        raise DataError(
+            f"{source}: line {repeated} repeats the line of names; save the lines from {repeated} on as a second file, "
+            "and give both files as two runs, or remove that line if the record goes on"
+        )
     if not rows.ragged:
         # float() accepts underscores between digits; numbers in files must not have them.
         plain = not dialect.comma and dialect.mark is None and not any("_" in line for _, line in content)

@@ -192,10 +192,12 @@ def run_from_tables(
     roles = _assume_roles(selection, pool, signals) if header is None else ()
     _check_disjoint_roles(selection, pool)
     if not selection.outputs:
+        # A column with a word among its numbers is no signal by its name.
+        words = next((f"; {c.problem}" for c in pool.columns if c.problem is not None and not c.blank), "")
         raise DataError(
             "no output is named, and the names of the columns do not say which they are; name the signals with "
             f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}, or in a file for "
-            f"{parameter('columns')}; {pool.describe()}"
+            f"{parameter('columns')}; {pool.describe()}{words}"
         )
     if header is None:
         add_file_units(selection, pool)

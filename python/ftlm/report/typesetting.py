@@ -28,7 +28,7 @@ from ftlm.utils.statistics import NORMAL_95
 #: Decimals of an order in an equation; the model file stores all digits.
 ORDER_DECIMALS = 4
 THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # our constant
-_DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
+_DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>{}</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _LIMITED_INPUT = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
 _IN_PARENTHESES = Markup("<mrow><mo>(</mo>{}<mo>)</mo></mrow>")
 _GAUSSIAN_DECAY = Markup(
@@ -50,7 +50,7 @@ def equation_html(
     item
         Equation.
     delay
-        Delays of inputs [s] by name; a delayed input is written u(t − 0.035 s).
+        Delays of inputs [s]; a delayed input is written u(t − 0.035 s), one that leads u(t + 0.035 s).
     limits
         Known saturations and dead zones of inputs; a saturated input is written sat(u, 0.94).
     offset
@@ -134,8 +134,8 @@ def _symbol_math(name: str) -> Markup:
 
 def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[InputNonlinearity] = ()) -> Markup:
     text = _symbol_math(signal)
-    if delay > 0:
-        text += _DELAYED_TIME.format(_number_math(_short(delay)), THIN_SPACE)
+    if delay:
+        text += _DELAYED_TIME.format("−" if delay > 0 else "+", _number_math(_short(abs(delay))), THIN_SPACE)
     for limit in limits:
         if limit.signal == signal and not isinstance(limit.value, tuple):
             text = _LIMITED_INPUT.format(

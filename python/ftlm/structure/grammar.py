@@ -12,7 +12,8 @@ an expression in parentheses. Blanks between names, numbers and symbols do not m
                 |  number ["*"] "(" sum ")" ["/" number]
     term        = {number ["*" | "/"]} [name ["*"]] (derivative | product | "D" ["^" order] group) ["/" number]
     derivative  = ["D" ["^" order]] signal  |  signal {"'"}  |  "dy/dt"  |  "d^2 y/dt^2"  |  "d/dt" signal
-    signal      = name ["(t" ["-" delay ["s"]] ")"]  |  "sat(" signal "," limit ")"  |  "dead(" signal "," limit ")"
+    signal      = name ["(t" [("-" | "+") delay ["s"]] ")"]
+                |  "sat(" signal "," limit ")"  |  "dead(" signal "," limit ")"
     product     = power {"*" power}
     power       = (number | group | function group | derivative) ["^" number]
     group       = "(" {sign} product {sign {sign} product} ")"
@@ -604,8 +605,8 @@ class EquationParser:
             delay = -float(self._take()[1])
         elif self._accept("-"):
             delay = self._delay(signal)
-            # The unit of a printed model.
-            self._position += self._sees("s")
+        # The unit of a printed model.
+        self._position += self._sees("s")
         self._expect(")")
         self._check_delay(signal, delay)
 
@@ -629,9 +630,10 @@ class EquationParser:
         """Parse a number, or an interval ``low:high`` for an estimate, and return it."""
         ends = []
         while True:
+            sign = -1.0 if self._accept("-") else 1.0
             if self._peek()[0] != "number":
                 raise self._syntax_error(expectation)
-            ends.append(float(self._take()[1]))
+            ends.append(sign * float(self._take()[1]))
             if len(ends) == 2 or not self._accept(":"):
                 return ends[0] if len(ends) == 1 else (ends[0], ends[1])
 

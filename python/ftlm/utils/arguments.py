@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import difflib
 import functools
 import inspect
 import math
@@ -97,12 +98,24 @@ def _is_raised_by_caller(error: BaseException) -> bool:
     return False
 
 
+def _raise_unknown_keyword(signature: inspect.Signature, kwargs: Mapping[str, Any], error: Exception) -> None:
+    """Raise TypeError that names the keywords of a function if one of the given ones is not among them."""
+    names = [n for n, p in signature.parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    takes_any = any(p.kind == p.VAR_KEYWORD for p in signature.parameters.values())
+    unknown = next((name for name in kwargs if name not in names), None)
+    if unknown is not None and not takes_any:
+        near = difflib.get_close_matches(unknown, names, 1)
+        known = f"did you mean {near[0]}=?" if near else f"known: {', '.join(n for n in names if n != 'self')}"
+        raise TypeError(f"{error}; {known}") from None
+
+
 def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, error: Exception) -> None:
     """Raise ModelError for the first argument whose type is not the annotated one."""
     signature = inspect.signature(function)
     try:
         bound = signature.bind(*args, **kwargs)
     except TypeError:
+        _raise_unknown_keyword(signature, kwargs, error)
         return
     names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))
     for name, value in bound.arguments.items():
