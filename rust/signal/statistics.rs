@@ -256,6 +256,60 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     (best, remaining)
 }
 
+/// Autoregression 1, a₁, …, aₙ of a series and the innovation variance, by Burg's method.
+///
+/// The series is not centered, and a root may lie as close to 1 as that of a random walk, whose color the Yule-Walker
+/// equations underestimate (Kay, Modern Spectral Estimation, §7.6). The order minimizes Akaike's criterion. NaN is a
+/// missing sample.
+///
+/// ```
+/// // The sum of ±1 is a random walk: each value predicts the next one.
+/// let mut state = 1_u32;
+/// let mut sign = || {
+///     state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+///     if state >> 31 == 0 { 1.0 } else { -1.0 }
+/// };
+/// let walk: Vec<f64> = (0..1000).scan(0.0, |sum, _| { *sum += sign(); Some(*sum) }).collect();
+/// let (filter, power) = ftlm::signal::statistics::burg_filter(&walk, 10);
+/// assert!((filter.iter().sum::<f64>()).abs() < 0.02 && (power - 1.0).abs() < 0.05);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
+    let present: Vec<bool> = series.iter().map(|v| !v.is_nan()).collect();
+    let mut forward: Vec<f64> = series.iter().map(|v| if v.is_nan() { 0.0 } else { *v }).collect();
+    let mut backward = forward.clone();
+    let count = present.iter().filter(|v| **v).count().max(1) as f64;
+    let mut power = inner(&forward, &forward) / count;
+    let (mut best, mut current, mut remaining) = (vec![1.0], vec![1.0], power);
+    let mut least = count * libm::log(power);
+    for order in 1..=most.min(series.len().saturating_sub(1)) {
+        let pairs = (order..series.len()).filter(|&t| present[t] && present[t - order]);
+        let (across, total) = pairs.fold((0.0, 0.0), |(across, total), t| {
+            let (one, other) = (forward[t], backward[t - 1]);
+            (across + one * other, total + one * one + other * other)
+        });
+        let reflection = -2.0 * across / total;
+        power *= 1.0 - reflection * reflection;
+        if power.is_nan() || power <= 0.0 {
+            break;
+        }
+        for t in (order..series.len()).rev() {
+            let (one, other) = (forward[t], backward[t - 1]);
+            (forward[t], backward[t]) = (one + reflection * other, other + reflection * one);
+        }
+        current.push(0.0);
+        let turned: Vec<f64> = current.iter().rev().copied().collect();
+        current.iter_mut().zip(turned).for_each(|(a, b)| *a += reflection * b);
+        let criterion = count * libm::log(power) + 2.0 * order as f64;
+        if criterion < least {
+            (least, remaining) = (criterion, power);
+            best.clone_from(&current);
+        }
+    }
+    (best, remaining)
+}
+
 /// Samples needed for each lag of an input in an ARX model, all runs together.
 const SAMPLES_AN_INPUT_LAG: usize = 40;
 /// Share of a column of a regression that is left beside the columns before it, below which it is dropped.

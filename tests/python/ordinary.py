@@ -1,4 +1,4 @@
-"""Ordinary records for tests: ten kinds of input, five of noise and seven plants, by SciPy and NumPy alone."""
+"""Ordinary records for tests: ten kinds of input, six of noise and seven plants, by SciPy and NumPy alone."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ INPUTS = (
     *("PRBS", "telegraph", "levels", "pulses", "white", "low-pass"),
     *("multisine", "chirp", "walk", "bursts"),
 )
-NOISES = ("white", "strong", "coloured", "heavy", "of motion")
+NOISES = ("white", "strong", "coloured", "heavy", "of motion", "walking")
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,9 @@ def drawn_noise(kind: str, clean: np.ndarray, rng: np.random.Generator) -> np.nd
             return 0.1 * size * lfilter([np.sqrt(1 - 0.81)], [1, -0.9], white)
         case "heavy":
             return 0.03 * size * rng.standard_t(3, clean.size)
+        case "walking":
+            # The zero of a sensor that wanders, by 5, 10 or 20 % of the signal over the record.
+            return rng.choice([0.05, 0.1, 0.2]) * size * np.cumsum(white) / np.sqrt(clean.size)
     # A sensor that is quiet where the machine is: its noise follows the speed.
     return 0.2 * np.abs(np.gradient(clean)) * white
 
@@ -111,6 +114,6 @@ def record(plant: str, kind: str, noise: str, seed: int, rows: int = ROWS, quiet
 
 
 def records(seeds: Iterable[int]) -> Iterator[Record]:
-    """The panel: 350 records a seed."""
+    """The panel: 420 records a seed."""
     for names in itertools.product(PLANTS, INPUTS, NOISES, seeds):
         yield record(*names)

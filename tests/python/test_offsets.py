@@ -385,7 +385,7 @@ def test_the_test_for_an_offset_keeps_its_level(kind):
 
 def test_the_test_for_an_offset_is_that_of_dense_regression():
     # The oracle: sensitivities of the free run by differences, noise of known white colour.
-    run, truth = fractional_run(2, 0.02, noise=0.05), {"a": 0.7, "b": 1.4}
+    run, truth = fractional_run(2, 0.005, noise=0.05), {"a": 0.7, "b": 1.4}
     structure = ftlm.equation("D^0.8 y = -a y + b u", initial="rest")
     found = offset_test([run], structure, truth, every=4)
     steps = 4 * (run.length - 1)
@@ -402,7 +402,7 @@ def test_the_test_for_an_offset_is_that_of_dense_regression():
     column = column - others @ np.linalg.lstsq(others, column, rcond=None)[0]
     every = np.column_stack([others, column])
     rest = missed - every @ np.linalg.lstsq(every, missed, rcond=None)[0]
-    expected = (column @ missed) ** 2 / (column @ column) / (rest @ rest / (rest.size - 3))
+    expected = rest.size * np.log1p((column @ missed) ** 2 / (column @ column) / (rest @ rest))
     assert found.statistic == pytest.approx(expected, rel=0.05)
 
 

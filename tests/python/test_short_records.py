@@ -73,3 +73,16 @@ def test_poles_out_of_the_range_of_numbers_are_refused():
     assert not ftlm.analysis.poles(ftlm.Model(ftlm.equation("D^0.01 y = -1e12 y + 2 u"))).size
     slow = ftlm.analysis.poles(ftlm.Model(ftlm.equation("D^1.5 y = -1e-200 D^0.5 y + 2 u")))
     np.testing.assert_allclose(slow, [-1e-200], rtol=1e-9)
+
+
+def test_rows_that_a_model_fits_exactly_end_in_a_result_or_in_words():
+    # Residuals of 0 have no size with which other initial conditions could be compared.
+    for seed in range(60):
+        g = np.random.default_rng(seed)
+        run = ftlm.Run.from_arrays(
+            step=1e3,
+            inputs={"u": g.standard_normal(5)},
+            outputs={"y": 1e-9 * np.cumsum(g.standard_normal(5))},
+        )
+        with contextlib.suppress(*IN_WORDS):
+            ftlm.identify(run, LINEAR, threads=1)

@@ -87,7 +87,8 @@ def with_intervals(
             again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
         except FtlmError:
             break
-        if all(v > (1.0 - MIN_NOISE_REDUCTION) * level[o] for o, v in again.noise.items()):
+        exact = joint.exact_outputs(runs)
+        if all(o in exact or v > (1.0 - MIN_NOISE_REDUCTION) * level[o] for o, v in again.noise.items()):
             joint = replace(again, starts=joint.starts, origin=joint.origin)
             continue
         joint = replace(again, origin="a lower optimum that the search for its intervals came upon")

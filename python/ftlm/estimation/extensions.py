@@ -1,6 +1,6 @@
 """Tests whether an extended structure, or other initial conditions, explain the colored residuals of a fit.
 
-The extensions are a linear drift of an output, another intersample behavior of an input (``"zoh"`` or ``"foh"``), a
+Extensions are a constant, a drift of the level, another intersample behavior of an input (``"zoh"`` or ``"foh"``), a
 lag, a delay or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared input, and a load
 step.
 """
@@ -37,8 +37,9 @@ from ftlm.structure.expression import apply, channel, constant, multiply, power
 from ftlm.structure.input_nonlinearity import InputEffect, input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Offset, Structure
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import Floats
-from ftlm.validation.comparison import simulate_runs
+from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, simulate_runs
 from ftlm.validation.residual_tests import (
     DEFAULT_LAGS,
     NoiseModel,
@@ -158,12 +159,14 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     raises it. An extension is reported only if its own residuals depend neither on an input nor on the direction of
     motion.
 
-    Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
-    with a coefficient law are tested only for drift and intersample behavior. Structures with other nonlinear terms are
-    tested only for intersample behavior.
+    Residuals that are rounding and discretization errors show nothing.
+
+    Structures with friction, limits or free delays are not tested. Those of several equations or with a coefficient law
+    are tested for drift and intersample behavior alone, those with non-linear terms for intersample behavior alone.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
-    colored = any(not o.whiteness.passed or o.follows_direction for o in tests.outputs.values())
+    large = [o for o in tests.outputs.values() if not o.nr <= NEGLIGIBLE_RESIDUAL_SHARE]
+    colored = any(not o.whiteness.passed or o.follows_direction for o in large)
     is_excluded = structure.has_friction or structure.limits or structure.free_inputs
     if joint is None or not joint.names or not colored or is_excluded:
         return ExtensionTests([])
@@ -173,7 +176,11 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     try:
         joint, runs = _first_samples(joint, structure, runs)
         own = _prediction_criterion(joint, structure, runs, 0)
-        extensions = [*_drift_extensions(structure, joint, runs), *_intersample_extensions(structure, joint, runs)]
+        is_poor = any(not o.nr <= MAX_NORMALIZED_RESIDUAL for o in large)
+        extensions = [
+            *_offset_extensions(structure, joint, runs, is_poor=is_poor),
+            *_intersample_extensions(structure, joint, runs),
+        ]
         if names:
             extensions += _input_extensions(structure, joint, runs, names)
             extensions += [
@@ -206,6 +213,11 @@ def _extension_findings(
     extension, refit = best.extension, best.fit
     if not _passes_residual_tests(best, runs):
         return missing
+    if extension.code == "offset_missing":
+        change = _largest_change(joint, refit)
+        test = f"with it {change['parameter']} is {change['other_value']:.4g}, not {change['value']:.4g}"
+        share = 100.0 * (1.0 - min(change["ratio"], 1.0))
+        return [make_finding("offset_missing", output=about["output"], share=share, test=test)]
     if extension.code == "drift_fits":
         return [make_finding("drift_fits", **about, **_largest_change(joint, refit))]
     if extension.code == "other_intersample_fits":
@@ -240,12 +252,22 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
     return tuple(n for n in runs[0].inputs if n in structure.equations[0].signals)
 
 
-def _drift_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the structure extended by a linear drift of each output; [] if nonlinear or if an offset was requested."""
+def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:
+    """Return the linear structure with a constant, and with levels that change linearly; none if offsets were given.
+
+    A fit that explains little may be far from one with a constant, which then has initial guesses of its own.
+    """
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
-    count = (2 if structure.offset == "none" else 1) * len(structure.equations) * len(runs)
-    return [Extension("drift_fits", replace(structure, offset="ramp"), count, [], near=joint)]
+    count, extensions = len(structure.equations) * len(runs), []
+    if structure.offset == "none":
+        with contextlib.suppress(FtlmError):
+            constant_structure = replace(structure, offset="constant")
+            starts = [joint.values_by_name, *([None] if is_poor else [])]
+            extensions.append(Extension("offset_missing", constant_structure, count, [], starts=starts))
+        count *= 2
+    drift = replace(structure, offset="ramp")
+    return [*extensions, Extension("drift_fits", drift, count, [], starts=[joint.values_by_name])]
 
 
 def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
@@ -612,6 +634,9 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
         return []
     if all(rest_evidence(run, structure) is not None for run in runs):
         # Another finding states the evidence of rest, or that rest is assumed.
+        return []
+    if joint.exact_outputs(runs) == set(joint.noise):
+        # The squares of rounding errors compare nothing.
         return []
     own_setting = joint.initial if joint.initial == "rest" else "caputo", structure.offset
 

@@ -85,8 +85,8 @@ from ftlm.validation.residual_tests import (
 
 #: Findings on residuals that known missing dynamics explain.
 SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
-#: Findings on effects that have a mean, as a missing offset has.
-HAVE_MEAN_CODES = ("square_fits", "drift_fits", "friction_fits")
+#: Findings of extensions that have a mean, which the test of an offset finds as well.
+HAVE_MEAN_CODES = ("square_fits", "offset_missing", "drift_fits", "friction_fits")
 #: Share of the work of an identification that decides about the start of its runs.
 HYPOTHESES_SHARE = 0.7
 #: Initial terms of fits with a level.
@@ -262,6 +262,9 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
             fresh = has_level and candidate is None
             near = fit if candidate is None else candidate[1]
             level = hypotheses.fit(request) if fresh else hypotheses.refit(request, near, is_preferred)
+            if level is not None and level.joint is not None and not (fresh or level.joint.converged):
+                # The optimum under other initial conditions is far from every one with these.
+                level = hypotheses.fit(request)
         except FtlmError:
             continue
         if level is not None and level.joint is not None and is_preferred(level.joint):

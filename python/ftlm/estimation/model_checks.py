@@ -22,11 +22,17 @@ from ftlm.estimation.result import Identification
 from ftlm.findings import Finding, make_finding, unique
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import compared_values, has_nonuniform_samples
-from ftlm.simulation.initial_conditions import RestEvidence, noise_at_start, resolve_start, rest_evidence
+from ftlm.simulation.initial_conditions import (
+    START_SETTINGS,
+    RestEvidence,
+    noise_at_start,
+    resolve_start,
+    rest_evidence,
+)
 from ftlm.simulation.output_samples import OutputSamples
 from ftlm.structure.structure import Structure
 from ftlm.utils.linalg import dot
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared, is_white, robust_deviation
+from ftlm.utils.statistics import chi_squared, is_white, robust_deviation
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_findings
 from ftlm.validation.data_advice import check_excitation, find_dead_channel
@@ -116,9 +122,7 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
         is_bounded = name in joint.profiles and 0.0 not in joint.profiles[name]
         if name not in unidentifiable and not errors[name] <= abs(value) and not is_bounded:
             findings.append(make_finding("not_different_from_0", parameter=name, value=value, error=errors[name]))
-    findings += correlation_findings(joint) + unbounded_interval_findings(joint, unidentifiable)
-    coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
-    return [*findings, *(make_finding("residuals_not_white", output=output) for output in coloured)]
+    return findings + correlation_findings(joint) + unbounded_interval_findings(joint, unidentifiable)
 
 
 def second_optimum_findings(
@@ -169,7 +173,8 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
             for a, b, e in zip(joint.values.tolist(), values, errors, strict=True)
         )
     ]
-    if not far or joint.robust is not None or not problem.structure.is_linear:
+    exact = len(joint.exact_outputs(runs)) == len(problem.structure.outputs)
+    if not far or exact or joint.robust is not None or not problem.structure.is_linear:
         return []
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     first = max(MAX_SECOND_SAMPLES // len(runs), MIN_SECOND_RUN_SAMPLES)
@@ -245,15 +250,13 @@ def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) 
 
 
 def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[Finding]:
-    """Return findings on outliers, quantization and interpolated nonuniform samples."""
-    findings = []
-    for output in problem.structure.outputs:
-        size = math.sqrt(float(np.mean([np.nanvar(run[output]) for run in runs])))
-        noise = joint.noise[output]
-        if noise <= NEGLIGIBLE_RESIDUAL_SHARE * size:
-            continue
+    """Return findings on the color of residuals, outliers, quantization and interpolated nonuniform samples."""
+    outputs = [o for o in problem.structure.outputs if o not in joint.exact_outputs(runs)]
+    coloured = [o for o in sorted(outputs) if not all(is_white(part[o]) for part in joint.residuals)]
+    findings = [make_finding("residuals_not_white", output=output) for output in coloured]
+    for output in outputs:
         findings += _outlier_findings(runs, problem.structure, joint, output)
-        findings += _quantization_findings(runs, problem.structure, output, noise)
+        findings += _quantization_findings(runs, problem.structure, output, joint.noise[output])
     run_names = [
         run.name for run in runs if run.sample_times is not None and not has_nonuniform_samples(run, problem.structure)
     ]
@@ -293,7 +296,7 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
     With a zero-order hold the change acts from that sample on, so a strictly proper model responds one sample later.
     """
     row = evidence.rows
-    if not 0 < row < run.length - 1 or run.sample_times is not None:
+    if not START_SETTINGS.quiet_rows <= row < run.length - 1 or run.sample_times is not None:
         return []
     changes = [n for n in evidence.inputs if run[n][row] != run[n][row - 1]]
     findings = []
@@ -306,7 +309,11 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
         noise = noise_at_start(y)
         early, slope = float(y[row]) - level, float(y[row + 1] - y[row])
         rows = early / slope if slope else math.inf
-        if abs(early) > EARLY_SIGMAS * noise and EARLY_ROWS[0] <= rows <= EARLY_ROWS[1]:
+        # A level that walks is no longer where it was, but its last change is one of many.
+        increments = np.diff(drop_missing(y[: row + 1]))
+        usual = max(noise, float(np.sqrt(np.mean(increments[:-1] ** 2))))
+        is_early = abs(early) > EARLY_SIGMAS * noise and abs(increments[-1]) > EARLY_SIGMAS * usual
+        if is_early and EARLY_ROWS[0] <= rows <= EARLY_ROWS[1]:
             numbers = {"row": row, "size": abs(early) / noise, "rows": rows}
             inputs = enumerate_names([t.signal for t in driven])
             about = {"run": run.name, "output": item.output, "input": inputs}

@@ -31,11 +31,18 @@ from ftlm.simulation.output_samples import initial_exponents, is_in_motion
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Structure, offset_exponents
-from ftlm.utils.linalg import column_norms, dot, orthonormal, projections, thin_svd
+from ftlm.utils.linalg import (
+    column_norms,
+    dot,
+    minimum_norm_solution,
+    orthonormal,
+    projections,
+    thin_svd,
+    triangular_factor,
+)
 from ftlm.utils.statistics import (
     NEGLIGIBLE_RESIDUAL_SHARE,
     SIGNIFICANCE_LEVEL,
-    autoregression,
     chi_squared,
     is_white,
     robust_deviation,
@@ -46,6 +53,12 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS
 
 #: Block pulses per sampling interval if the fit does not state its refinement.
 DEFAULT_PULSES_PER_SAMPLE = 2
+#: Fits of the noise to the residuals and of the columns under that noise, in turn.
+NOISE_FITS = 4
+#: Samples of the shortest run for each lag of an autoregression.
+SAMPLES_PER_NOISE_LAG = 10
+#: Singular values of whitened columns, relative to the largest one, below which they are collinear.
+NOISE_RANK_TOLERANCE = 1e-10
 #: Relative size of the offset sensitivity below which it is collinear with the other parameters.
 OFFSET_COLLINEARITY_TOLERANCE = 1e-6
 #: Smallest reported effect of an offset, as a fraction of the standard deviation of the output.
@@ -68,7 +81,7 @@ class OffsetTest:
     Parameters
     ----------
     statistic
-        Score statistic, valid for colored residuals; chi-squared distributed if there is no offset.
+        Likelihood ratio under colored residuals; chi-squared distributed without an offset.
     degrees
         Number of identifiable constants over all equations and runs; 0 if none is identifiable.
     share
@@ -84,8 +97,12 @@ class OffsetTest:
     size: float
 
     def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = NEGLIGIBLE_RESIDUAL_SHARE) -> bool:
-        """Whether the statistic is significant at `level`, and the effect on the output is larger than `size`."""
-        return self.degrees > 0 and self.size > size and self.statistic > chi_squared(self.degrees, level)
+        """Whether the statistic is significant at `level` and the effect is larger than `size`.
+
+        An effect larger than the deviation of the output is no noise of any color, whatever the statistic.
+        """
+        significant = self.size > 1.0 or self.statistic > chi_squared(self.degrees, level)
+        return self.degrees > 0 and self.size > size and significant
 
     @property
     def statistic_text(self) -> str:
@@ -180,10 +197,9 @@ def offset_test(
     if count == 0 or not total > 0:
         return OffsetTest(0.0, 0, 0.0, 0.0)
     along = projections(basis_part, residuals)
-    # Where the numbers come from a fit with an offset, part of what it does lies along their sensitivities.
-    noise = residuals - basis_part @ along - basis @ projections(basis, residuals)
-    spread = _colored_covariance(basis_part, noise, blocks, residuals.size - basis.shape[1] - count)
-    statistic = float(along @ np.linalg.pinv(spread) @ along)
+    # The initial terms, which are projected out of all columns, are fitted anew under the color of the noise.
+    common = np.column_stack([basis, *_initial_responses(point, blocks, residuals.size)])
+    statistic = _prediction_ratio(common, np.column_stack([common, basis_part]), residuals, blocks)
     explained = basis_part @ along
     sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
     weights = [w for _ in runs for w in grid.weights]
@@ -234,25 +250,103 @@ def _residual_blocks(grid: Objective) -> list[list[tuple[int, int]]]:
     return blocks
 
 
-def _colored_covariance(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:
-    """Return the covariance of the projections of noise onto directions; each output's noise is autoregressive."""
-    total: Floats = np.zeros((directions.shape[1], directions.shape[1]))
-    scale = noise.size / max(degrees, 1)
-    for output in range(len(blocks[0])):
-        places = [slice(*own[output]) for own in blocks]
-        series = [noise[p] for p in places]
-        filtered = autoregression(series, DEFAULT_LAGS)
-        errors = np.concatenate([np.convolve(e, filtered, "valid") for e in series])
-        power = float(np.mean(errors**2)) * scale
-        for place in places:
-            size = place.stop - place.start
-            divisor = np.zeros(size)
-            divisor[: min(filtered.size, size)] = filtered[:size]
-            # Noise is what 1/A makes of white noise; its transpose runs through the directions backwards.
-            turned = [_core.series_divide(np.ascontiguousarray(d[place][::-1]), divisor) for d in directions.T]
-            stacked = np.stack(turned)
-            total += power * np.einsum("ik,jk->ij", stacked, stacked)
-    return total
+def _initial_responses(point: Iterate, blocks: list[list[tuple[int, int]]], size: int) -> list[Floats]:
+    """Return the responses to the initial terms of each run, as columns of all residuals."""
+    columns = []
+    for responses, own in zip(point.outcome["initial_responses"], blocks, strict=True):
+        if len(responses):
+            columns.append(np.zeros((size, len(responses))))
+            columns[-1][own[0][0] : own[-1][1]] = responses.T
+    return columns
+
+
+def _prediction_ratio(few: Floats, many: Floats, residuals: Floats, blocks: list[list[tuple[int, int]]]) -> float:
+    """Return twice the logarithm of the likelihood ratio of two sets of columns under autoregressive noise.
+
+    One-step prediction errors are compared: the mean of a random walk is as large as the walk, but its changes are
+    white. Each set has an order of its own, because a high order imitates a constant.
+    """
+    outputs = [[slice(*own[k]) for own in blocks] for k in range(len(blocks[0]))]
+    shortest = [min(p.stop - p.start for p in places) for places in outputs]
+    most = [min(DEFAULT_LAGS, size // SAMPLES_PER_NOISE_LAG) for size in shortest]
+    orders = [_prediction_criterion(columns, residuals, outputs, most)[1] for columns in (few, many)]
+    starts = [max(pair) for pair in zip(*orders, strict=True)]
+    one, other = (_prediction_criterion(columns, residuals, outputs, starts)[0] for columns in (few, many))
+    return max(one - other, 0.0)
+
+
+def _prediction_criterion(
+    columns: Floats, residuals: Floats, outputs: Sequence[Sequence[slice]], starts: Sequence[int]
+) -> tuple[float, list[int]]:
+    """Return the criterion of residuals without columns, by generalized least squares, and the orders of the noise.
+
+    The noise of each output is an autoregression, fitted to the rows of its runs from its start on.
+    """
+    both, amounts = np.column_stack([columns, residuals]), projections(columns, residuals)
+    best, orders = math.inf, list(starts)
+    for _ in range(NOISE_FITS):
+        noise = residuals - columns @ amounts
+        fits = [_fit_autoregression([noise[p] for p in places], s) for places, s in zip(outputs, starts, strict=True)]
+        criterion = sum(f.criterion for f in fits)
+        if not criterion < best:
+            break
+        best, orders = criterion, [f.order for f in fits]
+        whitened = np.concatenate(
+            [
+                f.whiten(both[place], start)
+                for f, places, start in zip(fits, outputs, starts, strict=True)
+                for place in places
+            ]
+        )
+        amounts = minimum_norm_solution(whitened[:, :-1], whitened[:, -1], NOISE_RANK_TOLERANCE)
+    return best, orders
+
+
+@dataclass(frozen=True)
+class _Autoregression:
+    """Autoregression without a constant: whitening filter, deviation and criterion of prediction errors."""
+
+    filter: Floats
+    deviation: float
+    criterion: float
+
+    @property
+    def order(self) -> int:
+        return self.filter.size - 1
+
+    def whiten(self, columns: Floats, start: int) -> Floats:
+        """Return prediction errors of columns, in their standard deviations, from a row on."""
+        rows = columns[start - self.order :].T
+        return np.stack([np.convolve(row, self.filter, "valid") for row in rows], axis=1) / self.deviation
+
+
+def _fit_autoregression(series: Sequence[Floats], most: int) -> _Autoregression:
+    """Return an autoregression of series or of their changes, by least squares from row ``most`` of each on.
+
+    The series are not centered. The order has the least criterion of Akaike, because white noise on a random walk has a
+    long autoregression. An estimated root near 1 is biased toward noise with a mean, so that a root other than 1 counts
+    as a parameter of Schwarz's criterion.
+    """
+    windows = np.concatenate([np.lib.stride_tricks.sliding_window_view(e, most + 1) for e in series])
+    rows = len(windows)
+    # Lags first, the predicted row last: each order is a part of one triangular factor.
+    factor = triangular_factor(np.column_stack([windows[:, -2::-1], windows[:, -1]]))
+    fits = [_nested_regression(factor, rows, np.ones(1), math.log(rows))]
+    if most:
+        changes = np.column_stack([factor[:, :-2] - factor[:, 1:-1], factor[:, -1] - factor[:, 0]])
+        fits.append(_nested_regression(triangular_factor(changes), rows, np.array([1.0, -1.0]), 0.0))
+    return min(fits, key=lambda fit: fit.criterion)
+
+
+def _nested_regression(factor: Floats, rows: int, difference: Floats, penalty: float) -> _Autoregression:
+    """Return the regression of the last column of a triangular factor on the first ones of least criterion."""
+    last = factor[:, -1]
+    powers = np.maximum(np.cumsum(last[::-1] ** 2)[::-1] / rows, np.finfo(np.float64).tiny)
+    criteria = rows * np.log(powers) + 2.0 * np.arange(last.size) + penalty
+    order = int(np.argmin(criteria))
+    coefficients = np.linalg.lstsq(factor[:order, :order], last[:order], rcond=None)[0]
+    through = np.convolve(np.append(1.0, -coefficients), difference)
+    return _Autoregression(through, math.sqrt(powers[order]), float(criteria[order]))
 
 
 def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str]) -> list[Finding]:

@@ -25,7 +25,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import memory_limit, stop_flag
-from ftlm.utils.statistics import NORMAL_95
+from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, NORMAL_95
 from ftlm.utils.validation import Floats
 
 Loss = Literal["squares", "huber"]
@@ -221,6 +221,11 @@ class JointFit:
             slope = np.array([factors.count(n) * value / v if v else 0.0 for n, v in self.coefficients.items()])
             out[name] = float(propagated_errors(slope[None], spread)[0])
         return out
+
+    def exact_outputs(self, runs: Sequence[Run]) -> set[str]:
+        """Return the outputs whose residuals are rounding and discretization errors, not noise."""
+        sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in self.noise}
+        return {o for o, noise in self.noise.items() if noise <= NEGLIGIBLE_RESIDUAL_SHARE * sizes[o]}
 
     @property
     def names(self) -> list[str]:

@@ -159,8 +159,9 @@ class OutputResiduals:
 
     @property
     def has_colored_correlation(self) -> bool:
-        """Whether the residuals are finite, colored, and correlated with an input."""
-        return math.isfinite(self.rms) and not self.whiteness.passed and any(t.failed for t in self.inputs.values())
+        """Whether the residuals are finite, not white, and correlated with an input or the direction of motion."""
+        tests = [*self.inputs.values(), *([self.direction] if self.direction else [])]
+        return math.isfinite(self.rms) and not self.whiteness.passed and any(t.failed for t in tests)
 
     @property
     def is_noise(self) -> bool:
@@ -383,12 +384,16 @@ def run_residual_tests(
         direct = {s for t in item.terms for s in t.signals if t.order.constant >= item.order.constant - ORDER_TOLERANCE}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
         outputs[name] = _test_output(residuals[name], gaps, signals, lags, deviation, commands, runs[0].inputs)
+        signs: list[Floats] = []
         if item.friction is None and model.structure.is_linear and math.isfinite(outputs[name].rms):
             row = model.outputs.index(name)
             moves = [np.gradient(f.outputs[row]) if item.order.constant > 1.0 else f.outputs[row] for f in free]
-            outputs[name] = _test_direction(outputs[name], moves, lags, item.order.constant)
+            signs = _signs_of_motion(moves)
+            slope = math.inf if item.order.constant > 1.0 else sign_tanh_slope(moves)
+            outputs[name] = _test_direction(outputs[name], signs, lags, slope)
         if sensitivities is not None and outputs[name].has_colored_correlation:
-            outputs[name] = _test_beyond_parameters(outputs[name], sensitivities().get(name, []), signals, lags)
+            own = sensitivities().get(name, [])
+            outputs[name] = _test_beyond_parameters(outputs[name], own, signals, signs, lags)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
@@ -432,38 +437,46 @@ def _test_output(
     return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
 
-def _test_direction(output: OutputResiduals, velocities: Sequence[Floats], lags: int, order: float) -> OutputResiduals:
-    """Return the residuals of an output with a test of their dependence on the sign of a simulated velocity.
-
-    Missing dry friction causes such a dependence.
-    """
+def _signs_of_motion(velocities: Sequence[Floats]) -> list[Floats]:
+    """Return the sign of simulated velocities at each residual, 0 at rest; empty if nothing moves."""
     largest = max(float(np.max(np.abs(v))) for v in velocities)
     if not 0.0 < largest < math.inf:
+        return []
+    return [np.where(np.abs(v) > MAX_REST_VELOCITY_RATIO * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
+
+
+def _test_direction(output: OutputResiduals, signs: list[Floats], lags: int, slope: float) -> OutputResiduals:
+    """Test whether residuals depend on the sign of a simulated velocity, as they do if dry friction is missing."""
+    if not signs:
         return output
-    signs = [np.where(np.abs(v) > MAX_REST_VELOCITY_RATIO * largest, np.sign(v), 0.0)[1:-1] for v in velocities]
     test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
-    return replace(output, direction=test, sign_slope=math.inf if order > 1.0 else sign_tanh_slope(velocities))
+    return replace(output, direction=test, sign_slope=slope)
 
 
 def _test_beyond_parameters(
     output: OutputResiduals,
     sensitivities: Sequence[Floats],
     signals: Mapping[str, list[Floats]],
+    signs: list[Floats],
     lags: int,
 ) -> OutputResiduals:
     """Return the tests of an output, in which failures that parameter errors explain count as passed.
 
-    The fit minimizes squared residuals and ignores the color of the noise, so parameter errors alone can correlate
-    residuals with an input. One generalized least-squares step removes that part of the residuals before the test.
+    Least squares ignores the color of the noise, so errors of the parameters alone can correlate residuals with an
+    input, or with the direction of motion. One generalized least-squares step removes that part of the residuals.
     """
-    inputs = dict(output.inputs)
-    for name, test in output.inputs.items():
-        if test.failed:
-            noise = NoiseModel.fit(output.residuals, signals[name], lags)
-            residuals = noise.subtract(output.residuals, sensitivities)
-            again = _independence(residuals, signals[name], noise, lags, first=test.first)
-            inputs[name] = again if again.passed else test
-    return replace(output, inputs=inputs)
+
+    def repeat(test: CorrelationTest, signal: list[Floats]) -> CorrelationTest:
+        noise = NoiseModel.fit(output.residuals, signal, lags)
+        residuals = noise.subtract(output.residuals, sensitivities)
+        again = _independence(residuals, signal, noise, lags, first=test.first)
+        return again if again.passed else test
+
+    inputs = {name: repeat(test, signals[name]) if test.failed else test for name, test in output.inputs.items()}
+    direction = output.direction
+    if direction is not None and direction.failed:
+        direction = repeat(direction, signs)
+    return replace(output, inputs=inputs, direction=direction)
 
 
 def _failed_test(lags: NDArray[np.int64]) -> CorrelationTest:

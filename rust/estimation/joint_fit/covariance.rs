@@ -5,8 +5,8 @@ use super::problem::OptimizationResult;
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::linalg::dense;
 use crate::signal::statistics::{
-    filter_autocovariances, inner, is_white, multiply_toeplitz, robust_deviation, sum, whitening_filter,
-    HUBER_THRESHOLD, WHITENESS_LAGS,
+    burg_filter, filter_autocovariances, inner, is_white, multiply_toeplitz, robust_deviation, sum, HUBER_THRESHOLD,
+    WHITENESS_LAGS,
 };
 
 /// Exponent of the number of samples in the number of autocovariance lags of the robust covariance.
@@ -175,7 +175,7 @@ fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[V
         if count == 0 {
             continue;
         }
-        let (through, power) = whitening_filter(&[residuals], lag_count(count));
+        let (through, power) = burg_filter(residuals, lag_count(count));
         let covariances = filter_autocovariances(&through, power, residuals.len());
         if covariances[0].is_nan() || covariances[0] <= 0.0 {
             continue;

@@ -132,6 +132,7 @@ impl Problem {
                 residuals: optimum.residuals,
                 jacobian: optimum.jacobian,
                 initial: optimum.initial,
+                initial_responses: optimum.initial_responses,
                 evaluations: optimum.evaluations,
                 status: optimum.status,
             });
@@ -146,6 +147,7 @@ impl Problem {
             ParameterPoint { orders: optimum.orders, coefficients: optimum.coefficients, inputs: optimum.inputs };
         Ok(OptimizationResult {
             initial: optimum.states.iter().map(|states| vec![states.clone()]).collect(),
+            initial_responses: Vec::new(),
             iterate: Iterate { point, states: optimum.states },
             cost: optimum.cost,
             residuals: optimum.residuals,
@@ -179,6 +181,8 @@ pub struct OptimizationResult {
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms by run and equation; initial states if there is friction.
     pub initial: Vec<Vec<Vec<f64>>>,
+    /// Orthonormal basis of the weighted responses to the initial terms by run; empty after several evaluations.
+    pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
     /// Reason of termination.
@@ -190,8 +194,9 @@ impl OptimizationResult {
     #[must_use]
     pub fn initial_result(iterate: Iterate) -> Self {
         let (cost, evaluations, status) = (f64::INFINITY, 0, Status::Exhausted);
-        let (residuals, jacobian, initial) = (Vec::new(), Vec::new(), Vec::new());
-        Self { iterate, cost, residuals, jacobian, initial, evaluations, status }
+        let (residuals, jacobian) = (Vec::new(), Vec::new());
+        let (initial, initial_responses) = (Vec::new(), Vec::new());
+        Self { iterate, cost, residuals, jacobian, initial, initial_responses, evaluations, status }
     }
 
     /// Cost per residual: 1 at the noise floor if the weights are right.

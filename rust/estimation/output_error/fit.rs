@@ -31,6 +31,8 @@ pub struct OutputErrorFit {
     pub initial: Vec<Vec<Vec<f64>>>,
     /// Exponents of the initial terms per equation.
     pub exponents: Vec<Vec<f64>>,
+    /// Orthonormal basis of the weighted responses to the initial terms per record; empty after several evaluations.
+    pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
     /// Reason of termination.
@@ -66,6 +68,15 @@ impl Simulation<'_> {
             Self::Pulses(evaluation) => &evaluation.residuals,
             Self::Exact(evaluation) => &evaluation.residuals,
             Self::Sampled(evaluation) => &evaluation.residuals,
+        }
+    }
+
+    /// Orthonormal basis of the weighted responses to the initial terms, per record.
+    fn initial_responses(&self) -> Vec<Vec<Vec<f64>>> {
+        match self {
+            Self::Pulses(evaluation) => evaluation.parts.iter().map(|part| part.basis.clone()).collect(),
+            Self::Exact(evaluation) => evaluation.parts.iter().map(|part| part.basis().to_vec()).collect(),
+            Self::Sampled(evaluation) => evaluation.parts.iter().map(|part| part.basis.clone()).collect(),
         }
     }
 
@@ -374,6 +385,7 @@ pub fn fit_until(
         jacobian: optimum.jacobian,
         initial: optimum.evaluation.initial_terms().0.to_vec(),
         exponents: optimum.evaluation.initial_terms().1.to_vec(),
+        initial_responses: if settings.evaluations > 1 { Vec::new() } else { optimum.evaluation.initial_responses() },
         evaluations: optimum.evaluations,
         status: optimum.status,
     })

@@ -104,6 +104,9 @@ impl JointProblem {
         dict.set_item("values", optimum.values())?;
         dict.set_item("states", &optimum.iterate.states)?;
         dict.set_item("initial", optimum.initial)?;
+        let responses =
+            optimum.initial_responses.iter().map(|rows| stack_rows(py, rows)).collect::<PyResult<Vec<_>>>()?;
+        dict.set_item("initial_responses", responses)?;
         dict.set_item("cost", optimum.cost)?;
         dict.set_item("residuals", PyArray1::from_vec(py, optimum.residuals))?;
         let none = optimum.jacobian.first().is_none_or(Vec::is_empty);
