@@ -55,6 +55,8 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS
 DEFAULT_PULSES_PER_SAMPLE = 2
 #: Fits of the noise to the residuals and of the columns under that noise, in turn.
 NOISE_FITS = 4
+#: Rows of the lagged residuals that are stored at a time.
+NOISE_BLOCK_ROWS = 1 << 14
 #: Samples of the shortest run for each lag of an autoregression.
 SAMPLES_PER_NOISE_LAG = 10
 #: Singular values of whitened columns, relative to the largest one, below which they are collinear.
@@ -327,10 +329,12 @@ def _fit_autoregression(series: Sequence[Floats], most: int) -> _Autoregression:
     long autoregression. An estimated root near 1 is biased toward noise with a mean, so that a root other than 1 counts
     as a parameter of Schwarz's criterion.
     """
-    windows = np.concatenate([np.lib.stride_tricks.sliding_window_view(e, most + 1) for e in series])
-    rows = len(windows)
-    # Lags first, the predicted row last: each order is a part of one triangular factor.
-    factor = triangular_factor(np.column_stack([windows[:, -2::-1], windows[:, -1]]))
+    factor = np.zeros((most + 1, most + 1))
+    for windows in (np.lib.stride_tricks.sliding_window_view(e, most + 1) for e in series):
+        for block in np.array_split(windows, len(windows) // NOISE_BLOCK_ROWS + 1):
+            # Lags first, the predicted row last: each order is a part of one triangular factor.
+            factor = triangular_factor(np.concatenate([factor, np.column_stack([block[:, -2::-1], block[:, -1]])]))
+    rows = sum(e.size - most for e in series)
     fits = [_nested_regression(factor, rows, np.ones(1), math.log(rows))]
     if most:
         changes = np.column_stack([factor[:, :-2] - factor[:, 1:-1], factor[:, -1] - factor[:, 0]])
