@@ -390,6 +390,10 @@ impl NonlinearModel {
                 }
                 stop.check()?;
                 let slopes = match moved {
+                    // An order that fell below an integer has fewer initial terms than at the initial guess.
+                    Parameter::InitialTerm(_, state) if *state >= states.len() => {
+                        vec![vec![0.0; record.m()]; self.model.equations.len()]
+                    }
                     Parameter::InitialTerm(_, state) if states[*state].is_impulse() => {
                         // A filter transient does not enter the equations.
                         let mut slopes = vec![vec![0.0; record.m()]; self.model.equations.len()];

@@ -9,9 +9,11 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 from scipy.stats import beta
 
+import arm_measured
 import ftlm
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.initial_conditions import rest_evidence
+from measured import needs_data
 
 H = 0.5
 
@@ -531,3 +533,26 @@ def test_runs_in_motion_at_a_level_have_the_gain_of_the_plant(mean):
         run = ftlm.Run.from_arrays(step=step, inputs={"u": u[before:]}, outputs={"y": noisy})
         got = ftlm.identify(run, ftlm.equation("D y = a y + b u")).coefficients
         assert got["b"] / -got["a"] == pytest.approx(1.5, rel=0.05), seed
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "stage", "text"),
+    [
+        ("lqr", 1, "D^2 y = d D y + a y + b D^2 u"),
+        ("psf", 2, "D^2 y = d D^mu y + a y + b D^gamma u"),
+    ],
+)
+def test_a_run_that_begins_slowly_is_compared_as_it_was_fitted(name, stage, text):
+    # Deviations from the first sample look like rest, which would leave -18 and 25 % of these records.
+    arm = arm_measured.arm_run(name)
+    record = ftlm.Run.from_arrays(
+        step=arm.step,
+        inputs={"u": arm[f"theta{stage}1"]},
+        outputs={"y": arm[f"theta{stage}2"]},
+        intersample={"u": "foh"},
+    )
+    result = ftlm.identify(record, ftlm.equation(text))
+    fitted = 100 * (1 - result.joint.noise["y"] / np.std(record["y"]))
+    assert result.joint.initial != "rest"
+    assert result.fit["y"] == pytest.approx(fitted, abs=0.5)

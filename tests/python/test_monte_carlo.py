@@ -317,3 +317,12 @@ def test_of_neighbouring_orders_of_a_stage_the_coupled_run_decides() -> None:
     assert missed(found.orders) <= min(missed(row.orders) for row in table[:4]) + 0.7
     true = {n: v for n, v in plants.truth("A").items() if n in free.order_names}
     assert all(abs(found.orders[n] - true[n]) < 0.051 for n in true)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_second_stage_is_found_from_automatic_initial_guesses(seed: int) -> None:
+    # With one row of each order grid as an initial guess, these three end at 2 to 17 times the noise.
+    exact = plants.truth("A2")
+    found = fit_output_error([plants.noisy_run("A2", 40, seed)], plants.structure("A2"))
+    scores = (found.values - [exact[n] for n in found.names]) / np.sqrt(np.diag(found.covariance))
+    assert np.max(np.abs(scores)) < 4.0

@@ -1,6 +1,7 @@
 """Non-linear terms in identifications: equation error, order searches, results from file to page."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -247,3 +248,21 @@ def test_selection_finds_the_nonlinear_term(runs):
     structure = ftlm.equation("D^0.9 y = c u^2 - w y^2 + k y + e y*u", initial="rest")
     selection = ftlm.select(runs["rotor"].window(0.0, 30.0), structure)
     assert {"c", "w"} <= {t.name for t in selection.model.equations[0].terms}
+
+
+@pytest.mark.parametrize("start", [1.1, 1.6])
+def test_an_order_may_fall_below_an_integer_in_motion(start):
+    # Of two initial values at the start one is left at the optimum.
+    time = np.arange(400) * 0.02
+    u = np.sign(np.sin(1.3 * time) + 0.3 * np.sin(4.1 * time))
+    drive = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": np.zeros(400)})
+    y = ftlm.Model(ftlm.equation("D^0.9 y = -1.2 y - 0.8 y^3 + 2 u")).simulate(drive)["y"]
+    y = y + 1e-3 * np.random.default_rng(0).normal(size=400)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y})
+    structure = replace(ftlm.equation("D^alpha y = a y + c y^3 + b u"), initial="caputo")
+    guess = {"alpha": start, "a": -1.2, "c": -0.8, "b": 2.0}
+    result = ftlm.identify(run, structure, method=ftlm.OutputError(start=guess))
+    truth = {"alpha": 0.9, "a": -1.2, "c": -0.8, "b": 2.0}
+    for name, value in truth.items():
+        estimate = result.parameters[name]
+        assert abs(estimate.value - value) < 4 * estimate.standard_error

@@ -96,8 +96,8 @@ def transfer_function(
     Raises
     ------
     ModelError
-        The numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
-        a list is empty or of another form, a number is not finite, or the delay is below 0.
+        If the numerator has a higher power than the denominator, the denominator has no power above 0 or one above 10,
+        a list is empty or of another form, a number is not finite, or the delay is negative.
 
     Examples
     --------

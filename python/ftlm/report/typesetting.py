@@ -50,7 +50,7 @@ def equation_html(
     item
         Equation.
     delay
-        Delays of inputs [s]; a delayed input is written u(t − 0.035 s), one that leads u(t + 0.035 s).
+        Delays of inputs [s] by name; a delayed input is written u(t − 0.035 s), one that leads u(t + 0.035 s).
     limits
         Known saturations and dead zones of inputs; a saturated input is written sat(u, 0.94).
     offset

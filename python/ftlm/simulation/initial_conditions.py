@@ -313,9 +313,14 @@ def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
     if initial == "auto":
         if structure.offset != "level" and starts_at_rest(run, structure):
             return "rest"
-        # Past inputs are superposed, so that a model that is not linear has only its initial states.
-        initial = "history" if has_memory(structure) and structure.is_linear else "caputo"
+        initial = conditions_in_motion(structure)
     return history(run, structure) if initial == "history" else initial
+
+
+def conditions_in_motion(structure: Structure) -> Initial:
+    """Return the initial conditions of a structure for a run that was not at rest before its first sample."""
+    # Past inputs are superposed, so that a model that is not linear has only its initial states.
+    return "history" if has_memory(structure) and structure.is_linear else "caputo"
 
 
 def common_initial_conditions(decisions: list[Initial]) -> Initial | None:
@@ -377,14 +382,13 @@ def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Flo
     The numbers of samples are divided by the variance inflation of the `reference` residuals, the same for all compared
     fits. A smooth misfit that a missing term causes then has the same weight in all of them.
     """
-    score, total = 0.0, 0
+    score, total = 0.0, 0.0
     for own, other in zip(residuals, reference, strict=True):
-        differences, difference = drop_missing(own), drop_missing(other)
-        total += differences.size
-        score += (
-            differences.size / variance_inflation(difference) * math.log(max(float(np.mean(differences**2)), 1e-300))
-        )
-    return score + math.log(max(total, 1)) * terms
+        differences = drop_missing(own)
+        size = differences.size / variance_inflation(drop_missing(other))
+        total += size
+        score += size * math.log(max(float(np.mean(differences**2)), 1e-300))
+    return score + math.log(max(total, 1.0)) * terms
 
 
 def needs_history(

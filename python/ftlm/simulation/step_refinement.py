@@ -11,7 +11,13 @@ from ftlm.data.run import Run
 from ftlm.data.sampling import drop_missing
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import MAX_M, has_nonuniform_samples
-from ftlm.simulation.initial_conditions import deviations, resolve_initial_conditions, resolve_start, start_score
+from ftlm.simulation.initial_conditions import (
+    conditions_in_motion,
+    deviations,
+    resolve_initial_conditions,
+    resolve_start,
+    start_score,
+)
 from ftlm.simulation.output_samples import (
     INITIAL_STATE_REFINEMENT,
     LEVEL_EXPONENT,
@@ -68,6 +74,7 @@ def simulate_refined(
         # A run that may have been in motion may as well have rested at its level.
         rest = replace(model, structure=replace(model.structure, initial="rest"))
         result = _simulate_refined(rest, shifted, None, tolerance, max_m, on_grid)
+        model = replace(model, structure=replace(model.structure, initial=conditions_in_motion(model.structure)))
     if result is None or not _has_white_residuals(model, shifted, result):
         free = _simulate_refined(model, shifted, None, tolerance, max_m, on_grid)
         result = free if result is None or not _explains_as_well(model, shifted, result, free) else result

@@ -521,7 +521,7 @@ class Structure:
 
     @check_arguments
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
-        """Texts of inputs with delay or nonlinearity, such as ``sat(u(t - 0.035 s), 0.94)``."""
+        """Return text of inputs with a delay or nonlinearity by name, such as ``sat(u(t - 0.035 s), 0.94)``."""
         known = {n: f"{'+' if d < 0 else '-'} {_format(abs(d), digits)}" for n, d in self.delay.items() if d}
         free = {n: f"- {_format(low, digits)}:{_format(high, digits)}" for n, (low, high) in self.free_delays.items()}
         out = {n: f"{n}(t {text} s)" for n, text in {**known, **free}.items()}

@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 
 pub use prefilter::power_frequency;
 
-use self::order_grid::{grid_candidate, law_candidates, linspace, natural_axes, start_axes, GridSearch};
+use self::order_grid::{grid_candidates, law_candidates, linspace, natural_axes, start_axes, GridSearch};
 use self::prefilter::LowPassCache;
 use self::resonances::scan_candidates;
 use super::format::format_general;
@@ -129,7 +129,7 @@ impl<'a> OrderGrids<'a> {
             let origin = corner.map_or_else(|| "no prefilter".into(), words);
             let mut candidates_of_inputs: Vec<Candidate> = Vec::new();
             for axes in &grids {
-                let more = grid_candidate(free, &coarse, axes, &origin, &candidates_of_inputs)?;
+                let more = grid_candidates(free, &coarse, axes, &origin, &candidates_of_inputs)?;
                 candidates_of_inputs.extend(more);
             }
             if let Some(axes) = &natural {

@@ -223,6 +223,11 @@ fn standard_deviation(values: &[f64]) -> f64 {
 
 /// Best rows of an order grid from which the coefficients follow by a law.
 const ROWS_BY_LAW: usize = 4;
+/// Candidates from an order grid under an order law, rows among which they are sought, and their least difference in
+/// some order.
+const CANDIDATES_BY_LAW: usize = 4;
+const ROWS_TO_SEPARATE: usize = 400;
+const MIN_ORDER_SEPARATION: f64 = 0.35;
 /// Ratios of a coefficient law at which the coefficients of one equation follow from those of another.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
 /// Absolute and relative difference below which two orders are equal.
@@ -236,18 +241,35 @@ pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &s
     )
 }
 
-/// Candidate from the best row of an order grid; None if an earlier candidate has its orders.
-pub(super) fn grid_candidate(
+/// Candidates from the best rows of an order grid, without earlier candidates: one, or several under an order law.
+///
+/// A law ties the orders of several equations, whose equation errors have several minima between them. The candidates
+/// then differ from each other in some order.
+pub(super) fn grid_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
     axes: &Axes,
     origin: &str,
     before: &[Candidate],
-) -> Result<Option<Candidate>> {
-    let Some(row) = coarse.best_rows(&free.structure, axes, 1)?.into_iter().next() else { return Ok(None) };
-    let values = row.values(&free.orders);
-    let is_known = before.iter().any(|other| are_orders_close(&values, &other.result.iterate.point.orders));
-    Ok((!is_known).then(|| new_candidate(values, free.free_from(&row.coefficients), origin)))
+) -> Result<Vec<Candidate>> {
+    let (count, rows) = if free.structure.has_order_law() { (CANDIDATES_BY_LAW, ROWS_TO_SEPARATE) } else { (1, 1) };
+    let mut candidates: Vec<Candidate> = Vec::new();
+    let mut picked: Vec<Vec<f64>> = Vec::new();
+    for row in coarse.best_rows(&free.structure, axes, rows)? {
+        let values = row.values(&free.orders);
+        let is_apart = |other: &Vec<f64>| values.iter().zip(other).any(|(a, b)| (a - b).abs() >= MIN_ORDER_SEPARATION);
+        if !picked.iter().all(is_apart) {
+            continue;
+        }
+        if !before.iter().any(|other| are_orders_close(&values, &other.result.iterate.point.orders)) {
+            candidates.push(new_candidate(values.clone(), free.free_from(&row.coefficients), origin));
+        }
+        picked.push(values);
+        if picked.len() == count {
+            break;
+        }
+    }
+    Ok(candidates)
 }
 
 fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
