@@ -399,7 +399,7 @@ from search import plant_a_run
 run = plant_a_run()
 equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
 step = float(sys.argv[1])
-coarse = ftlm.lattice(step=0.5, alpha=(1.0, 2.0))
+coarse = ftlm.order_grid(increment=0.5, alpha=(1.0, 2.0))
 ftlm.search_orders(run, equation, coarse, coefficients="least-squares", m=2048)
 with open("/proc/self/clear_refs", "w") as peak:
     peak.write("5")  # forget the peak so far
@@ -407,12 +407,13 @@ def status(name):
     with open("/proc/self/status") as lines:
         return next(int(line.split()[1]) for line in lines if line.startswith(name))
 before = status("VmRSS")
-lattice = ftlm.lattice(step=step, alpha=(1.05, 2.0))
+grid = ftlm.order_grid(increment=step, alpha=(1.05, 2.0))
 start = time.perf_counter()
-found = ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=2048)
+found = ftlm.search_orders(run, equation, grid, coefficients="least-squares", m=2048)
 wall = time.perf_counter() - start
 after = status("VmHWM")
-pruned = 1 - (len(found.table) + found.exclusion_counts["beaten"]) / found.candidates
+kept = len(found.table) + found.exclusion_counts["beaten"]
+pruned = 1 - kept / found.candidates
 print(found.candidates, wall, (after - before) / 1024, pruned)
 """
 
