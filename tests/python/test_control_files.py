@@ -202,9 +202,12 @@ def test_shape_writes_what_a_reference_is_convolved_with(saved, tmp_path):
 REFUSED = [
     (("control", "MODEL", "--crossover", 40), "several outputs; name one with --output"),
     (("control", "MODEL", "--output", "hub"), "--crossover is missing"),
-    (("control", "MODEL", "--output", "hub", "--crossover", 40, "--max-input", 1), "--max-input: of --design lqg"),
+    (
+        ("control", "MODEL", "--output", "hub", "--crossover", 40, "--max-input", 1),
+        "--max-input: used with --design lqg",
+    ),
     (("control", "MODEL", "--design", "lqg"), "--max-deviation OUTPUT=A and --max-input A are missing"),
-    ((*WORDS, "MODEL", "--crossover", 40), "--crossover: of --design pid"),
+    ((*WORDS, "MODEL", "--crossover", 40), "--crossover: used with --design pid"),
     ((*WORDS, "MODEL", "--max-deviation", "hob=1"), "did you mean 'hub'"),
     ((*WORDS, "MODEL", "--noise", "hub"), "names 'hub' twice"),
     ((*WORDS, "MODEL", "--band", "1"), "--band '1' is not 2 numbers"),

@@ -144,7 +144,7 @@ def test_no_delay_is_found_where_there_is_none():
 
 def test_a_delay_beyond_its_bound_is_named():
     found = ftlm.identify(late_run(DELAY, 40, 0), structure(0.0, 0.1), threads=1)
-    assert any("the delay of u = 0.1 s is on its bound; widen it" in w for w in found.warnings)
+    assert any("the delay of u = 0.1 s is on its bound; widen the bound" in w for w in found.warnings)
 
 
 @pytest.mark.parametrize("method", ["instrumental-variables", "least-squares", "multi-innovation"])
@@ -179,7 +179,7 @@ def test_a_model_has_no_free_delay_and_no_second_name():
     free = structure().with_orders({"alpha": 2.2, "nu": 0.9}).with_coefficients({"a1": -1, "a0": -1, "b0": 1})
     with pytest.raises(ftlm.ModelError, match="the delay of u is still free"):
         ftlm.Model(free)
-    with pytest.raises(ftlm.ModelError, match="delay_u is the delay of u"):
+    with pytest.raises(ftlm.ModelError, match="delay_u is the name of the delay of u"):
         ftlm.equation("D^alpha y = a0 y + delay_u u", delay={"u": (0.0, 0.1)})
 
 

@@ -416,7 +416,7 @@ def test_a_level_that_drifts_is_named_with_its_remedy():
     said = [f for f in run_of(u, y).advice() if f.code == "drift"]
     assert len(said) == 1
     assert "offset='ramp'" in said[0].text
-    assert said[0].remedy.startswith("offset='ramp'")
+    assert said[0].remedy.startswith("use offset='ramp'")
     found = ftlm.identify(run_of(u, y), ftlm.equation(WORDS, offset="ramp"))
     assert gain_of(found) == pytest.approx(1.0, rel=0.02)
     # Without the line it is named with what it changes.

@@ -157,7 +157,7 @@ def test_names_of_very_many_columns_are_compared_once_each():
     check_distinct(names, 1, "x.csv")
     # Every name beside every other would be 4.5 million.
     assert Name.compared < 100_000
-    with pytest.raises(ftlm.DataError, match="'a7' is there 2 times"):
+    with pytest.raises(ftlm.DataError, match="'a7' occurs 2 times"):
         check_distinct([*names, Name("a7")], 1, "x.csv")
 
 

@@ -257,7 +257,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
 @pytest.mark.parametrize(
     ("text", "options", "words"),
     [
-        ("D y = a y + b sat(u, -1)", {}, "expected a limit"),
+        ("D y = a y + b sat(u, -1)", {}, "saturation of u = -1.0 is not a number above 0"),
         ("D y = a y + b sat(u)", {}, "expected ','"),
         ("D y = a y + b sat(u, 0)", {}, "saturation of u = 0.0 is not a number above 0"),
         ("D y = a y + b sat(u, 2:1)", {}, "from 2.0 to 1.0 is not an interval"),

@@ -131,7 +131,7 @@ def needed(monkeypatch, structure, runs, **options):
     monkeypatch.setenv(MEMORY_VARIABLE, "1")
     with pytest.raises(ModelError) as refused:
         search(structure, runs, **options)
-    assert "or allow more by FTLM_MEMORY" in str(refused.value)
+    assert "or raise the memory limit by FTLM_MEMORY" in str(refused.value)
     told = REFUSED.search(str(refused.value))
     return int(told[1]), int(told[2])
 
@@ -153,7 +153,7 @@ def test_the_border_is_exact_and_all_runs_count(monkeypatch, case):
     monkeypatch.setenv(MEMORY_VARIABLE, str(one))
     found = search(structure, of_one, **options)
     monkeypatch.setenv(MEMORY_VARIABLE, str(one - 1))
-    with pytest.raises(ModelError, match=f"need {one} bytes, more than the {one - 1} that"):
+    with pytest.raises(ModelError, match=f"need {one} bytes, more than the limit of {one - 1}"):
         search(structure, of_one, **options)
     monkeypatch.delenv(MEMORY_VARIABLE)
     # Findings may differ: simulations of the best candidates are refined only as far as memory allows.

@@ -122,7 +122,7 @@ def test_one_sine_for_many_numbers_says_so(small_model):
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": clean["u"]}, outputs={"y": y})
     structure = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
     found = ftlm.identify(run, structure)
-    assert said(found, "the equation of y has 5 free parameters, but u determines 2")
+    assert said(found, "the equation of y has 5 free parameters, but in steady state u determines only 2")
 
 
 def test_what_is_printed_is_what_compare_says(noisy, tmp_path):

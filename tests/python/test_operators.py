@@ -110,7 +110,7 @@ def test_block_pulse_rule_is_the_oracles_matrix(order):
 
 
 def test_absurd_numbers_of_points_are_refused():
-    with pytest.raises(ftlm.ModelError, match=r"m = 1e\+?15|m = 10{15} is outside \[0, 134217728\]; ask for"):
+    with pytest.raises(ftlm.ModelError, match=r"m = 1e\+?15|m = 10{15} is outside \[0, 134217728\]; use a number"):
         _core.block_pulse_kernels(np.array([0.5]), 10**15, 0.1)
 
 

@@ -207,7 +207,7 @@ def test_a_lost_fit_is_said(tmp_path, identified, sine):
         units=sine.units,
     )
     text = report.identification_page(identified, tmp_path / "p.html", validation=other).read_text("utf-8")
-    assert "validation run other: the fit of theta12 falls from" in text
+    assert "validation run other: the fit of theta12 drops from" in text
 
 
 def test_hostile_names_are_inert(tmp_path, page):
@@ -239,7 +239,7 @@ def test_existing_files_are_kept(tmp_path, identified):
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_any_work(tmp_path, identified, monkeypatch):
-    with pytest.raises(ftlm.DataError, match="is not a folder; create it first"):
+    with pytest.raises(ftlm.DataError, match="is not a folder; make it first"):
         identified.report(tmp_path / "nowhere" / "p.html")
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(ftlm.DataError, match="is read-only; choose another folder"):
@@ -266,7 +266,7 @@ def test_a_saved_model_has_a_report_of_its_own(tmp_path, small_run, small_model,
     )
     page = report.model_page(loaded, tmp_path / "m.html", validation=mirrored).read_text("utf-8")
     text = " ".join(Page(page).text)
-    assert "validation run mirrored: the fit of y falls from" in text
+    assert "validation run mirrored: the fit of y drops from" in text
     assert "95 % interval" in text
     assert {found.standard_errors["alpha"], found.orders["alpha"]} <= {float(v) for v in Page(page).data}
     again = report.model_page(loaded, tmp_path / "again.html", validation=with_noise(small_run, 0.02, 1))

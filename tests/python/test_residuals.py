@@ -254,7 +254,7 @@ def test_validation_far_below_estimation_is_said(noisy, small_model):
     found = ftlm.identify(noisy, ftlm.equation(WORDS), method="least-squares", m=512)
     other = ftlm.Run.from_arrays(step=noisy.step, inputs={"u": noisy["u"]}, outputs={"y": -noisy["y"]}, name="mirrored")
     lost = found.validate(other)
-    assert any(w.startswith("mirrored: the fit of y falls from") for w in lost.warnings)
+    assert any(w.startswith("mirrored: the fit of y drops from") for w in lost.warnings)
     again = found.validate(noisy)
     assert any("does not validate the model" in w for w in again.warnings)
     fresh = small_model.simulate(blank(np.sin(0.02 * np.arange(800) ** 1.1)), tolerance=1e-5)
@@ -360,7 +360,7 @@ def test_an_input_that_does_not_move_decides_nothing(small_model, noisy):
     assert found.outputs["y"].inputs["u"].verdict == "undecided"
     assert found.independence == {"y": "undecided"}
     assert not found.passed
-    assert "whether residuals are correlated with u is undecided: u is constant" in str(found)
+    assert "whether residuals are correlated with u is undecided, because u is constant" in str(found)
 
 
 def test_the_caption_of_a_chart_says_what_its_bars_do(long_run, small_model):

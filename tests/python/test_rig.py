@@ -355,7 +355,7 @@ def test_the_stock_filter_of_a_record_is_that_of_a_model():
         ({"amplitude": math.nan}, "not a current"),
         ({"duration": 0}, "not a time above 0"),
         ({"duration": 1e4}, "no run is longer than 600 s"),
-        ({"duration": 40}, "over the limit of 30 s; raise limit="),
+        ({"duration": 40}, "exceeds the limit of 30 s; raise limit="),
         ({"duration": 40, "limit": 700}, "outside (0, 600]"),
         ({"rate": 20000.0}, "is not possible with this board"),
         ({"rate": 0}, "not a positive number"),

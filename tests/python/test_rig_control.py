@@ -276,7 +276,7 @@ REFUSED = [
     ({"reference": np.zeros((50, 2)), "duration": 0.2}, ftlm.DataError, "has 50 rows, .* has 101"),
     ({"reference": [(0.0, 0.0)] * 60 + [(0.0, np.nan)] * 3}, ftlm.DataError, "hub 2 is nan at row 60 .3 such rows"),
     ({"reference": [(0.0, 0.0)] * 60 + [(20.0, 0.0)]}, ftlm.ModelError, "hub 1 is 1146 degrees at 0.12 s .*travel"),
-    ({"reference": np.zeros((200, 2)), "limit": 0.1}, ftlm.ModelError, "over the limit of 0.1 s"),
+    ({"reference": np.zeros((200, 2)), "limit": 0.1}, ftlm.ModelError, "exceeds the limit of 0.1 s"),
     ({"reference": np.zeros((200, 2)), "rate": 0}, ftlm.ModelError, "rate = 0"),
     ({"reference": np.zeros((200, 2)), "watchdog": 0.0}, ftlm.ModelError, "watchdog = 0"),
     ({"reference": np.zeros((200, 2)), "rig": "q9"}, ftlm.ModelError, "'q9' is not known"),

@@ -615,7 +615,7 @@ def test_errors_of_frames_name_the_column_too():
         Run.from_frame(frame, time="t_s", inputs={"I": "cur A"}, outputs=["th_deg"])
     with pytest.raises(DataError, match=r"signal 'I' \(column 'word'\): 'a' is not a number"):
         Run.from_frame(frame, time="t_s", inputs={"I": "word"}, outputs=["th_deg"])
-    with pytest.raises(DataError, match=r"'th_deg' .* is there 2 times"):
+    with pytest.raises(DataError, match=r"'th_deg' .* occurs 2 times"):
         Run.from_frame(pd.concat([frame, frame], axis=1), step=1, inputs=None, outputs=["th_deg"])
     with pytest.raises(DataError, match="collect"):
         Run.from_frame(pl.DataFrame(frame_columns()).lazy(), step=1, inputs=None, outputs=["th_deg"])

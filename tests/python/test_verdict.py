@@ -181,7 +181,7 @@ def test_each_rule_finds_its_own_fault(found, checked):
         return replace(comparison, output_error={"y": bad})
 
     lost = verdict(found, fit(checked, 70.0))
-    assert lost.reason == f"the fit of y falls from {found.fit['y']:.3g} to 70 % on validation"
+    assert lost.reason == f"the fit of y drops from {found.fit['y']:.3g} % to 70 % on validation"
     assert lost.level == "with care"
     gone = verdict(found, fit(checked, 40.0))
     assert (gone.level, gone.reason) == (
@@ -432,7 +432,7 @@ def test_the_name_of_a_run_is_no_reason(found, checked, name):
     assert judged.trusted
     assert noted.text == f"run {name}: resampled as {name}"
     fallen = make_finding("fit_falls", run=name, output=name, before=99.0, after=50.0, where="")
-    assert fallen.text.startswith(f"{name}: the fit of {name} falls from 99 % on")
+    assert fallen.text.startswith(f"{name}: the fit of {name} drops from 99 % on")
 
 
 def test_every_entry_of_the_catalogue_renders():
@@ -572,7 +572,7 @@ def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_p
     assert saved_verdict(old, [saved.compare(other)]).remedy == "identify the model again"
     assert "order alpha = 2 is on its bound; widen it" in model_page(old, tmp_path / "o.html").read_text("utf-8")
     better = replace_estimate(saved, fit={"y": 130.0})
-    assert "falls from 130 to" in saved_verdict(better, [saved.compare(other)]).reason
+    assert "drops from 130 % to" in saved_verdict(better, [saved.compare(other)]).reason
     grown = ftlm.Model(ftlm.equation("D y = 0.3 y + u"))
     assert saved_verdict(grown, []).level == "do not use"
 

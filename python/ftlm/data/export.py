@@ -280,7 +280,7 @@ def header_of_line(path: Path, line: bytes) -> Header | None:
 
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
-    """Write a run as text; see :meth:`ftlm.Run.to_csv`."""
+    """Write a run to a csv file; see :meth:`ftlm.Run.to_csv`."""
     check_new(path, force=force)
     columns = _columns(run)
     rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
@@ -289,7 +289,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
 
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> None:
-    """Write a run as a parquet file; see :meth:`ftlm.Run.to_parquet`."""
+    """Write a run to a parquet file; see :meth:`ftlm.Run.to_parquet`."""
     target = check_new(path, force=force)
     try:
         pyarrow = importlib.import_module("pyarrow")

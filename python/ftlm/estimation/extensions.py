@@ -161,8 +161,9 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
 
     Residuals that are rounding and discretization errors show nothing.
 
-    Structures with friction, limits or free delays are not tested. Those of several equations or with a coefficient law
-    are tested for drift and intersample behavior alone, those with non-linear terms for intersample behavior alone.
+    Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
+    with a coefficient law are tested only for drift and intersample behavior. Structures with other nonlinear terms are
+    tested only for intersample behavior.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     large = [o for o in tests.outputs.values() if not o.nr <= NEGLIGIBLE_RESIDUAL_SHARE]

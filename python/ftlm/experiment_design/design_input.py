@@ -213,7 +213,7 @@ def design_input(
         zones; if it is too uncertain; or if an argument is invalid or a limit cannot be met.
     """
     if progress is not None and not callable(progress):
-        raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
+        raise ModelError(f"progress is a {type(progress).__name__}; give a function of (done, total)")
     solved = model.model if isinstance(model, Identification) else model
     check_model(solved)
     check_linear(solved.equations, "a design of the next experiment")

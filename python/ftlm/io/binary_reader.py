@@ -221,7 +221,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
 
 
 def _arrow_units(schema: Any) -> dict[str, str]:
-    """Return the units of columns, as fields or the attributes of a pandas frame state them."""
+    """Return the units by column that fields, or the attributes of a pandas frame, state."""
     try:
         whole = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
         units = {str(name): str(unit) for name, unit in whole.items()}

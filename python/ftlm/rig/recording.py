@@ -374,7 +374,7 @@ class Experiment:
         """Return the selected board, and its metadata for the run."""
         virtual = isinstance(self.rig, str) and self.rig == "virtual"
         if self.offset is not None and not virtual:
-            raise ModelError("offset is of the virtual arm; a board has its own, leave it out")
+            raise ModelError("offset applies only to the virtual arm; leave it out for a board")
         if virtual:
             arm = ArmParameters.of(self.parameters)
             if self.offset is not None:

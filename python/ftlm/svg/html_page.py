@@ -102,7 +102,7 @@ class Table:
         return starts
 
     def to_html(self) -> Markup:
-        """Return the table in a container that scrolls horizontally on narrow screens."""
+        """Return the table as HTML, in a container that scrolls horizontally on narrow screens."""
         pairs = zip(self.is_numeric, self.starts_group, strict=True)
         words = [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
         classes = [Markup(' class="{}"').format(w) if w else "" for w in words]
@@ -177,13 +177,13 @@ def read_resource(name: str, package: str = "ftlm.svg") -> str:
 
 
 def style_sheet() -> Markup:
-    """Common style sheet of all pages."""
+    """Return the style sheet of all pages."""
     return Markup(read_resource("style.css"))  # our own file
 
 
 @cache
 def _script() -> tuple[Markup, str]:
-    """Return the script and its hash for the content security policy."""
+    """Return the script element and its hash for the content security policy."""
     text = read_resource("charts.js")
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return Markup(text), f"sha256-{digest}"  # our own file

@@ -446,7 +446,10 @@ def _signs_of_motion(velocities: Sequence[Floats]) -> list[Floats]:
 
 
 def _test_direction(output: OutputResiduals, signs: list[Floats], lags: int, slope: float) -> OutputResiduals:
-    """Test whether residuals depend on the sign of a simulated velocity, as they do if dry friction is missing."""
+    """Return the residuals of an output with a test of their dependence on the sign of a simulated velocity.
+
+    Missing dry friction causes such a dependence.
+    """
     if not signs:
         return output
     test = _independence(output.residuals, signs, NoiseModel.fit(output.residuals, signs, lags), lags, first=0)
