@@ -259,7 +259,7 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 /// Autoregression 1, a₁, …, aₙ of a series and the innovation variance, by Burg's method.
 ///
 /// The series is not centered, and a root may lie as close to 1 as that of a random walk, whose color the Yule-Walker
-/// equations underestimate (Kay, Modern Spectral Estimation, §7.6). The order minimizes Akaike's criterion. NaN is a
+/// equations underestimate (Kay, Modern Spectral Estimation, §7.6). The order minimizes Schwarz's criterion. NaN is a
 /// missing sample.
 ///
 /// ```
@@ -301,7 +301,7 @@ pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
         current.push(0.0);
         let turned: Vec<f64> = current.iter().rev().copied().collect();
         current.iter_mut().zip(turned).for_each(|(a, b)| *a += reflection * b);
-        let criterion = count * libm::log(power) + 2.0 * order as f64;
+        let criterion = count * libm::log(power) + libm::log(count) * order as f64;
         if criterion < least {
             (least, remaining) = (criterion, power);
             best.clone_from(&current);
