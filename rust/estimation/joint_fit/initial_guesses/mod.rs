@@ -30,6 +30,8 @@ use crate::signal::statistics::median;
 const MAX_START_PULSES: usize = 1024;
 /// Cutoff frequencies of the prefilters relative to the bandwidth of the outputs; None for no prefilter.
 const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 2] = [Some(2.0), None];
+/// The same under an order law, which ties several equations: each has minima of its own at each cutoff.
+const PREFILTER_CUTOFF_RATIOS_BY_LAW: [Option<f64>; 5] = [Some(1.0), Some(2.0), Some(4.0), Some(8.0), None];
 /// Difference below which two orders are equal.
 const ORDER_TOLERANCE: f64 = 1e-9;
 
@@ -116,7 +118,9 @@ impl<'a> OrderGrids<'a> {
             stop: self.stop,
         };
         let mut attempts = Vec::new();
-        for multiple in PREFILTER_CUTOFF_RATIOS {
+        let by_law = free.structure.has_order_law();
+        let ratios = if by_law { &PREFILTER_CUTOFF_RATIOS_BY_LAW[..] } else { &PREFILTER_CUTOFF_RATIOS[..] };
+        for multiple in ratios {
             self.stop.check()?;
             let corner = multiple.map(|multiple| multiple * frequency);
             if corner.is_some_and(|corner| corner >= fastest) {
