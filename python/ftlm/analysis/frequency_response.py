@@ -113,7 +113,7 @@ class TransferFunctions:
     outputs, inputs
         Signal names.
     denominator
-         Denominator of each output as (coefficient, power) pairs, highest power first. Coupled
+        Denominator of each output as (coefficient, power) pairs, highest power first. Coupled
         outputs have the same denominator.
     numerators
         Numerator by output and input as such pairs; empty if an input has no effect on an output.
