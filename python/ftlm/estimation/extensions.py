@@ -1,8 +1,8 @@
 """Tests whether an extended structure, or other initial conditions, explain the colored residuals of a fit.
 
-Extensions are a constant, a drift of the level, another intersample behavior of an input (``"zoh"`` or ``"foh"``), a
-lag, a delay or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared input, and a load
-step.
+The extensions are a constant, a linear drift of an output, another intersample behavior of an input (``"zoh"`` or
+``"foh"``), a lag, a delay or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared
+input, and a load step.
 """
 
 from __future__ import annotations
@@ -254,9 +254,10 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 
 
 def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:
-    """Return the linear structure with a constant, and with levels that change linearly; none if offsets were given.
+    """Return the structure extended by a constant and by a linear drift; [] if nonlinear or if offsets were given.
 
-    A fit that explains little may be far from one with a constant, which then has initial guesses of its own.
+    If the fit explains little (`is_poor`), the optimum with a constant may be far away. It is then also sought from
+    automatic initial guesses.
     """
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
@@ -268,7 +269,7 @@ def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_
             extensions.append(Extension("offset_missing", constant_structure, count, [], starts=starts))
         count *= 2
     drift = replace(structure, offset="ramp")
-    return [*extensions, Extension("drift_fits", drift, count, [], starts=[joint.values_by_name])]
+    return [*extensions, Extension("drift_fits", drift, count, [], near=joint)]
 
 
 def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:

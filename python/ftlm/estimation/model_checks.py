@@ -251,7 +251,8 @@ def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) 
 
 def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[Finding]:
     """Return findings on the color of residuals, outliers, quantization and interpolated nonuniform samples."""
-    outputs = [o for o in problem.structure.outputs if o not in joint.exact_outputs(runs)]
+    exact = joint.exact_outputs(runs)
+    outputs = [o for o in problem.structure.outputs if o not in exact]
     coloured = [o for o in sorted(outputs) if not all(is_white(part[o]) for part in joint.residuals)]
     findings = [make_finding("residuals_not_white", output=output) for output in coloured]
     for output in outputs:

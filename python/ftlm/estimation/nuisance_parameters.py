@@ -101,7 +101,7 @@ class OffsetTest:
     def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = NEGLIGIBLE_RESIDUAL_SHARE) -> bool:
         """Whether the statistic is significant at `level` and the effect is larger than `size`.
 
-        An effect larger than the deviation of the output is no noise of any color, whatever the statistic.
+        An effect larger than the standard deviation of the output counts as significant: noise of no color explains it.
         """
         significant = self.size > 1.0 or self.statistic > chi_squared(self.degrees, level)
         return self.degrees > 0 and self.size > size and significant
@@ -157,9 +157,9 @@ def offset_test(
 ) -> OffsetTest | None:
     """Test at given parameters for an unknown constant in each equation and run; None if not computable.
 
-    The score is the projection of the residuals on the responses to a constant in each equation, orthogonal to the
-    sensitivities to all free parameters and initial terms. Errors of these do not affect it (Neyman's C(alpha) test),
-    so any consistent estimate is sufficient. Its variance follows from an autoregressive model of the residuals.
+    Two linear regressions of the residuals under autoregressive noise are compared: on the sensitivities to all free
+    parameters and initial terms, and on these and the response to a constant in each equation. The statistic is the
+    likelihood ratio of their one-step prediction errors. A consistent estimate at which to linearize is sufficient.
     """
     reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
     one = next(n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names)
@@ -271,18 +271,19 @@ def _prediction_ratio(few: Floats, many: Floats, residuals: Floats, blocks: list
     outputs = [[slice(*own[k]) for own in blocks] for k in range(len(blocks[0]))]
     shortest = [min(p.stop - p.start for p in places) for places in outputs]
     most = [min(DEFAULT_LAGS, size // SAMPLES_PER_NOISE_LAG) for size in shortest]
-    orders = [_prediction_criterion(columns, residuals, outputs, most)[1] for columns in (few, many)]
+    orders = [_noise_criterion(columns, residuals, outputs, most)[1] for columns in (few, many)]
     starts = [max(pair) for pair in zip(*orders, strict=True)]
-    one, other = (_prediction_criterion(columns, residuals, outputs, starts)[0] for columns in (few, many))
+    one, other = (_noise_criterion(columns, residuals, outputs, starts)[0] for columns in (few, many))
     return max(one - other, 0.0)
 
 
-def _prediction_criterion(
+def _noise_criterion(
     columns: Floats, residuals: Floats, outputs: Sequence[Sequence[slice]], starts: Sequence[int]
 ) -> tuple[float, list[int]]:
-    """Return the criterion of residuals without columns, by generalized least squares, and the orders of the noise.
+    """Return the criterion of the noise that remains after regression on columns, and the autoregression orders.
 
-    The noise of each output is an autoregression, fitted to the rows of its runs from its start on.
+    Regression by generalized least squares and the fit of an autoregression to the noise of each output alternate. The
+    criterion counts the rows of each run from that of `starts` on.
     """
     both, amounts = np.column_stack([columns, residuals]), projections(columns, residuals)
     best, orders = math.inf, list(starts)

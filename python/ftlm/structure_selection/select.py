@@ -273,7 +273,7 @@ def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
 
 @dataclass(frozen=True)
 class Choice:
-    """Chosen trial among ranked trials, with the reason, and the choices for single outputs that it combines."""
+    """The best of several ranked trials with the reason for it, and the choices for single outputs that it combines."""
 
     ranked: tuple[Trial, ...]
     winner: Trial

@@ -30,7 +30,7 @@ use crate::signal::statistics::median;
 const MAX_START_PULSES: usize = 1024;
 /// Cutoff frequencies of the prefilters relative to the bandwidth of the outputs; None for no prefilter.
 const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 2] = [Some(2.0), None];
-/// The same under an order law, which ties several equations: each has minima of its own at each cutoff.
+/// Cutoff frequencies under an order law: the equations that it ties have several minima, which differ by cutoff.
 const PREFILTER_CUTOFF_RATIOS_BY_LAW: [Option<f64>; 5] = [Some(1.0), Some(2.0), Some(4.0), Some(8.0), None];
 /// Difference below which two orders are equal.
 const ORDER_TOLERANCE: f64 = 1e-9;
