@@ -258,9 +258,9 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 
 /// Autoregression 1, a₁, …, aₙ of a series and the innovation variance, by Burg's method.
 ///
-/// The series is not centered, and a root may lie as close to 1 as that of a random walk, whose color the Yule-Walker
-/// equations underestimate (Kay, Modern Spectral Estimation, §7.6). The order minimizes Schwarz's criterion. NaN is a
-/// missing sample.
+/// The series is not centered. Yule-Walker estimates move a root near 1, that of a random walk, inward and so
+/// underestimate slow correlation; Burg's do not (Kay, Modern Spectral Estimation, §7.6). The order, at most `most`,
+/// minimizes Schwarz's criterion. NaN marks a missing sample: pairs that begin or end at it are left out.
 ///
 /// ```
 /// // The sum of ±1 is a random walk: each value predicts the next one.

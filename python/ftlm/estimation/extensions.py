@@ -1,4 +1,4 @@
-"""Tests whether an extended structure, or other initial conditions, explain the colored residuals of a fit.
+"""Tests whether an extended structure explains colored residuals, and whether other initial conditions fit as well.
 
 The extensions are a constant, a linear drift of an output, another intersample behavior of an input (``"zoh"`` or
 ``"foh"``), a lag, a delay or lead, a zero, a pole with a zero, dry friction, a saturation, a dead zone, a squared
@@ -107,7 +107,7 @@ class Extension:
     starts
         Initial guesses; None stands for the automatic ones.
     near
-        Fit with the same parameters from whose optimum, on its grid, the extension is fitted instead.
+        Fit with the same free parameters. The extension is fitted from its optimum and on its grid, not from `starts`.
     local_start
         Parameter values at which the extended model nearly equals the fitted one. If a local fit from these values does
         not lower the criterion, the slower multistart from `starts` is skipped.
@@ -254,7 +254,7 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 
 
 def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:
-    """Return the structure extended by a constant and by a linear drift; [] if nonlinear or if offsets were given.
+    """Return extensions by a constant, if the structure has no level, and by a drift; [] if nonlinear or given offsets.
 
     If the fit explains little (`is_poor`), the optimum with a constant may be far away. It is then also sought from
     automatic initial guesses.
@@ -267,6 +267,7 @@ def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_
             constant_structure = replace(structure, offset="constant")
             starts = [joint.values_by_name, *([None] if is_poor else [])]
             extensions.append(Extension("offset_missing", constant_structure, count, [], starts=starts))
+        # A ramp has a constant and a slope; the constant is not new beside a level.
         count *= 2
     drift = replace(structure, offset="ramp")
     return [*extensions, Extension("drift_fits", drift, count, [], near=joint)]

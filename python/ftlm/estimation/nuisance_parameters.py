@@ -53,7 +53,7 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS
 
 #: Block pulses per sampling interval if the fit does not state its refinement.
 DEFAULT_PULSES_PER_SAMPLE = 2
-#: Fits of the noise to the residuals and of the columns under that noise, in turn.
+#: Maximum number of alternations between the fit of the noise and the regression under that noise.
 NOISE_FITS = 4
 #: Rows of the lagged residuals that are stored at a time.
 NOISE_BLOCK_ROWS = 1 << 14
@@ -78,12 +78,13 @@ SCREENING_RESIDUAL_SHARE = 0.5
 
 @dataclass(frozen=True)
 class OffsetTest:
-    """Score test for unknown constants in the equations.
+    """Test for unknown constants in the equations, at given parameters.
 
     Parameters
     ----------
     statistic
-        Likelihood ratio under colored residuals; chi-squared distributed without an offset.
+        Twice the logarithm of the likelihood ratio under autoregressive noise; approximately chi-squared distributed if
+        there is no constant.
     degrees
         Number of identifiable constants over all equations and runs; 0 if none is identifiable.
     share
@@ -101,7 +102,8 @@ class OffsetTest:
     def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = NEGLIGIBLE_RESIDUAL_SHARE) -> bool:
         """Whether the statistic is significant at `level` and the effect is larger than `size`.
 
-        An effect larger than the standard deviation of the output counts as significant: noise of no color explains it.
+        An effect larger than the standard deviation of the output counts as significant: noise of whatever color cannot
+        explain it.
         """
         significant = self.size > 1.0 or self.statistic > chi_squared(self.degrees, level)
         return self.degrees > 0 and self.size > size and significant
@@ -158,8 +160,9 @@ def offset_test(
     """Test at given parameters for an unknown constant in each equation and run; None if not computable.
 
     Two linear regressions of the residuals under autoregressive noise are compared: on the sensitivities to all free
-    parameters and initial terms, and on these and the response to a constant in each equation. The statistic is the
-    likelihood ratio of their one-step prediction errors. A consistent estimate at which to linearize is sufficient.
+    parameters and initial terms, and on these and the response to a constant in each equation. The statistic is
+    twice the logarithm of the likelihood ratio of their one-step prediction errors. The `values` need only be
+    consistent; `every` is the number of block pulses per sampling interval.
     """
     reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
     one = next(n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names)
@@ -263,41 +266,46 @@ def _initial_responses(point: Iterate, blocks: list[list[tuple[int, int]]], size
 
 
 def _prediction_ratio(few: Floats, many: Floats, residuals: Floats, blocks: list[list[tuple[int, int]]]) -> float:
-    """Return twice the logarithm of the likelihood ratio of two sets of columns under autoregressive noise.
+    """Return the decrease of the noise criterion from the columns `few` to the columns `many`, at least 0.
 
-    One-step prediction errors are compared: the mean of a random walk is as large as the walk, but its changes are
-    white. Each set has an order of its own, because a high order imitates a constant.
+    For equal autoregressions it is twice the logarithm of the likelihood ratio of their one-step prediction errors.
+    Predictions are compared because a random walk has a mean as large as itself, but white increments. Each set has its
+    own order: that which is needed without the constants can imitate them. Both are evaluated on the same rows.
     """
     outputs = [[slice(*own[k]) for own in blocks] for k in range(len(blocks[0]))]
     shortest = [min(p.stop - p.start for p in places) for places in outputs]
     most = [min(DEFAULT_LAGS, size // SAMPLES_PER_NOISE_LAG) for size in shortest]
     orders = [_noise_criterion(columns, residuals, outputs, most)[1] for columns in (few, many)]
-    starts = [max(pair) for pair in zip(*orders, strict=True)]
-    one, other = (_noise_criterion(columns, residuals, outputs, starts)[0] for columns in (few, many))
+    max_orders = [max(pair) for pair in zip(*orders, strict=True)]
+    one, other = (_noise_criterion(columns, residuals, outputs, max_orders)[0] for columns in (few, many))
     return max(one - other, 0.0)
 
 
 def _noise_criterion(
-    columns: Floats, residuals: Floats, outputs: Sequence[Sequence[slice]], starts: Sequence[int]
+    columns: Floats, residuals: Floats, outputs: Sequence[Sequence[slice]], max_orders: Sequence[int]
 ) -> tuple[float, list[int]]:
-    """Return the criterion of the noise that remains after regression on columns, and the autoregression orders.
+    """Return the noise criterion after regression on columns, and the order of the noise of each output.
 
-    Regression by generalized least squares and the fit of an autoregression to the noise of each output alternate. The
-    criterion counts the rows of each run from that of `starts` on.
+    The criterion is that of :func:`_fit_autoregression`, summed over the outputs. Generalized least squares and the fit
+    of autoregressions alternate until it no longer decreases. `max_orders` bounds the order of each output and is the
+    first predicted row of each run. `columns` are orthonormal.
     """
     both, amounts = np.column_stack([columns, residuals]), projections(columns, residuals)
-    best, orders = math.inf, list(starts)
+    best, orders = math.inf, list(max_orders)
     for _ in range(NOISE_FITS):
         noise = residuals - columns @ amounts
-        fits = [_fit_autoregression([noise[p] for p in places], s) for places, s in zip(outputs, starts, strict=True)]
+        fits = [
+            _fit_autoregression([noise[p] for p in places], most)
+            for places, most in zip(outputs, max_orders, strict=True)
+        ]
         criterion = sum(f.criterion for f in fits)
         if not criterion < best:
             break
         best, orders = criterion, [f.order for f in fits]
         whitened = np.concatenate(
             [
-                f.whiten(both[place], start)
-                for f, places, start in zip(fits, outputs, starts, strict=True)
+                f.whiten(both[place], first)
+                for f, places, first in zip(fits, outputs, max_orders, strict=True)
                 for place in places
             ]
         )
@@ -324,11 +332,12 @@ class _Autoregression:
 
 
 def _fit_autoregression(series: Sequence[Floats], most: int) -> _Autoregression:
-    """Return an autoregression of series or of their changes, by least squares from row ``most`` of each on.
+    """Return the autoregression of lower criterion: of the series, or of their increments, whose root is fixed at 1.
 
-    The series are not centered. The order has the least criterion of Akaike, because white noise on a random walk has a
-    long autoregression. An estimated root near 1 is biased toward noise with a mean, so that a root other than 1 counts
-    as a parameter of Schwarz's criterion.
+    Both are fitted by least squares from row ``most`` of each series on. Orders minimize Akaike's criterion, because
+    white noise on a random walk needs many lags. That of the series pays a further log(rows): an estimated root near 1
+    is biased downward, so that a random walk would pass for stationary noise about a mean. Series are not centered,
+    because their mean is what is tested.
     """
     factor = np.zeros((most + 1, most + 1))
     for windows in (np.lib.stride_tricks.sliding_window_view(e, most + 1) for e in series):
@@ -344,7 +353,11 @@ def _fit_autoregression(series: Sequence[Floats], most: int) -> _Autoregression:
 
 
 def _nested_regression(factor: Floats, rows: int, difference: Floats, penalty: float) -> _Autoregression:
-    """Return the regression of the last column of a triangular factor on the first ones of least criterion."""
+    """Return the autoregression of the order that minimizes rows log(power) + 2 order + `penalty`.
+
+    The triangular `factor` has the lags first and the predicted value last: regression on the first k columns leaves
+    the last column from row k on. `difference` is the filter that the series passed before, and part of the result.
+    """
     last = factor[:, -1]
     powers = np.maximum(np.cumsum(last[::-1] ** 2)[::-1] / rows, np.finfo(np.float64).tiny)
     criteria = rows * np.log(powers) + 2.0 * np.arange(last.size) + penalty

@@ -223,7 +223,7 @@ class JointFit:
         return out
 
     def exact_outputs(self, runs: Sequence[Run]) -> set[str]:
-        """Return the outputs whose residuals are rounding and discretization errors, not noise."""
+        """Return the outputs whose residuals are negligible: errors of rounding and discretization, not noise."""
         sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in self.noise}
         return {o for o, noise in self.noise.items() if noise <= NEGLIGIBLE_RESIDUAL_SHARE * sizes[o]}
 

@@ -68,9 +68,9 @@ class StartSettings:
     least_noise
         Noise assumed for a noise-free signal, as a fraction of its standard deviation.
     drift_share
-        Limit on the uncertainty of a drift in quiet samples. It is the standard error of the drift, extrapolated to the
-        whole run, as a fraction of the output's standard deviation. It applies if an input starts at a nonzero value
-        and changes often.
+        Maximum standard error of a drift in the quiet samples, extrapolated to the whole run, as a fraction of the
+        output's standard deviation. It is checked only if an input begins at a nonzero value and an input changes more
+        than once.
     outlier_share
         Maximum fraction of quiet samples that may be outliers; one outlier is always allowed.
     rounding
@@ -318,8 +318,11 @@ def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
 
 
 def conditions_in_motion(structure: Structure) -> Initial:
-    """Return the initial conditions of a structure for a run that was not at rest before its first sample."""
-    # Past inputs are superposed, so that a model that is not linear has only its initial states.
+    """Return the initial conditions for a run that need not begin at rest.
+
+    They are ``"history"`` for a linear structure with memory, otherwise ``"caputo"``.
+    """
+    # A history superposes responses to past inputs, which requires linearity.
     return "history" if has_memory(structure) and structure.is_linear else "caputo"
 
 
@@ -377,10 +380,11 @@ def output_residuals(measurement: Floats, simulated: Floats) -> Floats:
 
 
 def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Floats]) -> float:
-    """Return the Bayesian information criterion of a fit with `terms` initial terms; lower is better.
+    """Return the Bayesian information criterion of a fit with `terms` initial terms, up to a constant.
 
-    The numbers of samples are divided by the variance inflation of the `reference` residuals, the same for all compared
-    fits. A smooth misfit that a missing term causes then has the same weight in all of them.
+    Lower is better. Other parameters are not counted, so that only fits that share them are compared. The number of
+    samples is divided by the variance inflation of the `reference` residuals, the same for all compared fits, so that
+    a smooth misfit has the same weight in all of them.
     """
     score, total = 0.0, 0.0
     for own, other in zip(residuals, reference, strict=True):

@@ -223,10 +223,11 @@ fn standard_deviation(values: &[f64]) -> f64 {
 
 /// Best rows of an order grid from which the coefficients follow by a law.
 const ROWS_BY_LAW: usize = 4;
-/// Candidates from an order grid under an order law, rows among which they are sought, and their least difference in
-/// some order.
-const CANDIDATES_BY_LAW: usize = 4;
-const ROWS_TO_SEPARATE: usize = 400;
+/// Maximum number of initial guesses from one order grid under an order law.
+const MAX_GUESSES_UNDER_ORDER_LAW: usize = 8;
+/// Number of best rows of an order grid among which these are chosen.
+const ROWS_UNDER_ORDER_LAW: usize = 4000;
+/// Least difference of two of them in at least one order: more than one increment of the grid.
 const MIN_ORDER_SEPARATION: f64 = 0.35;
 /// Ratios of a coefficient law at which the coefficients of one equation follow from those of another.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
@@ -241,10 +242,11 @@ pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &s
     )
 }
 
-/// Candidates from the best rows of an order grid, without earlier candidates: one, or several under an order law.
+/// Initial guesses from the best rows of an order grid.
 ///
-/// A law ties the orders of several equations, whose equation errors have several minima between them. The candidates
-/// then differ from each other in some order.
+/// One guess is the best row. Under an order law there are several, because the equation errors of the equations that it
+/// ties have several minima; each differs from every better one in at least one order. A row with the orders of a guess
+/// in `before` is not repeated, but counts.
 pub(super) fn grid_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
@@ -252,7 +254,8 @@ pub(super) fn grid_candidates(
     origin: &str,
     before: &[Candidate],
 ) -> Result<Vec<Candidate>> {
-    let (count, rows) = if free.structure.has_order_law() { (CANDIDATES_BY_LAW, ROWS_TO_SEPARATE) } else { (1, 1) };
+    let (count, rows) =
+        if free.structure.has_order_law() { (MAX_GUESSES_UNDER_ORDER_LAW, ROWS_UNDER_ORDER_LAW) } else { (1, 1) };
     let mut candidates: Vec<Candidate> = Vec::new();
     let mut picked: Vec<Vec<f64>> = Vec::new();
     for row in coarse.best_rows(&free.structure, axes, rows)? {
