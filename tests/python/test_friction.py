@@ -377,7 +377,7 @@ def test_a_velocity_of_one_sign_does_not_tell_friction_from_an_offset() -> None:
     assert np.all(v >= 0.0)
     run = run_of(force, 0.01, y + 1e-3 * np.random.default_rng(0).standard_normal(401))
     found = ftlm.identify(run, ftlm.equation(CART + " + c", initial="caputo"))
-    assert any("never changes its sign" in w for w in found.warnings)
+    assert any(f.code == "friction_unsigned" for f in found.findings)
 
 
 def test_a_run_that_never_moves_is_refused() -> None:
