@@ -332,7 +332,7 @@ def test_results_print_and_are_json(clean_a, plants):
 def test_a_prior_that_pulls_is_named(small_run, structure):
     found = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=0.01))
     (warning,) = (w for w in found.warnings if "the prior" in w)
-    assert "y: the prior (K0 = 0.01, centered at 0) shifts a coefficient by" in warning
+    assert "y: the prior (covariance K0 = 0.01, mean 0) shifts a coefficient by" in warning
     assert "Raise prior_covariance=, or use method='least-squares'" in warning
     assert "p = 7 only sets the weight of the data relative to the prior" in warning
     weak = ftlm.identify(small_run, structure, method=ftlm.MultiInnovation(prior_covariance=1e6))
@@ -363,7 +363,7 @@ def test_the_papers_prior_on_plant_a_is_named(clean_a, plants):
     assert found.settings["m"] == 2048
     assert found.coefficients["a1"] == pytest.approx(1.25, abs=0.01)
     for output in ("theta11", "theta12"):
-        assert any(w.startswith(f"{output}: the prior (K0 = 1") for w in found.warnings)
+        assert any(w.startswith(f"{output}: the prior (covariance K0 = 1") for w in found.warnings)
         assert any(w.startswith(f"{output}: the simulation explains little") for w in found.warnings)
 
 
@@ -412,7 +412,7 @@ def test_a_discretization_that_is_itself_unstable_is_named():
     assert _core.nyquist_margin([(-2000.0, 2.0), (-60.0, 1.0)], 0.08) == pytest.approx(1 - 2000 * 0.08**2 / 12)
     (warning,) = (w for w in coarse.warnings if "discretization" in w)
     assert warning.startswith(
-        "y: with 100 pulses the discretization itself is unstable (margin -0.067), whether or not"
+        "y: with 100 block pulses per run the discretization itself is unstable (stability margin -0.067), whether or not"
     )
     assert "raise m" in warning
     assert not any("discretization" in w for w in fine.warnings)

@@ -505,7 +505,7 @@ def test_equation_error_prefers_near_identities_at_alpha_2(clean_a, with_noise, 
     assert compared.output_error["theta12"].nr == pytest.approx(172, rel=0.03)
     (warning,) = compared.warnings
     assert "orders 1.95, 1.9 are close to alpha = 2" in warning
-    assert "Do not use these orders" in warning
+    assert "Do not use the model with these orders" in warning
 
 
 @pytest.mark.parametrize("seed", [0, 1])

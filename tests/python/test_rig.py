@@ -461,7 +461,7 @@ def test_a_live_estimate_is_of_the_equation_that_identify_takes_and_its_prior_is
     assert "g2" not in weak
     assert "the prior" not in weak
     assert command(*words, "-o", tmp_path / "strong.csv", "--prior-covariance", 1) == 0
-    assert "! theta11: the prior (K0 = 1, centered at 0) shifts a coefficient by" in capsys.readouterr().err
+    assert "! theta11: the prior (covariance K0 = 1, mean 0) shifts a coefficient by" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

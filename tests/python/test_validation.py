@@ -233,7 +233,12 @@ def figures(nr):
         ((1.4,), 0.01, 0.04, None),
         ((1.4,), 0.01, 0.06, "order 1.4 is close to alpha = 1.5, so the equation nearly says that y equals itself"),
         ((1.4, 1.3), 0.001, np.inf, "orders 1.4, 1.3 are close to alpha = 1.5"),
-        ((1.4, 1.3), 0.001, np.nan, "the NR of its simulation is nan, that of the equation error 0.001"),
+        (
+            (1.4, 1.3),
+            0.001,
+            np.nan,
+            "the normalized residual (NR) of its simulation is nan, that of the equation error 0.001",
+        ),
         ((1.0,), 0.01, 0.4, None),
         ((1.0,), 0.01, 0.6, "the simulation (NR 0.6) is far worse than the equation error (0.01)"),
         ((1.0,), 0.4, 0.6, "the simulation explains little of the output (NR 0.6)"),
