@@ -26,7 +26,7 @@ from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.model_checks import enumerate_names
-from ftlm.estimation.nuisance_parameters import output_sensitivities, refit_if_accepted
+from ftlm.estimation.nuisance_parameters import evaluate_at_point, output_sensitivities, refit_if_accepted
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
@@ -37,6 +37,7 @@ from ftlm.structure.expression import apply, channel, constant, multiply, power
 from ftlm.structure.input_nonlinearity import InputEffect, input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Offset, Structure
+from ftlm.utils.linalg import orthonormal
 from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, simulate_runs
@@ -59,10 +60,10 @@ MIN_CRITERION_GAP = 10.0
 MAX_EXTENSION_SAMPLES = 6000
 #: Smallest share of a run before and after a load step.
 MIN_LOAD_SHARE = 0.05
-#: Number of initial guesses of the row of a load step.
-LOAD_ROW_GUESSES = 7
 #: Maximum number of searches of the row of a load step from one fit.
 MAX_LOAD_SEARCHES = 4
+#: Share of the power of a load step that the parameters do not explain, below which it is collinear with them.
+LOAD_COLLINEARITY_TOLERANCE = 1e-6
 #: Smallest saturation limit that is tried, as a share of the largest value of an input.
 MIN_SATURATION_SHARE = 0.05
 #: Largest dead zone that is tried, as a share of the largest value of an input.
@@ -178,17 +179,14 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
         joint, runs = _first_samples(joint, structure, runs)
         own = _prediction_criterion(joint, structure, runs, 0)
         is_poor = any(not o.nr <= MAX_NORMALIZED_RESIDUAL for o in large)
-        extensions = [
-            *_offset_extensions(structure, joint, runs, is_poor=is_poor),
-            *_intersample_extensions(structure, joint, runs),
-        ]
+        fit_each = partial(_fit_extensions, runs=runs, own_criterion=own)
+        fits = fit_each(_offset_extensions(structure, joint, runs, is_poor=is_poor))
+        offset_fits = sorted((f.fit for f in fits), key=lambda fit: max(fit.noise.values()))
+        fits += fit_each(_intersample_extensions(structure, joint, runs))
         if names:
-            extensions += _input_extensions(structure, joint, runs, names)
-            extensions += [
-                *_friction_extensions(structure, joint, runs),
-                *_load_step_extensions(structure, joint, runs),
-            ]
-        fits = [f for e in extensions if (f := _fit_extension(e, runs, own)) is not None]
+            fits += fit_each(_input_extensions(structure, joint, runs, names))
+            fits += fit_each(_friction_extensions(structure, joint, runs))
+            fits += fit_each(_load_step_extensions(structure, [joint, *offset_fits[:1]], runs))
         best = _best_extension(fits, own)
         clear = best is not None and best.criterion <= own - MIN_CRITERION_DECREASE
         findings = _extension_findings(best, structure, joint, runs, names, about) if best and clear else []
@@ -329,6 +327,11 @@ def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list
     numbered = (f"{base}{k}" for k in itertools.count(1))
     names = itertools.chain([base] if count == 1 else [], numbered)
     return list(itertools.islice((n for n in names if n not in reserved_names), count))
+
+
+def _fit_extensions(extensions: Sequence[Extension], *, runs: Runs, own_criterion: float) -> list[FittedExtension]:
+    """Return the fits of extensions, without those of which every fit fails."""
+    return [f for e in extensions if (f := _fit_extension(e, runs, own_criterion)) is not None]
 
 
 def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> FittedExtension | None:
@@ -486,57 +489,58 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
     return extensions
 
 
-def _load_step_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
+def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs: Runs) -> list[Extension]:
     """Return the structure with a constant load that sets in at an unknown time; [] for several or irregular runs.
 
-    The model is fitted with the load step at each of seven times. The search continues from the best of these fits and
-    from the fit without a load: the step moves to the time at which a load explains most of the residuals, and the
-    model is fitted again, until the time does not change.
+    From the parameters of each of `starts`, the step is put at the time at which a load, with the parameters adapted to
+    it, explains most of the residuals. The model is fitted again, until the time does not change.
     """
     (item,), (run, *others) = structure.equations, runs
     if others or run.sample_times is not None:
         return []
     (name,) = _unused_names("load", 1, structure, run)
     wider = replace(structure, equations=(_with_terms(item, [Term(name, Order(0.0), name)]),))
-    size = run.length
 
-    def fit_at(row: int, near: JointFit) -> JointFit:
-        loaded = run_with_inputs(run, {name: np.where(np.arange(size) >= row, 1.0, 0.0)})
-        start = {name: 0.0, **near.values_by_name}
-        return fit_output_error([loaded], wider, start=start, refine=False)
+    def loaded(row: int) -> Run:
+        return run_with_inputs(run, {name: np.where(np.arange(run.length) >= row, 1.0, 0.0)})
 
-    def search(fit: JointFit, row: int) -> tuple[float, int]:
+    def search(values: Mapping[str, float]) -> tuple[float, int, Mapping[str, float]]:
+        best: tuple[float, int, Mapping[str, float]] = (math.inf, 0, {})
         for _ in range(MAX_LOAD_SEARCHES):
-            response = _load_response(item, structure, fit, run)
-            residuals = fit.noise[item.output] * fit.residuals[0][item.output]
-            if row:
-                residuals[row - 1 :] += fit.coefficients[name] * response[: size - 1 - row]
-            step_row = _load_row(residuals, response)
-            if step_row is None or step_row == row:
+            # Without the load, its size is that which the residuals require.
+            values = {n: values[n] for n in starts[0].names}
+            row = _load_row(*_residuals_at(values, structure, run), _load_response(item, structure, values, run))
+            if row is None or row == best[1]:
                 break
-            fit, row = fit_at(step_row, fit), step_row
-        return (fit.noise[item.output] if row else math.inf), row
+            fit = fit_output_error([loaded(row)], wider, start={name: 0.0, **values}, refine=False)
+            noise, values = fit.noise[item.output], fit.values_by_name
+            if not noise < best[0]:
+                break
+            best = noise, row, values
+        return best
 
-    try:
-        rows = np.linspace(0, size, LOAD_ROW_GUESSES + 2).astype(int)[1:-1]
-        best = min(((fit_at(int(k), joint), int(k)) for k in rows), key=lambda pair: pair[0].noise[item.output])
-        noise, row = min(search(joint, 0), search(*best))
-    except FtlmError:
-        return []
+    found = []
+    for fit in starts:
+        with contextlib.suppress(FtlmError):
+            found.append(search(fit.values_by_name))
+    noise, row, values = min(found, key=lambda f: f[0], default=(math.inf, 0, {}))
     if not math.isfinite(noise):
         return []
-    loaded = run_with_inputs(run, {name: np.where(np.arange(size) >= row, 1.0, 0.0)})
-    starts = [None, {name: 0.0, **joint.values_by_name}]
     time = run.start + row * run.step
-    return [Extension("load_step_fits", wider, 2, [name], starts, runs=as_runs(loaded), load_time=time)]
+    return [Extension("load_step_fits", wider, 2, [name], [values], runs=as_runs(loaded(row)), load_time=time)]
 
 
-def _load_response(item: Equation, structure: Structure, joint: JointFit, run: Run) -> Floats:
-    """Return the response of a fitted model to a constant unit load from sample 0 on, at samples 1 to N - 1."""
+def _residuals_at(values: Mapping[str, float], structure: Structure, run: Run) -> tuple[Floats, Floats]:
+    """Return residuals and their sensitivities (parameters, samples) at given parameters, up to a common factor."""
+    _, point = evaluate_at_point([run], structure, values, 1)
+    return np.asarray(point.outcome["residuals"]), np.asarray(point.outcome["jacobian"])
+
+
+def _load_response(item: Equation, structure: Structure, values: Mapping[str, float], run: Run) -> Floats:
+    """Return the response of a model with given parameters to a unit load from sample 0 on, at samples 1 to N - 1."""
     own = (t for t in item.terms if t.signal == item.output)
     alone = replace(item, terms=(*own, Term("load", Order(0.0), 1.0)))
     single = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
-    values = joint.values_by_name
     single = single.with_orders({n: values[n] for n in single.order_names})
     model = Model(single.with_coefficients({n: values[n] for n in single.coefficient_names}))
     ones, zeros = np.ones(run.length), np.zeros(run.length)
@@ -544,21 +548,29 @@ def _load_response(item: Equation, structure: Structure, joint: JointFit, run: R
     return simulate(model, rest)[item.output][1:]
 
 
-def _load_row(residuals: Floats, response: Floats) -> int | None:
+def _load_row(residuals: Floats, sensitivities: Floats, response: Floats) -> int | None:
     """Return the sample index from which a constant load explains most of the residuals; None if not computable.
 
-    `residuals` and `response` cover samples 1 to N - 2 and start with the same sample.
+    `residuals`, the `sensitivities` to the parameters, an array (parameters, samples), and the `response` to a load
+    from the first sample on cover samples 1 to N - 2. What the parameters can explain is projected out of residuals and
+    loads.
     """
-    series = np.nan_to_num(residuals)
-    load = response[: series.size]
-    power, edge = np.cumsum(load**2)[::-1], max(int(MIN_LOAD_SHARE * series.size), 1)
-    if not np.all(np.isfinite(load)) or not power[-edge] > 0.0:
+    series, load = residuals, response[: residuals.size]
+    edge = max(int(MIN_LOAD_SHARE * series.size), 1)
+    if not np.all(np.isfinite(load)):
         return None
-    # The correlation by FFT, padded so that it is not circular.
-    spectra = np.fft.rfft(series, 2 * series.size) * np.conj(np.fft.rfft(load, 2 * series.size))
-    explained = np.fft.irfft(spectra)[: series.size] ** 2 / np.maximum(power, 1e-300)
+    basis = orthonormal(sensitivities.T, 1e-12)
+    series = series - basis @ (basis.T @ series)
+    # Products with the load from each row on, by FFTs that are padded so that they are not circular.
+    padded = 2 * series.size
+    spectra = np.fft.rfft(np.column_stack([basis, series]), padded, axis=0)
+    products = np.fft.irfft(spectra * np.conj(np.fft.rfft(load, padded))[:, None], axis=0)[: series.size]
+    power = np.cumsum(load**2)[::-1]
+    free_power = power - np.sum(products[:, :-1] ** 2, axis=1)
+    is_free = free_power > LOAD_COLLINEARITY_TOLERANCE * power
+    explained = np.where(is_free, products[:, -1] ** 2 / np.where(is_free, free_power, 1.0), 0.0)[edge:-edge]
     # A load of row k acts on row k + 1 first, which is number k of the inner rows.
-    return edge + int(np.argmax(explained[edge:-edge]))
+    return edge + int(np.argmax(explained)) if np.any(explained > 0.0) else None
 
 
 def _with_lag(item: Equation, coefficient: str) -> Equation:
@@ -652,9 +664,8 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
         if (initial, offset) == own_setting:
             continue
         request = replace(structure, initial=initial, offset=offset)
-        refit = partial(fit_output_error, near=joint, refine=False)
         other = refit_if_accepted(
-            joint, runs, request, lambda candidate: squares_ratio(candidate) <= MAX_SQUARES_RATIO, refit
+            joint, runs, request, lambda candidate: squares_ratio(candidate) <= MAX_SQUARES_RATIO, refine=False
         )
         if other is None or other.unstable_optimum is not None:
             continue

@@ -49,7 +49,7 @@ from ftlm.estimation.nuisance_parameters import (
     refit_if_accepted,
     unrequested_offset_findings,
 )
-from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, parameter_set
+from ftlm.estimation.output_error import JointFit, parameter_set
 from ftlm.estimation.result import Identification
 from ftlm.estimation.unstable_plants import SPLIT_CODES, unstable_plant_findings
 from ftlm.estimation.verdict import has_loop_noise_model, is_buried, result_findings
@@ -166,10 +166,7 @@ class Hypotheses:
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
         request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
-        loss: Loss = "squares" if joint.robust is None else "huber"
-        # The refinement of a fit is that of the finer of its two last grids.
-        coarser = replace(joint, refinement=max(joint.refinement // 2, 1))
-        near = refit_if_accepted(joint, runs, request, accepts, partial(fit_output_error, near=coarser, loss=loss))
+        near = refit_if_accepted(joint, runs, request, accepts)
         return None if near is None else replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
 
 

@@ -72,7 +72,7 @@ MAX_REFINEMENT_EVALUATIONS = 40
 #: Maximum number of evaluations that screen initial conditions from an optimum under others. Those that explain a run
 #: as well converge in two to four.
 MAX_SCREENING_EVALUATIONS = 12
-#: Share of the residuals of a screening that a fit to the end could leave.
+#: Share of the residuals of a screening that did not converge which a fit to the end could leave.
 SCREENING_RESIDUAL_SHARE = 0.5
 
 
@@ -429,12 +429,12 @@ def fit_with_initial_conditions(
         request = replace(structure, initial=start)
         multistart = None if alone else run_multistart(runs, request, threads, progress)
         many = fit_initial_terms(start, refine=False, multistart=multistart)
-        simplified = _simplify_initial_terms(many, runs, structure, loss, refine=False)
+        simplified = _simplify_initial_terms(many, runs, structure, refine=False)
         request = replace(structure, initial=simplified.initial)
         fine = fit_output_error(runs, request, near=simplified, loss=loss, multistart=multistart)
         unstable = fine.unstable_optimum or simplified.unstable_optimum or many.unstable_optimum
         fine = replace(fine, starts=many.starts, origin=many.origin, unstable_optimum=unstable)
-        return fine if simplified is not many else _simplify_initial_terms(fine, runs, structure, loss, refine=True)
+        return fine if simplified is not many else _simplify_initial_terms(fine, runs, structure, refine=True)
     joint = fit_initial_terms(start)
     if decided or start != "rest" or not _has_nonzero_start(joint, runs, structure):
         return joint
@@ -472,19 +472,15 @@ def _pooled_residuals(joint: JointFit) -> list[Floats]:
     return [noise * np.concatenate([part[o] for part in joint.residuals]) for o, noise in joint.noise.items()]
 
 
-def _simplify_initial_terms(
-    joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool
-) -> JointFit:
+def _simplify_initial_terms(joint: JointFit, runs: Sequence[Run], structure: Structure, *, refine: bool) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
-    request, begin = replace(structure, initial="caputo"), joint.values_by_name
-    few = refit_if_accepted(
-        joint,
-        runs,
-        request,
-        lambda few: not _fit_needs_history(few, joint, runs, structure),
-        partial(fit_output_error, start=begin, loss=loss, refine=refine),
+    request = replace(structure, initial="caputo")
+    return (
+        refit_if_accepted(
+            joint, runs, request, lambda few: not _fit_needs_history(few, joint, runs, structure), refine=refine
+        )
+        or joint
     )
-    return few or joint
 
 
 def refit_if_accepted(
@@ -492,35 +488,47 @@ def refit_if_accepted(
     runs: Sequence[Run],
     structure: Structure,
     accepts: Callable[[JointFit], bool],
-    refit: Callable[[Sequence[Run], Structure], JointFit],
+    *,
+    refine: bool = True,
 ) -> JointFit | None:
     """Return the refit of a linear structure with other initial conditions or offsets; None if rejected or failed.
 
-    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The remaining
-    residuals, multiplied by `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of a complete fit. `refit`
-    makes the complete fit only if `accepts` accepts this estimate. Its result must also be accepted.
+    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. If it does not
+    converge, the residuals, multiplied by `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of a complete
+    fit. Then follow a fit on the same grid and, with `refine`, one with a refined step. Each is made only if `accepts`
+    accepts the result before.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
     grid = Objective(problem, runs, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
+    loss: Loss = "squares" if joint.robust is None else "huber"
     begin = start_from_values(problem, joint.values_by_name)
     try:
-        screening = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True)
+        # A smaller reduction of the cost changes the log-likelihood by less than 0.5.
+        tolerance = 1.0 / joint.samples
+        screening = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True, tolerance=tolerance)
+        share = 1.0 if screening.has_converged else SCREENING_RESIDUAL_SHARE
         deviation = grid.rms_residuals(screening)
         if joint.robust is not None:
             deviation = {o: robust_deviation(e) for o, e in grid.pooled_residuals(screening).items()}
         screened = replace(
             joint,
-            noise={o: SCREENING_RESIDUAL_SHARE * v * joint.noise[o] for o, v in deviation.items()},
+            noise={o: share * v * joint.noise[o] for o, v in deviation.items()},
             residuals=[
                 {o: e / max(deviation[o], 1e-300) for o, e in part.items()} for part in grid.residuals(screening)
             ],
             initial_terms=sum(len(terms) for run in screening.outcome["initial"] for terms in run),
         )
-        fit = refit(runs, structure) if accepts(screened) else None
+        if not accepts(screened):
+            return None
+        fit = fit_output_error(runs, structure, near=joint, loss=loss, refine=False)
+        if refine and accepts(fit):
+            # The refinement of a fit is that of the finer of its two last grids.
+            coarser = replace(fit, refinement=max(fit.refinement // 2, 1))
+            fit = fit_output_error(runs, structure, near=coarser, loss=loss)
     except FtlmError:
         return None
-    return fit if fit is not None and accepts(fit) else None
+    return fit if accepts(fit) else None
 
 
 def refit_from(

@@ -111,7 +111,8 @@ pub enum Initialization {
 pub struct Settings {
     /// Loss function of the residuals. The multistart compares sums of squares.
     pub loss: Loss,
-    /// True to refine the step below the sampling interval.
+    /// True to refine the step below the sampling interval. Otherwise the fit is one to be compared with others: its
+    /// optimization ends as soon as the likelihood hardly increases.
     pub refine: bool,
     /// Threads of the multistart; results do not depend on it.
     pub threads: usize,
@@ -145,20 +146,20 @@ pub struct FitProblem<'a> {
 }
 
 impl<'a> FitProblem<'a> {
-    fn grid(&self, outputs: Vec<f64>, sampling: Sampling) -> Result<Objective<'a>> {
+    /// Objective with weights of the outputs; with the tolerance of comparisons unless the step is refined.
+    fn grid(&self, outputs: Vec<f64>, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
         let weights = Weights { outputs, robust_weights: None };
         let source: &'a Recordings = self.source;
-        Objective::new((&self.free.problem, source, self.stop), weights, sampling, false)
+        let grid = Objective::new((&self.free.problem, source, self.stop), weights, sampling, false)?;
+        Ok(if refine { grid } else { grid.for_comparison() })
     }
 
     /// Objective with equal weights of all outputs relative to their standard deviations.
     ///
     /// The noise levels determine the optimum, but are not needed to approach it.
-    ///
-    /// # Errors
-    /// As the source.
-    pub fn equally_weighted_grid(&self, sampling: Sampling) -> Result<Objective<'a>> {
-        self.grid(self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect(), sampling)
+    fn equally_weighted_grid(&self, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
+        let weights = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
+        self.grid(weights, sampling, refine)
     }
 
     /// Run the multistart; return its candidates, best first.
@@ -283,8 +284,8 @@ pub fn fit(
         Initialization::WarmStart { values, noise, pulses_per_sample: every, candidates: raced } => {
             let start = sought.start(&values, GIVEN_START_ORIGIN)?;
             let sampling = Sampling { pulses_per_sample: every, ..Sampling::default() };
-            let grid =
-                sought.grid(noise.iter().map(|noise| 1.0 / noise.max(MIN_NOISE_DEVIATION)).collect(), sampling)?;
+            let weights = noise.iter().map(|noise| 1.0 / noise.max(MIN_NOISE_DEVIATION)).collect();
+            let grid = sought.grid(weights, sampling, settings.refine)?;
             let (best, grid) = reweight_candidate(&start, grid, settings.loss)?;
             return finish_fit(free, best, grid, raced, settings).map(Some);
         }
@@ -301,7 +302,8 @@ pub fn fit(
     };
     let Some(first) = contenders.first() else { return Ok(None) };
     pace.advance_to(MULTISTART_PROGRESS_SHARE)?;
-    let mut grid = sought.grid(sought.sizes.iter().map(|size| 1.0 / size.noise).collect(), Sampling::default())?;
+    let weights = sought.sizes.iter().map(|size| 1.0 / size.noise).collect();
+    let mut grid = sought.grid(weights, Sampling::default(), settings.refine)?;
     // If a response is faster than the sampling interval, a grid of that step has a spurious optimum.
     while grid.sampling.pulses_per_sample < MAX_PULSES_PER_SAMPLE && !grid.is_exact(&first.result.iterate) {
         let finer = grid.finer()?;
@@ -310,7 +312,7 @@ pub fn fit(
         }
         grid = finer;
     }
-    let mut best = select_on_part(sought, &contenders, grid.sampling)?;
+    let mut best = select_on_part(sought, &contenders, grid.sampling, settings.refine)?;
     if sought.sizes.len() > 1 {
         // With a single output the noise level does not move the optimum.
         let place = &best.result.iterate;
@@ -362,10 +364,15 @@ fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -
 }
 
 /// Best survivor on all samples; of long records the best one on their first part continues alone.
-fn select_on_part(sought: FitProblem<'_>, contenders: &[Candidate], sampling: Sampling) -> Result<Candidate> {
-    let whole = sought.equally_weighted_grid(sampling)?;
+fn select_on_part(
+    sought: FitProblem<'_>,
+    contenders: &[Candidate],
+    sampling: Sampling,
+    refine: bool,
+) -> Result<Candidate> {
+    let whole = sought.equally_weighted_grid(sampling, refine)?;
     if let Some(intervals) = leading_part(sought.free, sought.source, SELECTION_INTERVALS)? {
-        let part = sought.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling })?;
+        let part = sought.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling }, refine)?;
         let winner = select_best_candidate(sought.free, contenders, &part).and_then(|best| {
             let place = &best.result.iterate;
             let problem = sought.free.problem_at(place, true, &[]);

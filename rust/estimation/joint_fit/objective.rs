@@ -13,6 +13,9 @@ use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 
 /// Relative cost decrease predicted for a full step below which an optimization has converged.
 pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
+/// Such a decrease times the number of residuals, for a fit that is only compared with others: the increase of twice
+/// the log-likelihood by a full step below which an optimization has converged.
+const COMPARISON_LIKELIHOOD_TOLERANCE: f64 = 2e-4;
 /// Largest acceptable discretization error, in standard deviations of the noise.
 const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
 /// Finest grid, in block pulses per sampling interval.
@@ -43,6 +46,8 @@ pub struct Objective<'a> {
     pub sampling: Sampling,
     /// True if an optimization must not go from a stable model to an unstable one.
     pub requires_stability: bool,
+    /// Relative decrease of the cost by a full step below which an optimization has converged.
+    tolerance: f64,
     /// Mask of the present samples, by run and output; empty without missing samples.
     sample_mask: Arc<Vec<Vec<Vec<f64>>>>,
     experiments: Arc<Vec<Experiment>>,
@@ -72,6 +77,7 @@ impl<'a> Objective<'a> {
             weights: blank,
             sampling,
             requires_stability: steady,
+            tolerance: RELATIVE_COST_TOLERANCE,
             sample_mask: read,
             experiments: Arc::new(experiments),
         };
@@ -111,7 +117,20 @@ impl<'a> Objective<'a> {
     /// As the source.
     pub fn finer(&self) -> Result<Self> {
         let sampling = Sampling { pulses_per_sample: 2 * self.sampling.pulses_per_sample, ..self.sampling };
-        Self::new((self.problem, self.source, self.stop), self.weights.clone(), sampling, self.requires_stability)
+        let whole = (self.problem, self.source, self.stop);
+        let finer = Self::new(whole, self.weights.clone(), sampling, self.requires_stability)?;
+        Ok(Self { tolerance: self.tolerance, ..finer })
+    }
+
+    /// Objective whose optimizations end as soon as the likelihood hardly increases, for comparisons of fits.
+    ///
+    /// Along a flat valley, where the data leave parameters undetermined, these are far fewer evaluations.
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn for_comparison(self) -> Self {
+        let residuals: usize = self.experiments.iter().map(Experiment::compared_count).sum();
+        let tolerance = COMPARISON_LIKELIHOOD_TOLERANCE / (residuals * self.problem.outputs.len()).max(1) as f64;
+        Self { tolerance: tolerance.max(RELATIVE_COST_TOLERANCE), ..self }
     }
 
     /// Objective of another problem with the same outputs.
@@ -155,7 +174,7 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// As [`Problem::minimize`].
     pub fn minimize(&self, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
-        let settings = MinimizationSettings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        let settings = MinimizationSettings { evaluations, tolerance: self.tolerance };
         self.problem.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
@@ -164,7 +183,7 @@ impl<'a> Objective<'a> {
     /// # Errors
     /// As [`Problem::minimize`].
     pub fn minimize_in(&self, turned: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
-        let settings = MinimizationSettings { evaluations, tolerance: RELATIVE_COST_TOLERANCE };
+        let settings = MinimizationSettings { evaluations, tolerance: self.tolerance };
         turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 

@@ -166,7 +166,7 @@ fn integer_order_optima(
     let mut candidates = Vec::new();
     for less in integer_order_problems(free, near) {
         // With fixed orders most initial guesses lead to the same optimum.
-        let ended = optimize_submodel(&less.free, course, coarse, MAX_FINAL_SURVIVORS)?;
+        let ended = optimize_submodel(&less.free, course, coarse, (MAX_FINAL_SURVIVORS, f64::INFINITY))?;
         candidates.extend(ended.iter().take(1).map(|runner| less.embed(runner)));
     }
     Ok(candidates)
@@ -174,12 +174,12 @@ fn integer_order_optima(
 
 /// Optimize a submodel from its own initial guesses; the best `going` of them continue.
 ///
-/// Of integer orders the leading intervals of long records suffice. Empty if two of its terms coincide.
+/// The second budget is for optima that can compete with a cost per residual of `level`, that of the full problem. Of integer orders the leading intervals of long records suffice. Empty if two of its terms coincide.
 fn optimize_submodel(
     free: &ParameterSet,
     course: MultistartContext<'_>,
     coarse: &Objective<'_>,
-    going: usize,
+    (going, level): (usize, f64),
 ) -> Result<Vec<Candidate>> {
     let part = leading_part(free, course.source, SELECTION_INTERVALS)?;
     if let Some(candidates) = integer_order_multistart(free, course.for_submodel(), part)? {
@@ -190,7 +190,10 @@ fn optimize_submodel(
     let mut runners = merge_duplicates(&laps.run(free, coarse, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
     runners.truncate(going);
     let ended = laps.run(free, coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
-    laps.run(free, coarse, &select_survivors(&ended), SECOND_BUDGET_EVALUATIONS)
+    let mut survivors = select_survivors(&ended);
+    let competitive = |runner: &Candidate| runner.cost_per_residual() <= MAX_SURVIVOR_COST_RATIO * level;
+    survivors.truncate(survivors.iter().filter(|runner| competitive(runner)).count().max(1));
+    laps.run(free, coarse, &survivors, SECOND_BUDGET_EVALUATIONS)
 }
 
 impl<'a> MultistartState<'a> {
@@ -202,7 +205,11 @@ impl<'a> MultistartState<'a> {
         let mut starts = self.starts.clone();
         loop {
             let glanced = self.laps.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
-            let glanced = merge_duplicates(&glanced, is_same_iterate);
+            let mut glanced = merge_duplicates(&glanced, is_same_iterate);
+            if self.coarse.sampling.pulses_per_sample > 1 {
+                // Nearly all of these were optimized on the coarser grid.
+                glanced.truncate(competitive_candidates(&glanced).len().max(MIN_SURVIVORS));
+            }
             self.candidates = self.laps.run(self.free, &self.coarse, &glanced, FIRST_BUDGET_EVALUATIONS)?;
             self.first.clone_from(&self.candidates);
             if self.coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
@@ -260,7 +267,8 @@ impl<'a> MultistartState<'a> {
             let ended = self.laps.run(&less.free, &self.coarse, &runners, FIRST_BUDGET_EVALUATIONS)?;
             return self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>());
         }
-        let ended = optimize_submodel(&less.free, self.course, &self.coarse, MIN_SURVIVORS)?;
+        let level = self.candidates.first().map_or(f64::INFINITY, Candidate::cost_per_residual);
+        let ended = optimize_submodel(&less.free, self.course, &self.coarse, (MIN_SURVIVORS, level))?;
         self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>())
     }
 
