@@ -72,8 +72,10 @@ MAX_REFINEMENT_EVALUATIONS = 40
 #: Maximum number of evaluations that screen initial conditions from an optimum under others. Those that explain a run
 #: as well converge in two to four.
 MAX_SCREENING_EVALUATIONS = 12
-#: Share of the residuals of a screening that did not converge which a fit to the end could leave.
-SCREENING_RESIDUAL_SHARE = 0.5
+#: Increase of twice the log-likelihood by a full step below which a screening has converged.
+SCREENING_LIKELIHOOD_TOLERANCE = 0.01
+#: Share of the residuals of a screening that a fit to the end could leave, if the screening converged and if not.
+CONVERGED_RESIDUAL_SHARE, SCREENING_RESIDUAL_SHARE = 0.9, 0.5
 
 
 @dataclass(frozen=True)
@@ -493,9 +495,8 @@ def refit_if_accepted(
 ) -> JointFit | None:
     """Return the refit of a linear structure with other initial conditions or offsets; None if rejected or failed.
 
-    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. If it does not
-    converge, the residuals, multiplied by `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of a complete
-    fit. Then follow a fit on the same grid and, with `refine`, one with a refined step. Each is made only if `accepts`
+    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The
+    residuals, multiplied by a share, are an optimistic estimate of those of a complete fit. Then follow a fit on the same grid and, with `refine`, one with a refined step. Each is made only if `accepts`
     accepts the result before.
     """
     problem = FreeProblem.of(structure)
@@ -504,10 +505,10 @@ def refit_if_accepted(
     loss: Loss = "squares" if joint.robust is None else "huber"
     begin = start_from_values(problem, joint.values_by_name)
     try:
-        # A smaller reduction of the cost changes the log-likelihood by less than 0.5.
-        tolerance = 1.0 / joint.samples
+        # Twice the log-likelihood increases by less than this in one step.
+        tolerance = SCREENING_LIKELIHOOD_TOLERANCE / joint.samples
         screening = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True, tolerance=tolerance)
-        share = 1.0 if screening.has_converged else SCREENING_RESIDUAL_SHARE
+        share = CONVERGED_RESIDUAL_SHARE if screening.has_converged else SCREENING_RESIDUAL_SHARE
         deviation = grid.rms_residuals(screening)
         if joint.robust is not None:
             deviation = {o: robust_deviation(e) for o, e in grid.pooled_residuals(screening).items()}
