@@ -28,9 +28,9 @@ an expression in parentheses. Blanks between names, numbers and symbols do not m
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 from ftlm.errors import ModelError
 from ftlm.structure.equation import Friction, Stribeck
@@ -57,6 +57,9 @@ _OFFSET_PATTERN = re.compile(r"c\d*")
 _TOKEN_PATTERN = re.compile(
     rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{IDENTIFIER_PATTERN})|(?P<symbol>[-+*/^(){{}}=,:']))"
 )
+#: Tops of ``d^2 y/dt^2``, ``d2y/dt2`` and ``dy/dt``, with a space between tokens, and most tokens of such a derivative.
+_LEIBNIZ_PATTERN = re.compile(rf"d(?: \^ (\d+)(?: ({IDENTIFIER_PATTERN}))?|(?:(\d+)?({IDENTIFIER_PATTERN}))?)(?= /)")
+MAX_LEIBNIZ_TOKENS = 8
 #: What follows the name of an offset in parentheses, by the kind of offset.
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
 #: Functions that an error message names where they are applied to a signal.
@@ -216,20 +219,21 @@ class EquationParser:
     def _sum(self, *, is_lhs: bool = False, closed: bool = False) -> list[ParsedTerm]:
         """Parse a sum up to the first token that cannot continue it, and return its terms."""
         terms: list[ParsedTerm] = []
-        while True:
-            sign = self._signs()
+        for sign in self._signs():
             if self._is_offset():
                 self._take_offset(sign, is_lhs=is_lhs)
             elif closed or not (self._take_printed_offset() or self._take_friction(-sign if is_lhs else sign)):
                 terms += self._item(sign)
-            if self._peek()[1] not in "+-" or self._peek()[0] != "symbol":
-                return terms
+        return terms
 
-    def _signs(self) -> float:
-        sign = 1.0
-        while self._peek()[0] == "symbol" and self._peek()[1] in "+-":
-            sign *= -1.0 if self._take()[1] == "-" else 1.0
-        return sign
+    def _signs(self) -> Iterator[float]:
+        """Yield the sign of each term of a sum, up to the first token that cannot continue it."""
+        is_first = True
+        while is_first or self._sees("+") or self._sees("-"):
+            is_first, sign = False, 1.0
+            while self._sees("+") or self._sees("-"):
+                sign *= -1.0 if self._take()[1] == "-" else 1.0
+            yield sign
 
     def _item(self, sign: float) -> list[ParsedTerm]:
         """Parse a product, or a number times a sum in parentheses, and return its terms."""
@@ -421,11 +425,11 @@ class EquationParser:
 
     def _operator(self) -> Order | None:
         """Parse ``D``, ``D^order`` or ``d/dt`` before an operand, and return its order; None for other text."""
-        operator = self._leibniz()
-        if operator is not None and not operator[1]:
-            self._position += operator[2]
-            return operator[0]
-        if self._peek()[:2] != ("name", "D"):
+        derivative = self._leibniz()
+        if derivative is not None and not derivative[1]:
+            self._position += derivative[2]
+            return derivative[0]
+        if not self._sees("D"):
             return None
         self._take()
         return self._order() if self._accept("^") else Order(1.0)
@@ -449,12 +453,7 @@ class EquationParser:
 
     def _expression(self) -> Expression:
         """Parse a sum of products of numbers, signals and functions without free parameters, and return it."""
-        terms = []
-        while True:
-            sign = self._signs()
-            terms.append(multiply(constant(sign), self._product()))
-            if self._peek()[1] not in "+-" or self._peek()[0] != "symbol":
-                return add(*terms)
+        return add(*[multiply(constant(sign), self._product()) for sign in self._signs()])
 
     def _product(self, *, divide: bool = True) -> Expression:
         """Parse a product of numbers, signals, derivatives, powers and functions, and return it."""
@@ -525,46 +524,29 @@ class EquationParser:
 
     def _derivative(self) -> tuple[Order | None, str]:
         """Parse a signal or its derivative, and return (order, signal); the order is None without a derivative."""
-        operator = self._leibniz()
-        if operator is not None:
-            order, signal, tokens = operator
-            self._position += tokens
-            return order, signal or self._signal()
-        if self._peek()[:2] == ("name", "D"):
-            self._take()
-            return (self._order() if self._accept("^") else Order(1.0)), self._signal()
-        signal = self._signal()
+        derivative = self._leibniz()
+        if derivative is not None and derivative[1]:
+            self._position += derivative[2]
+            return derivative[:2]
+        order, signal = self._operator(), self._signal()
         primes = 0
-        while self._accept("'"):
+        while order is None and self._accept("'"):
             primes += 1
-        return (Order(float(primes)) if primes else None), signal
+        return Order(float(primes)) if primes else order, signal
 
     def _leibniz(self) -> tuple[Order, str, int] | None:
         """Return (order, signal, number of tokens) of ``dy/dt``, ``d^2 y/dt^2`` or ``d/dt``; None for other text."""
-        distance, order = 0, 1
-        kind, value, _ = self._peek()
-        if kind != "name" or not value.startswith("d"):
+        text = " ".join(self._peek(k)[1] for k in range(MAX_LEIBNIZ_TOKENS))
+        top = _LEIBNIZ_PATTERN.match(text)
+        if top is None:
             return None
-        signal = value[1:]
-        if not signal and self._peek(1)[1] == "^" and self._peek(2)[1].isdigit():
-            distance, order = 2, int(self._peek(2)[1])
-            if self._peek(3)[0] == "name":
-                distance, signal = 3, self._peek(3)[1]
-        elif re.fullmatch(r"\d+\D.*", signal):
-            digits = re.match(r"\d+", signal)
-            assert digits is not None
-            order, signal = int(digits[0]), signal[digits.end() :]
-        if self._peek(distance + 1)[1] != "/":
-            return None
-        bottom = self._peek(distance + 2)[1]
-        distance += 3
-        if bottom == "dt" and self._peek(distance)[1] == "^" and self._peek(distance + 1)[1] == str(order):
-            distance += 2
-        elif bottom != ("dt" if order == 1 else f"dt{order}"):
+        order, signal = int(top[1] or top[3] or 1), top[2] or top[4] or ""
+        bottom = re.compile(rf" / dt( \^ {order}|{'' if order == 1 else order})(?= |$)").match(text, top.end())
+        if bottom is None:
             return None
         if signal:
             self.plain.add(signal)
-        return Order(float(order)), signal, distance
+        return Order(float(order)), signal, text.count(" ", 0, bottom.end()) + 1
 
     def _signal(self) -> str:
         """Parse a signal with its time argument, saturation or dead zone, and return its name."""
@@ -669,25 +651,21 @@ class EquationParser:
 
     def _take_friction(self, sign: float) -> bool:
         """Parse ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; return False for any other term."""
-        distance, number, name = 0, 1.0, None
-        if self._peek(distance)[0] == "number":
-            number = float(self._peek(distance)[1])
-            distance += 1 + (self._peek(distance + 1)[1] == "*")
-        if self._peek(distance)[0] == "name" and self._peek(distance)[1] not in ("D", "sign", "exp"):
-            name = self._peek(distance)[1]
-            distance += 1 + (self._peek(distance + 1)[1] == "*")
-        if self._peek(distance)[1] not in ("sign", "exp") or self._peek(distance + 1)[1] != "(":
-            return False
-        if self._peek(distance)[1] == "exp":
-            end_distance = self._closing_distance(distance + 1)
-            if self._peek(end_distance + (self._peek(end_distance)[1] == "*"))[1] != "sign":
-                return False
-        self._position += distance
-        near = self._stribeck_factor() if self._sees("exp") else None
-        if near is not None:
+        begin, number, name = self._position, 1.0, None
+        if self._peek()[0] == "number":
+            number = float(self._take()[1])
             self._accept("*")
-            if not self._sees("sign"):
-                raise self._syntax_error(f"sign(D {near[0]})")
+        if self._peek()[0] == "name" and self._peek()[1] not in ("D", "sign", "exp"):
+            name = self._take()[1]
+            self._accept("*")
+        # The factor of Stribeck friction stands before the sign.
+        end = self._closing_distance(1) if self._sees("exp", "(") else 0
+        has_factor = end > 0 and self._peek(end + (self._peek(end)[1] == "*"))[1] == "sign"
+        if not has_factor and not self._sees("sign", "("):
+            self._position = begin
+            return False
+        near = self._stribeck_factor() if has_factor else None
+        self._accept("*")
         self._take()
         self._expect("(")
         kind, value, _ = self._peek()
@@ -765,16 +743,13 @@ class EquationParser:
         common = self._transform() if self._accept("/") else None
         self._expect("=")
         paths: list[tuple[SymbolicPolynomial, SymbolicPolynomial, str]] = []
-        while True:
-            sign = self._signs()
+        for sign in self._signs():
             top, bottom, delay = self._ratio(common)
             signal = common or self._transform()
             self.delays[signal] = delay
             if any(signal == other for _, _, other in paths):
                 raise self._error(f"{signal} occurs twice; combine its terms into one transfer function")
             paths.append(([(sign * c, n, o) for c, n, o in top], bottom, signal))
-            if self._peek()[0] != "symbol" or self._peek()[1] not in "+-":
-                break
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-' or the end")
         denominators: list[SymbolicPolynomial] = []
@@ -851,22 +826,13 @@ class EquationParser:
     def _polynomial(self) -> SymbolicPolynomial:
         """Parse a sum of products of numbers, names and powers of s, and return it."""
         polynomial: SymbolicPolynomial = []
-        while True:
-            sign = self._signs()
+        for sign in self._signs():
             product = self._factor()
             while self._peek()[0] in ("number", "name") or self._peek()[1] in ("(", "*"):
                 self._accept("*")
                 product = self._times(product, self._factor())
-            for c, name, order in product:
-                same = next(
-                    (k for k, (_, n, o) in enumerate(polynomial) if (n, o) == (None, order) and name is None), None
-                )
-                if same is None:
-                    polynomial.append((sign * c, name, order))
-                else:
-                    polynomial[same] = (polynomial[same][0] + sign * c, None, order)
-            if self._peek()[0] != "symbol" or self._peek()[1] not in "+-":
-                return [item for item in polynomial if item[0] != 0.0] or UNIT_POLYNOMIAL
+            polynomial += [(sign * c, name, order) for c, name, order in product]
+        return [term for term in _add_known(polynomial) if term[0] != 0.0] or UNIT_POLYNOMIAL
 
     def _factor(self) -> SymbolicPolynomial:
         """Parse one factor of a transfer function, and return it as a polynomial in s."""
@@ -901,25 +867,27 @@ class EquationParser:
 
     def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
         """Return the product of two polynomials in s; terms of equal power with known coefficients are added."""
-        products: dict[tuple[str | None, Order], float] = {}
-        out: SymbolicPolynomial = []
-        for c1, n1, o1 in first:
-            for c2, n2, o2 in second:
-                if n1 is not None and n2 is not None:
-                    raise self._error(
-                        f"{n1}*{n2} is a product of two coefficients; multiply out, and give each product a name"
-                    )
-                name, order = n1 or n2, add_orders(o1, o2)
-                if name is None:
-                    products[None, order] = products.get((None, order), 0.0) + c1 * c2
-                else:
-                    out.append((c1 * c2, name, order))
-        terms: SymbolicPolynomial = [(c, n, o) for (n, o), c in products.items() if c != 0.0]
-        names = [name for _, name, _ in out]
-        twice = next((a for a, b in pairwise(sorted(filter(None, names))) if a == b), None)
+        terms: SymbolicPolynomial = []
+        for (c1, n1, o1), (c2, n2, o2) in product(first, second):
+            if n1 is not None and n2 is not None:
+                raise self._error(
+                    f"{n1}*{n2} is a product of two coefficients; multiply out, and give each product a name"
+                )
+            terms.append((c1 * c2, n1 or n2, add_orders(o1, o2)))
+        names = sorted(name for _, name, _ in terms if name is not None)
+        twice = next((a for a, b in pairwise(names) if a == b), None)
         if twice is not None:
             raise self._error(f"{twice} stands in several terms once multiplied out; give each term a name of its own")
-        return terms + out
+        return sorted(_add_known(terms), key=lambda term: term[1] is not None)
+
+
+def _add_known(terms: SymbolicPolynomial) -> SymbolicPolynomial:
+    """Return a polynomial in which terms of one order with known coefficients are added, without their zero sums."""
+    sums: dict[object, tuple[float, str | None, Order]] = {}
+    for place, (c, name, order) in enumerate(terms):
+        key = order if name is None else place
+        sums[key] = (sums[key][0] + c if key in sums else c, name, order)
+    return [(c, name, order) for c, name, order in sums.values() if c != 0.0 or name is not None]
 
 
 def add_orders(first: Order, second: Order) -> Order:
