@@ -20,11 +20,10 @@ from ftlm.data.sampling import (
     check_intersample,
     check_lengths,
     check_missing_policy,
-    check_rows,
     check_step,
     check_values,
-    describe_interpolation,
     describe_missing,
+    describe_resampled_signals,
     fill_input_gaps,
     grid_positions,
     has_too_few_values,
@@ -124,14 +123,11 @@ class RunArguments:
         if new_step is not None:
             step, since = new_step, times - times[0]
             whole = not any(np.isnan(data[s]).any() for s in self.outputs)
-            if whole and rows_coincide(since, new_step):
-                data = resample_uniform(since, data, behaviour, new_step)
-                facts += (describe_resampling(since, new_step, first, describe_interpolation(behaviour)),)
-            else:
-                check_rows(since, new_step)
+            if not (whole and rows_coincide(since, new_step)):
                 readings = NonuniformSamples(since, data)
-                data = readings.resample(behaviour, new_step)
-                facts += (describe_resampling(since, new_step, first, describe_nonuniform_resampling(behaviour)),)
+            data = resample_uniform(since, data, behaviour, new_step)
+            how = describe_resampled_signals(behaviour, keep_times=readings is not None)
+            facts += (describe_resampling(since, new_step, first, how),)
         return dict(
             name=self.name,
             step=step,
@@ -314,10 +310,3 @@ def describe_resampling(since: Floats, step: float, first: int, how: str) -> str
         f"resampled to {step:.12g} s from intervals of {intervals.min():.6g} to {intervals.max():.6g} s, the widest "
         f"after row {first + int(intervals.argmax())} ({how})"
     )
-
-
-def describe_nonuniform_resampling(behaviour: Mapping[str, Intersample]) -> str:
-    """Return a sentence on how nonuniformly sampled signals are used after resampling."""
-    held_inputs = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
-    means = f"held: {', '.join(held_inputs)}, by means over the new intervals; " if held_inputs else ""
-    return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -162,15 +162,8 @@ class FrequencyData:
                 f"{self.frequency.min():.5g} to {self.frequency.max():.5g} rad/s"
             )
         deviation = None if self.deviation is None else self.deviation[is_inside]
-        return FrequencyData(
-            self.frequency[is_inside],
-            self.response[is_inside],
-            deviation,
-            self.output,
-            self.input,
-            self.unit,
-            self.name,
-            self.warnings,
+        return replace(
+            self, frequency=self.frequency[is_inside], response=self.response[is_inside], deviation=deviation
         )
 
     @property

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ftlm.data.construction import RunArguments, describe_nonuniform_resampling
+from ftlm.data.construction import RunArguments
 from ftlm.data.sampling import (
     MIN_RUN_SAMPLES,
     Intersample,
@@ -21,10 +21,9 @@ from ftlm.data.sampling import (
     as_vector,
     check_intersample,
     check_lengths,
-    check_rows,
     check_step,
     check_values,
-    describe_interpolation,
+    describe_resampled_signals,
     drop_missing,
     fit_trend,
     interpolate_gaps,
@@ -451,21 +450,12 @@ class Run:
             If `step` is not positive, or gives fewer than three rows or more than 50 million.
         """
         new_step = check_step(step, "resample")
-        since, readings, how = (
-            uniform_times(self.length, self.step),
-            self.sample_times,
-            describe_interpolation(self._intersample),
-        )
+        since, readings = uniform_times(self.length, self.step), self.sample_times
         if readings is None and (self.missing_samples or not rows_coincide(since, new_step)):
             readings = NonuniformSamples(since, self._data)
-        if readings is None:
-            data = resample_uniform(since, self._data, self._intersample, new_step)
-        else:
-            check_rows(readings.times, new_step)
-            data, how = (
-                readings.resample(self._intersample, new_step),
-                describe_nonuniform_resampling(self._intersample),
-            )
+        source = readings or NonuniformSamples(since, self._data)
+        data = resample_uniform(source.times, source.data, self._intersample, new_step)
+        how = describe_resampled_signals(self._intersample, keep_times=readings is not None)
         fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
         return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=readings)
 

@@ -374,20 +374,16 @@ def resample_uniform(
 
     Zero-order-hold inputs take interval means, and other signals are interpolated linearly.
     """
-    rows = check_rows(since, step)
-    grid = uniform_times(rows, step)
-    return {
-        signal: _core.nonuniform_means(since, values, rows, step, True)
-        if behaviour.get(signal) == "zoh"
-        else np.interp(grid, since, values)
-        for signal, values in data.items()
-    }
+    check_rows(since, step)
+    return NonuniformSamples(since, dict(data)).resample(behaviour, step)
 
 
-def describe_interpolation(behaviour: Mapping[str, Intersample]) -> str:
-    """Return text on how :func:`resample_uniform` treats each signal."""
-    signals = [signal for signal, kind in behaviour.items() if kind == "zoh"]
+def describe_resampled_signals(behaviour: Mapping[str, Intersample], *, keep_times: bool) -> str:
+    """Return text on how each signal is resampled; `keep_times` means that outputs keep their original times."""
+    signals = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
     means = f"held: {', '.join(signals)}, by means over the new intervals; " if signals else ""
+    if keep_times:
+        return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"
     return f"{means}others linear; no anti-alias filter"
 
 

@@ -6,7 +6,7 @@ import csv
 import functools
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -236,13 +236,8 @@ class Timestamps:
         """Return the blocks of one column as one; None if they differ in notation."""
         if len({piece.notation for piece in pieces}) > 1:
             return None
-        return cls(
-            np.concatenate([p.parts for p in pieces]),
-            pieces[0].mark,
-            np.concatenate([p.clock for p in pieces]),
-            pieces[0].first,
-            pieces[0].notation,
-        )
+        parts, clock = (np.concatenate([getattr(p, name) for p in pieces]) for name in ("parts", "clock"))
+        return replace(pieces[0], parts=parts, clock=clock)
 
     def seconds(self, thing: str, dates: str | None) -> Floats:
         """Return the times in seconds since the first row, exact to the nanosecond.

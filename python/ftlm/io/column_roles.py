@@ -86,21 +86,12 @@ def _tokens(column: str) -> frozenset[str]:
 def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the columns whose names have words of inputs, and those with words of outputs."""
     words_by_column = {column: words_of(column) for column in columns}
-    drives = [
-        c
-        for c, words in words_by_column.items()
-        if words & _WORDS_BY_ROLE["input"] and not words & _WORDS_BY_ROLE["output"]
-    ]
-    follows = [
-        c
-        for c, words in words_by_column.items()
-        if words & _WORDS_BY_ROLE["output"] and not words & _WORDS_BY_ROLE["input"]
-    ]
-    either = [
-        c
-        for c, words in words_by_column.items()
-        if words & _WORDS_BY_ROLE["input or output"] and c not in drives and c not in follows
-    ]
+    inputs, outputs, both = (
+        [c for c, words in words_by_column.items() if words & _WORDS_BY_ROLE[role]]
+        for role in ("input", "output", "input or output")
+    )
+    drives, follows = [c for c in inputs if c not in outputs], [c for c in outputs if c not in inputs]
+    either = [c for c in both if c not in drives and c not in follows]
     if either and not drives:
         drives, either = either, []
     rest = [c for c in columns if c not in drives and c not in follows]

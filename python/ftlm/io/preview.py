@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -380,13 +380,7 @@ class _FilePreview:
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
         if clock is not None and self.table.header is None:
             options["time"] = clock.name
-        load_options = self.asked
-        more = {
-            "window": load_options.window,
-            "resample": load_options.resample,
-            "time_unit": load_options.time_unit,
-            "missing": load_options.missing,
-        }
+        more = {key: getattr(self.asked, key) for key in ("window", "resample", "time_unit", "missing")}
         options |= {key: value for key, value in more.items() if value is not None}
         for key in ("inputs", "outputs", "units", "intersample"):
             if getattr(selection, key) and (self.table.header is None or key in ("inputs", "outputs")):
@@ -409,17 +403,16 @@ def _first_bad_cell(column: Column) -> str:
 
 def _summarize_column(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
     role, signal = roles.get(column.name, ("", ""))
-    unit, values = column.file_unit, column.values
+    summary, values = FileColumn(column.name, role, signal, column.file_unit, None, None, None), column.values
     if column.timestamps is not None:
-        return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.timestamps.first}")
+        return replace(summary, words=f"from {column.timestamps.first}")
     if values is None or not values.size or not has_numbers(column):
         why = _first_bad_cell(column)
-        words = "no numbers" if not why else f"no numbers ({why})"
-        return FileColumn(column.name, role, signal, unit, None, None, None, words)
+        return replace(summary, words=f"no numbers ({why})" if why else "no numbers")
     finite = values[~np.isnan(values)]
     if not finite.size:
-        return FileColumn(column.name, role, signal, unit, None, None, None, "empty")
-    return FileColumn(column.name, role, signal, unit, float(values[0]), float(finite.min()), float(finite.max()))
+        return replace(summary, words="empty")
+    return replace(summary, first=float(values[0]), low=float(finite.min()), high=float(finite.max()))
 
 
 def _toml(value: object) -> str:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from msgspec import UNSET, UnsetType
 
@@ -106,6 +107,20 @@ class Term:
 
     def __str__(self) -> str:
         return self.format({})
+
+
+Parametric = TypeVar("Parametric", Term, "Stribeck", "Friction")
+
+
+def _fix_parameter(
+    item: Parametric, values: Mapping[str, float], field: str = "coefficient", name_field: str = "name"
+) -> Parametric:
+    """Return a term or friction with a free parameter fixed to its value, if there is one; its name is kept."""
+    name = getattr(item, field)
+    if not isinstance(name, str) or name not in values:
+        return item
+    changes: dict[str, Any] = {field: real_number(name, values[name]), name_field: name}
+    return replace(item, **changes)
 
 
 def derivative(order: Order, signal: str) -> str:
@@ -216,20 +231,10 @@ class Friction:
     @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
         """Return the friction with some free parameters fixed to values; the others stay free."""
-        out, more = self, self.stribeck
-        if isinstance(self.coefficient, str) and self.coefficient in values:
-            out = replace(
-                out, coefficient=real_number(self.coefficient, values[self.coefficient]), name=self.coefficient
-            )
-        if more is None:
-            return out
-        if isinstance(more.coefficient, str) and more.coefficient in values:
-            name = more.coefficient
-            more = replace(more, coefficient=real_number(name, values[name]), name=name)
-        if isinstance(more.speed, str) and more.speed in values:
-            name = more.speed
-            more = replace(more, speed=real_number(name, values[name]), speed_name=name)
-        return replace(out, more=more)
+        fixed = _fix_parameter(self, values)
+        if self.stribeck is None:
+            return fixed
+        return replace(fixed, more=_fix_parameter(_fix_parameter(self.stribeck, values), values, "speed", "speed_name"))
 
     @check_arguments
     def as_text(self, output: str) -> str:
@@ -439,12 +444,7 @@ class Equation:
         ModelError
             If a value is not a finite number.
         """
-        terms = tuple(
-            replace(t, coefficient=real_number(t.coefficient, values[t.coefficient]), name=t.coefficient)
-            if isinstance(t.coefficient, str) and t.coefficient in values
-            else t
-            for t in self.terms
-        )
+        terms = tuple(_fix_parameter(t, values) for t in self.terms)
         coulomb = self.coulomb.with_coefficients(values) if isinstance(self.coulomb, Friction) else self.coulomb
         return Equation(self.output, self.order, terms, coulomb)
 

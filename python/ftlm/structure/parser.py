@@ -6,14 +6,15 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Literal
 
 from msgspec import UNSET
 
 from ftlm.errors import ModelError
 from ftlm.structure.equation import Equation, Friction, Term, derivative
-from ftlm.structure.grammar import NONLINEARITY_KINDS, EquationParser
-from ftlm.structure.input_nonlinearity import InputNonlinearity, Value, sort_nonlinearities
+from ftlm.structure.grammar import EquationParser
+from ftlm.structure.input_nonlinearity import InputNonlinearity, NonlinearityKind, Value, sort_nonlinearities
 from ftlm.structure.order import Values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial, check_offset
@@ -227,11 +228,10 @@ def _friction_of(words: EquationParser, output: str, leading: float) -> Friction
 
 def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
     """Return the saturations and dead zones of all equations; raise ModelError if an input has different ones."""
-    limits: dict[tuple[str, str], Value] = {}
-    for words in parsed:
-        for key, limit in words.limits.items():
-            if limits.setdefault(key, limit) != limit:
-                raise ModelError(f"{key[0]} has two different limits of one kind in these equations; give it one")
+    limits: dict[tuple[str, NonlinearityKind], Value] = {}
+    for key, limit in chain.from_iterable(words.limits.items() for words in parsed):
+        if limits.setdefault(key, limit) != limit:
+            raise ModelError(f"{key[0]} has two different limits of one kind in these equations; give it one")
     bare = {signal for words in parsed for signal in words.plain}
     both = next((signal for signal, _ in limits if signal in bare), None)
     if both is not None:
@@ -239,22 +239,17 @@ def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlin
             f"{both} stands there limited and as it is, but an actuator limits all that it drives; limit it in each "
             "term, or give the run the limited input as a signal of its own"
         )
-    return tuple(
-        sort_nonlinearities(
-            [InputNonlinearity(s, law, v) for law in NONLINEARITY_KINDS for (s, own), v in limits.items() if own == law]
-        )
-    )
+    return tuple(sort_nonlinearities([InputNonlinearity(s, law, value) for (s, law), value in limits.items()]))
 
 
 def _merge_delays(parsed: Sequence[EquationParser], explicit_delays: Mapping[str, Value]) -> dict[str, Value]:
     """Return the delays of all equation texts and of the argument, by input; raise ModelError if they contradict."""
     delays: dict[str, Value] = {}
-    for words in parsed:
-        for signal, delay in words.delays.items():
-            if delays.setdefault(signal, delay) != delay:
-                raise ModelError(
-                    f"{signal} has two delays in these equations; give the input that comes later a name of its own"
-                )
+    for signal, delay in chain.from_iterable(words.delays.items() for words in parsed):
+        if delays.setdefault(signal, delay) != delay:
+            raise ModelError(
+                f"{signal} has two delays in these equations; give the input that comes later a name of its own"
+            )
     late = {signal: delay for signal, delay in delays.items() if delay != 0.0}
     twice = next((signal for signal in explicit_delays if signal in late), None)
     if twice is not None:

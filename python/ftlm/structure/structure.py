@@ -413,7 +413,6 @@ class Structure:
         return self._of((single,), "measured")
 
     @check_arguments
-    @check_arguments
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
         """Return the structure with orders fixed (a number) or with grid values; see :func:`parse_values`.
 
