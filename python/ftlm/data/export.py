@@ -6,15 +6,14 @@ import contextlib
 import hashlib
 import importlib
 import io
-import itertools
 import json
 import math
 import os
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 
 from ftlm.data.construction import RunArguments
@@ -165,24 +164,9 @@ UTF8_BOM = b"\xef\xbb\xbf"
 MAX_HEADER_BYTES = 1 << 20
 #: Note in files of runs with nonuniform samples, which only hold the resampled grid.
 OWN_TIMES_OMITTED_NOTE = "written on its grid: the times at which outputs were read stayed behind"
-#: JSON type of every header field; the start time follows from the samples.
-_FIELD_TYPES: dict[str, type] = {
-    "name": str,
-    "step": float,
-    "inputs": list,
-    "outputs": list,
-    "units": dict,
-    "intersample": dict,
-    "warnings": list,
-    "about": dict,
-    "missing": list,
-}
-#: Optional header fields and their defaults.
-_OPTIONAL_DEFAULTS: dict[str, Any] = {"about": {}, "missing": []}
 
 
-@dataclass(frozen=True)
-class Header:
+class Header(msgspec.Struct, frozen=True, omit_defaults=True):
     """Header that ftlm writes into run files, ``VERSION JSON`` with these fields as keys.
 
     It is the first line of a csv file, or metadata of a parquet file.
@@ -196,7 +180,7 @@ class Header:
     units: dict[str, str]
     intersample: dict[str, str]
     warnings: tuple[str, ...]
-    about: dict[str, Any] = field(default_factory=dict)
+    about: dict[str, Any] = {}
     missing: tuple[str, ...] = ()
 
     @classmethod
@@ -217,12 +201,7 @@ class Header:
 
     def text(self) -> str:
         """Return the header as text, ``VERSION JSON``."""
-        content = {
-            f.name: getattr(self, f.name)
-            for f in fields(self)
-            if f.name not in _OPTIONAL_DEFAULTS or getattr(self, f.name)
-        }
-        words = json.dumps(content, ensure_ascii=False, allow_nan=False)
+        words = json.dumps(msgspec.to_builtins(self), ensure_ascii=False, allow_nan=False)
         # A lone surrogate cannot be encoded in UTF-8 and is written as a JSON escape.
         return f"{CSV_VERSION} {words.encode('utf-8', 'backslashreplace').decode()}"
 
@@ -247,28 +226,16 @@ class Header:
                 "ftlm, or remove the line and name the columns"
             )
         try:
-            return _parse_fields(json.loads(body))
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            # The start time follows from the samples.
+            header = msgspec.convert({**json.loads(body), "start": 0.0}, cls)
+            if not is_run_name(header.name) or not math.isfinite(header.step):
+                raise ValueError("its name or step cannot be used")
+            return header
+        except (ValueError, TypeError, RecursionError) as error:
             raise DataError(
                 f"{path.name}: {where} is a damaged ftlm header ({str(error)[:100]}); restore it, or remove the line "
                 "and name the columns"
             ) from None
-
-
-def _parse_fields(fields: Any) -> Header:
-    values: dict[str, Any] = {}
-    for key, kind in _FIELD_TYPES.items():
-        value = fields.get(key, _OPTIONAL_DEFAULTS[key]) if key in _OPTIONAL_DEFAULTS else fields[key]
-        if not isinstance(value, kind):
-            raise ValueError(f"{key!r} is {str(value)[:40]!r}")
-        values[key] = tuple(value) if isinstance(value, list) else value
-    header = Header(start=0.0, **values)
-    words = (header.inputs, header.outputs, header.warnings, header.units.values(), header.intersample.values())
-    if not is_run_name(header.name) or not math.isfinite(header.step):
-        raise ValueError("its name or step cannot be used")
-    if not all(isinstance(word, str) for word in itertools.chain.from_iterable(words)):
-        raise ValueError("a name, unit or warning is not text")
-    return header
 
 
 def header_of_line(path: Path, line: bytes) -> Header | None:

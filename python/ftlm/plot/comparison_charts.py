@@ -17,7 +17,7 @@ from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import number, symbol
 from ftlm.utils.statistics import NORMAL_95
-from ftlm.utils.validation import Floats, short_repr, whole_number
+from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare
 from ftlm.validation.residual_tests import CorrelationTest, Residuals
 
@@ -203,12 +203,13 @@ def error_chart(
     compared: Sequence[tuple[str, Comparison]],
     output: str,
     *,
-    run: int = 0,
     title: str = "",
     units: Mapping[str, str] | None = None,
     points: int = MAX_LINE_POINTS,
 ) -> LineChart:
-    """Return a chart of the absolute simulation errors of several models on one run, as in the paper's Figure 4(a).
+    """Return a chart of the absolute simulation errors of several models on the first run of their comparisons.
+
+    Figure 4(a) of the paper is such a chart.
 
     Parameters
     ----------
@@ -216,8 +217,6 @@ def error_chart(
         (name of the model, its comparison) of each model, all on the same run with the same m.
     output
         Name of the output.
-    run
-        Index of the run in the comparisons.
     title
         Title; "" for a default title.
     units
@@ -228,22 +227,17 @@ def error_chart(
     Raises
     ------
     DataError
-        If there is no comparison, or one of them lacks the output or run.
+        If there is no comparison, or one of them lacks the output.
     """
     if not compared:
         raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
-    index = whole_number(run)
     for name, comparison in compared:
         outputs = list(comparison.measured)
         if output not in outputs:
             raise DataError(f"comparison {name!r} has no output {output!r}; it has {', '.join(outputs)}")
-        count = len(comparison.measured[output])
-        if index is None or not 0 <= index < count:
-            raise DataError(f"comparison {name!r} has no run {short_repr(run)}; give 0 to {count - 1}")
-    run = index or 0
-    errors = [(name, np.abs(c.measured[output][run] - c.simulated[output][run])) for name, c in compared]
+    errors = [(name, np.abs(c.measured[output][0] - c.simulated[output][0])) for name, c in compared]
     return LineChart(
-        pulse_times(compared[0][1], run),
+        pulse_times(compared[0][1]),
         errors,
         title=title or f"{symbol(output)}: absolute error of the simulation",
         x_label="time [s]",

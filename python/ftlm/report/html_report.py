@@ -244,15 +244,22 @@ def identification_page(
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
-    sections += [replace(section, collapsed=True) for section in details]
-    return write_page(
-        path,
-        title=title_of(model),
-        sections=sections,
-        lead=lead_of(compared),
-        force=force,
-        verdict=verdict_box(judgement),
-    )
+    return _write_model_page(path, model, judgement, compared, sections, details, force=force)
+
+
+def _write_model_page(
+    path: str | os.PathLike[str],
+    model: Model,
+    judgement: Verdict,
+    compared: Sequence[tuple[str, Comparison]],
+    sections: Sequence[Section],
+    details: Sequence[Section],
+    *,
+    force: bool,
+) -> Path:
+    """Write a page with the verdict and the sections of a model, followed by collapsed details."""
+    every, box = [*sections, *(replace(section, collapsed=True) for section in details)], verdict_box(judgement)
+    return write_page(path, title=title_of(model), sections=every, lead=lead_of(compared), force=force, verdict=box)
 
 
 def first_sections(
@@ -377,14 +384,14 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
 
     `steps` are the (sampling interval, duration) pairs of the runs [s].
     """
-    if model.structure.has_friction:
+    structure, words = model.structure, ""
+    if structure.has_friction:
         words = "A body that may stick has none: its answer is not in proportion to what drives it."
-        return Section("Frequency response", words)
-    if model.structure.has_nonlinear_terms:
+    elif structure.has_nonlinear_terms:
         words = "A non-linear model has none: see that of its linear model about a point, model.linearized(at=…)."
-        return Section("Frequency response", words)
-    if model.structure.limits:
+    elif structure.limits:
         words = "A model whose inputs saturate or have a dead zone has none: its answer is not in proportion to them."
+    if words:
         return Section("Frequency response", words)
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     words = "Exact, orders as they are; the equations together, from what is not modelled."
@@ -613,13 +620,5 @@ def model_page(
         about += [[n.upper().replace("AICC", "AICc"), v] for n, v in estimate.information.items()]
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
     details.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
-    sections += [replace(section, collapsed=True) for section in details]
     judgement = saved_verdict(model, validated)
-    return write_page(
-        path,
-        title=title_of(model),
-        sections=sections,
-        lead=lead_of(compared),
-        force=force,
-        verdict=verdict_box(judgement),
-    )
+    return _write_model_page(path, model, judgement, compared, sections, details, force=force)
