@@ -18,11 +18,13 @@ from ftlm.svg.figure import (
     MIN_DIFFERENCE,
     NARROW_WIDTH_PX,
     SMALL_WIDTH_PX,
-    TEXT_GROUP,
     Figure,
     PlotArea,
+    element,
+    faint_path,
     svg,
     svg_text,
+    text_group,
     text_width,
     ticks,
 )
@@ -168,47 +170,35 @@ class BarChart(Figure):
         top = 8.0 + 18.0 * (len(tables) > 1)
         w, step = width - left - value, BAR_HEIGHT_PX * len(tables) + 8
         low, high = self.ends
-        out = []
         across = ticks(low, high, 4 if narrow else 8)
-        h = step * len(names)
-        out.append(Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'))
-        out += [
-            Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(left + w * (v - low) / (high - low), top, h)
-            for v in across.values
-        ]
-        out.append(Markup("</g>"))
-        bar = Markup(
-            '<rect class="shade{}" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}" fill-opacity="{}"/>'
-        )
-        texts = []
+        plot = PlotArea(left, top, w, step * len(names), (low, high, 0.0, 1.0))
+        grid, axis = plot.grid(across, None)
+        bars, texts = [], []
         for i, name in enumerate(shown):
             texts.append(svg_text(left - 6, top + step * i + BAR_HEIGHT_PX * len(tables) / 2 + 6, name, "end"))
             for k, (_, values) in enumerate(tables):
                 v, y = float(values[i]), top + step * i + BAR_HEIGHT_PX * k + 2
                 inside = min(max(v, low), high) if math.isfinite(v) else low
                 length = w * (inside - low) / (high - low)
-                out.append(
-                    bar.format(k + 1, left, y, max(length, 0.0), BAR_HEIGHT_PX - 3, LINE_STYLES[k + 1][0], "0.85")
-                )
+                bars.append(_shade(k + 1, left, y, max(length, 0.0), BAR_HEIGHT_PX - 3, fill_opacity="0.85"))
                 text = number(v, 4) if math.isfinite(v) else "–"
                 texts.append(svg_text(left + length + 5, y + BAR_HEIGHT_PX - 5, text, "start"))
-        axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}"/>')
-        out += [axis.format(left, top, h), TEXT_GROUP, *texts]
         place = left
         for k, (name, _) in enumerate(tables if len(tables) > 1 else ()):
-            out.append(
-                Markup('<rect class="shade{}" x="{:.1f}" y="3" width="14" height="10" fill="{}"/>').format(
-                    k + 1, place, LINE_STYLES[k + 1][0]
-                )
-            )
-            out.append(svg_text(place + 19, 12, name, "start"))
+            texts += [_shade(k + 1, place, 3, 14, 10), svg_text(place + 19, 12, name, "start")]
             place += 19 + text_width(name) + 16
-        out += [
-            svg_text(left + w * (v - low) / (high - low), top + h + 15, t, "middle")
-            for v, t in zip(across.values, across.labels, strict=True)
-        ]
-        out += [svg_text(left + w, top + h + 32, self.x_label, "end"), Markup("</g>")]
-        return svg(width, round(top + h + 40), self.title, described, out, narrow=narrow)
+        bottom = top + plot.height
+        pairs = zip(across.values, across.labels, strict=True)
+        texts += [svg_text(float(plot.x_pixels(v)), bottom + 15, label, "middle") for v, label in pairs]
+        texts.append(svg_text(left + w, bottom + 32, self.x_label, "end"))
+        parts = [grid, *bars, axis, text_group(texts)]
+        return svg(width, round(bottom + 40), self.title, described, parts, narrow=narrow)
+
+
+def _shade(style: int, x: float, y: float, width: float, height: float, **attributes: str) -> Markup:
+    """Return a rectangle in the color of a style as SVG markup."""
+    place = {"x": x, "y": y, "width": width, "height": height}
+    return element("rect", class_=f"shade{style}", **place, fill=LINE_STYLES[style][0], **attributes)
 
 
 #: Height of the plot, half the size of a cross, and radius of a dot [px].
@@ -303,21 +293,18 @@ class PlaneChart(Figure):
         frame = corner.real, corner.real + w / scale, corner.imag, corner.imag + h / scale
         across, upward = ticks(*frame[:2], 4 if narrow else 8), ticks(*frame[2:], max(2, round(h / 48)))
         plot = PlotArea(left, top, w, h, frame)
-        box = plot.left, plot.top, plot.width, plot.height
-        inner = Markup(
-            '<svg x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" viewBox="{:.1f} {:.1f} {:.1f} {:.1f}">'
-        )
+        box = {"x": plot.left, "y": plot.top, "width": plot.width, "height": plot.height}
+        view = " ".join(f"{v:.1f}" for v in box.values())
         x, y = _places(plot, [0])[0]
-        zero = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="{}"/>')
-        through = zero.format(f"M{plot.left:.1f} {y:.1f}h{plot.width:.1f}M{x:.1f} {plot.top:.1f}v{plot.height:.1f}")
-        out = [*plot.grid(across, upward), inner.format(*box, *box), through]
-        out += self._crosses(plot) if self.line is None else self._locus(plot, self.line)
-        out += [Markup("</svg>"), TEXT_GROUP, *plot.labels((across, upward), (self.x_label, self.y_label), width)]
+        through = faint_path(f"M{plot.left:.1f} {y:.1f}h{plot.width:.1f}M{x:.1f} {plot.top:.1f}v{plot.height:.1f}")
+        curves = self._crosses(plot) if self.line is None else self._locus(plot, self.line)
+        texts = plot.labels((across, upward), (self.x_label, self.y_label), width)
         if self.line is not None:
-            out += [stroke_path(1, [(left, 12.0), (left + 20, 12.0)]), svg_text(left + 26, 16, "model", "start")]
-            out += [_dot(left + 90, 12), svg_text(left + 100, 16, "measured", "start")]
-        out.append(Markup("</g>"))
-        return svg(width, round(top + h + 44), self.title, self._describe(), out, narrow=narrow)
+            texts += [stroke_path(1, [(left, 12.0), (left + 20, 12.0)]), svg_text(left + 26, 16, "model", "start")]
+            texts += [_dot(left + 90, 12.0), svg_text(left + 100, 16, "measured", "start")]
+        inside = element("svg", [through, *curves], **box, viewBox=view)
+        parts = [*plot.grid(across, upward), inside, text_group(texts)]
+        return svg(width, round(top + h + 44), self.title, self._describe(), parts, narrow=narrow)
 
     def _describe(self) -> str:
         values = self.values
@@ -330,13 +317,14 @@ class PlaneChart(Figure):
 
     def _crosses(self, plot: PlotArea) -> list[Markup]:
         outline = self.sector_outline((plot.frame[1] + plot.frame[3]) / 2)
-        shade = Markup('<path class="shade1" fill="{}" fill-opacity="0.16" d="{}"/>')
-        curves = [shade.format(LINE_STYLES[1][0], path_data(_places(plot, outline)) + "Z")]
+        sector = path_data(_places(plot, outline)) + "Z"
+        curves = [element("path", class_="shade1", fill=LINE_STYLES[1][0], fill_opacity="0.16", d=sector)]
         curves.append(stroke_path(1, _places(plot, [outline[1], 0, outline[-1]]), 1.2, dashes="5 3"))
         c = CROSS_HALF_SIZE_PX
-        cross = Markup('<path class="line2" fill="none" stroke="{}" stroke-width="2.2" d="M{:.1f} {:.1f}{}"/>')
         strokes = f"l{2 * c} {2 * c}m0 {-2 * c}l{-2 * c} {2 * c}"
-        return curves + [cross.format(LINE_STYLES[2][0], x - c, y - c, strokes) for x, y in _places(plot, self.values)]
+        crosses = (f"M{x - c:.1f} {y - c:.1f}{strokes}" for x, y in _places(plot, self.values))
+        stroke = {"class_": "line2", "fill": "none", "stroke": LINE_STYLES[2][0], "stroke_width": "2.2"}
+        return curves + [element("path", **stroke, d=data) for data in crosses]
 
     def _locus(self, plot: PlotArea, line: Complex) -> list[Markup]:
         curves = [stroke_path(1, _places(plot, line))] if line.size else []
@@ -345,8 +333,8 @@ class PlaneChart(Figure):
 
 def _dot(x: float, y: float) -> Markup:
     """Return a measured point as SVG markup."""
-    dot = Markup('<circle class="line0" fill="none" stroke="{}" stroke-width="1.6" cx="{:.1f}" cy="{:.1f}" r="{}"/>')
-    return dot.format(LINE_STYLES[0][0], x, y, DOT_RADIUS_PX)
+    stroke = {"class_": "line0", "fill": "none", "stroke": LINE_STYLES[0][0], "stroke_width": "1.6"}
+    return element("circle", **stroke, cx=x, cy=y, r=DOT_RADIUS_PX)
 
 
 def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
@@ -457,22 +445,22 @@ class Landscape(Figure):
                 out.append(_rectangle(*place, count * cell_w, f"{cell_h + 0.3:.1f}", colour))
                 j += count
         centre = left + (best[1] + 0.5) * cell_w, bottom - (best[0] + 0.5) * cell_h
-        ring = Markup('<circle cx="{:.1f}" cy="{:.1f}" r="7" fill="none" stroke="{}" stroke-width="{}"/>')
-        out += [ring.format(*centre, colour, thickness) for colour, thickness in (("#fff", 4), ("#d1480a", 2))]
-        out.append(TEXT_GROUP)
+        for colour, thickness in (("#fff", 4), ("#d1480a", 2)):
+            x, y = centre
+            out.append(element("circle", cx=x, cy=y, r=7, fill="none", stroke=colour, stroke_width=thickness))
         fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER_WIDTH_PX * longest + 14))))
-        out += [
-            svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in _label_indices(columns, fit)
-        ]
-        for k in _label_indices(rows, min(rows, 7)):
-            out.append(svg_text(left - 6, bottom - (k + 0.5) * cell_h + 4, y_marks[k], "end"))
         across, upward = self.names
-        out.append(svg_text(4, top - 12, f"order {symbol(upward)}", "start"))
-        out.append(svg_text(left + w, bottom + 34, f"order {symbol(across)}", "end"))
         size = 20.0 if narrow else 26.0
-        out.append(svg_text(left, bottom + 76, f"score {number(ends[0], 3)}", "start"))
-        out.append(svg_text(left + size * len(HEAT_COLORS), bottom + 76, number(ends[1], 3), "end"))
-        out.append(Markup("</g>"))
+        column_labels, row_labels = _label_indices(columns, fit), _label_indices(rows, min(rows, 7))
+        texts = [
+            *(svg_text(left + (k + 0.5) * cell_w, bottom + 16, x_marks[k], "middle") for k in column_labels),
+            *(svg_text(left - 6, bottom - (k + 0.5) * cell_h + 4, y_marks[k], "end") for k in row_labels),
+            svg_text(4, top - 12, f"order {symbol(upward)}", "start"),
+            svg_text(left + w, bottom + 34, f"order {symbol(across)}", "end"),
+            svg_text(left, bottom + 76, f"score {number(ends[0], 3)}", "start"),
+            svg_text(left + size * len(HEAT_COLORS), bottom + 76, number(ends[1], 3), "end"),
+        ]
+        out.append(text_group(texts))
         out += [_rectangle(left + k * size, bottom + 48, size, "12", colour) for k, colour in enumerate(HEAT_COLORS)]
         return svg(width, round(bottom + below), self.title, described, out, narrow=narrow)
 
@@ -488,9 +476,7 @@ def _classes(scores: Floats, low: float, high: float) -> NDArray[np.intp]:
 
 def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Markup:
     """Return a heat-map cell as SVG markup, slightly enlarged to hide gaps."""
-    return Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{}" fill="{}"/>').format(
-        x, y, width + 0.3, height, colour
-    )
+    return element("rect", x=x, y=y, width=width + 0.3, height=height, fill=colour)
 
 
 def _label_indices(count: int, most: int) -> list[int]:
@@ -568,7 +554,6 @@ class CorrelationMap(Figure):
         turned = max(map(text_width, labels)) > cell - 4
         top = 8 + (max(map(text_width, labels)) if turned else 16)
         out, texts = [], []
-        box = Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}"/>')
         for i in range(count):
             for j in range(count):
                 value = float(matrix[i, j])
@@ -579,31 +564,25 @@ class CorrelationMap(Figure):
                     else -1
                 )
                 x, y = left + j * cell, top + i * cell
-                out.append(box.format(x, y, cell - 1, cell - 1, CORRELATION_COLORS[step] if known else NO_VALUE))
+                colour = CORRELATION_COLORS[step] if known else NO_VALUE
+                out.append(element("rect", x=x, y=y, width=cell - 1, height=cell - 1, fill=colour))
                 if cell >= MIN_LABELED_CELL_PX and i != j:
                     ink = "#fff" if step in DARK_COLOR_INDICES or not known else "#15181c"
                     text = f"{value:.2f}".replace("0.", ".").replace("-", "−") if known else "–"
-                    texts.append(
-                        Markup(
-                            '<text x="{:.1f}" y="{:.1f}" text-anchor="middle" fill="{}" font-size="11">{}</text>'
-                        ).format(x + cell / 2 - 0.5, y + cell / 2 + 4, ink, text)
-                    )
-        out.append(TEXT_GROUP)
+                    center = x + cell / 2 - 0.5, y + cell / 2 + 4
+                    texts.append(svg_text(*center, text, "middle", fill=ink, font_size="11"))
+        marks = []
         for k, label in enumerate(labels):
-            out.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
+            marks.append(svg_text(left - 6, top + (k + 0.5) * cell + 4, label, "end"))
             x = left + (k + 0.5) * cell
-            if turned:
-                out.append(
-                    Markup('<text x="0" y="0" transform="translate({:.1f} {:.1f}) rotate(-90)">{}</text>').format(
-                        x + 4, top - 6, label
-                    )
-                )
-            else:
-                out.append(svg_text(x, top - 6, label, "middle"))
+            turn = f"translate({x + 4:.1f} {top - 6:.1f}) rotate(-90)"
+            upright = element("text", [label], x=0, y=0, transform=turn)
+            marks.append(upright if turned else svg_text(x, top - 6, label, "middle"))
         foot = top + count * cell + 12
         size = 18.0 if narrow else 22.0
-        out += [box.format(left + k * size, foot, size, 10, colour) for k, colour in enumerate(CORRELATION_COLORS)]
-        out.append(svg_text(left, foot + 24, "−1", "start"))
-        out.append(svg_text(left + size * len(CORRELATION_COLORS) / 2, foot + 24, "0", "middle"))
-        out.append(svg_text(left + size * len(CORRELATION_COLORS), foot + 24, "1", "end"))
-        return svg(width, round(foot + 32), self.title, self._describe(), [*out, *texts, Markup("</g>")], narrow=narrow)
+        for k, colour in enumerate(CORRELATION_COLORS):
+            marks.append(element("rect", x=left + k * size, y=foot, width=size, height=10.0, fill=colour))
+        for share, text, anchor in ((0.0, "−1", "start"), (0.5, "0", "middle"), (1.0, "1", "end")):
+            marks.append(svg_text(left + share * size * len(CORRELATION_COLORS), foot + 24, text, anchor))
+        parts = [*out, text_group([*marks, *texts])]
+        return svg(width, round(foot + 32), self.title, self._describe(), parts, narrow=narrow)

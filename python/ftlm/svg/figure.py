@@ -86,36 +86,41 @@ class Figures(tuple[Figure, ...]):
         return "".join(figure._repr_html_() for figure in self)
 
 
+def element(name: str, parts: Iterable[str] | None = None, /, **attributes: str | float) -> Markup:
+    """Return an SVG element, empty without parts.
+
+    Underscores in the names of attributes stand for hyphens, and floats [px] are written with one decimal.
+    """
+    opening = Markup("<{}").format(name)
+    for attribute, value in attributes.items():
+        text = f"{value:.1f}" if isinstance(value, float) else value
+        opening += Markup(' {}="{}"').format(attribute.rstrip("_").replace("_", "-"), text)
+    return opening + (Markup("/>") if parts is None else Markup(">{}</{}>").format(Markup("").join(parts), name))
+
+
 def svg(
-    width: int,
-    height: int,
-    title: str,
-    described: str,
-    parts: Iterable[Markup],
-    *,
-    narrow: bool,
-    attributes: str = "",
+    width: int, height: int, title: str, described: str, parts: Iterable[Markup], *, narrow: bool, **attributes: str
 ) -> Markup:
     """Return an SVG drawing of the given size [px] and parts, with a description for screen readers."""
-    return Markup(
-        '<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}"{}>'
-        "<title>{}</title><desc>{}</desc>{}</svg>"
-    ).format(
-        "narrow" if narrow else "wide",
-        width,
-        height,
-        width,
-        height,
-        attributes,
-        title,
-        described,
-        Markup("").join(parts),
-    )
+    every = [element("title", [title]), element("desc", [described]), *parts]
+    look: dict[str, str] = {"class_": f"chart {'narrow' if narrow else 'wide'}", "role": "img"}
+    view = f"0 0 {width} {height}"
+    return element("svg", every, **look, viewBox=view, width=width, height=height, **attributes)
 
 
-def svg_text(x: float, y: float, text: str, anchor: str) -> Markup:
+def svg_text(x: float, y: float, text: str, anchor: str, **attributes: str) -> Markup:
     """Return text as SVG markup; `anchor` is the part of the text ("start", "middle", "end") at the point (x, y)."""
-    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(x, y, anchor, text)
+    return element("text", [text], x=float(x), y=float(y), text_anchor=anchor, **attributes)
+
+
+def text_group(texts: Iterable[Markup]) -> Markup:
+    """Return the group of the text of a drawing."""
+    return element("g", texts, font_size="12", fill="currentColor")
+
+
+def faint_path(data: str) -> Markup:
+    """Return the SVG path of an axis, in a faint text color."""
+    return element("path", fill="none", stroke="currentColor", stroke_opacity="0.55", d=data)
 
 
 def text_width(text: str) -> float:
@@ -141,8 +146,6 @@ class Ticks:
     power: int = 0
 
 
-#: Start of the text of a drawing.
-TEXT_GROUP = Markup('<g font-size="12" fill="currentColor">')  # our constant
 #: Coordinates of curves are integer tenths of a pixel.
 TENTHS_PER_PIXEL = 10
 
@@ -176,35 +179,32 @@ class PlotArea:
         )
         return xs, ys
 
-    def grid(self, across: Ticks, upward: Ticks) -> list[Markup]:
-        """Return grid lines and the left and lower axis as SVG markup."""
-        along, up = Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>'), Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>')
-        axes = Markup(
-            '</g><path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>'
-        )
+    def grid(self, across: Ticks, upward: Ticks | None) -> list[Markup]:
+        """Return grid lines and the left and lower axis as SVG markup; without upward ticks there is no lower axis."""
+        levels = () if upward is None else upward.values
+        lines = [f"M{self.left:.1f} {float(self.y_pixels(v)):.1f}h{self.width:.1f}" for v in levels]
+        lines += [f"M{float(self.x_pixels(v)):.1f} {self.top:.1f}v{self.height:.1f}" for v in across.values]
+        paths = [element("path", d=line) for line in lines]
+        lower = "" if upward is None else f"h{self.width:.1f}"
         return [
-            Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
-            *(along.format(self.left, float(self.y_pixels(v)), self.width) for v in upward.values),
-            *(up.format(float(self.x_pixels(v)), self.top, self.height) for v in across.values),
-            axes.format(self.left, self.top, self.height, self.width),
+            element("g", paths, class_="grid", fill="none", stroke="currentColor", stroke_opacity="0.14"),
+            faint_path(f"M{self.left:.1f} {self.top:.1f}v{self.height:.1f}{lower}"),
         ]
 
     def labels(self, axes: tuple[Ticks, Ticks], names: tuple[str, str], width: int) -> list[Markup]:
         """Return tick labels and names of both axes as SVG markup, in a drawing of the given width [px]."""
         across, upward = axes
         bottom = self.top + self.height
-        out = [Markup('<g class="ticks">')]
-        for v, label in zip(upward.values, upward.labels, strict=True):
-            out.append(svg_text(self.left - 6, float(self.y_pixels(v)) + 4, label, "end"))
-        for v, label in zip(across.values, across.labels, strict=True):
-            out.append(svg_text(float(self.x_pixels(v)), bottom + 16, label, "middle"))
-        out.append(Markup("</g>"))
+        pairs = zip(upward.values, upward.labels, strict=True)
+        marks = [svg_text(self.left - 6, float(self.y_pixels(v)) + 4, label, "end") for v, label in pairs]
+        pairs = zip(across.values, across.labels, strict=True)
+        marks += [svg_text(float(self.x_pixels(v)), bottom + 16, label, "middle") for v, label in pairs]
         x_text, y_text = (
             truncate_text(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER_WIDTH_PX))
             for label, axis in zip(names, axes, strict=True)
         )
         return [
-            *out,
+            element("g", marks, class_="ticks"),
             svg_text(4, self.top - 12, y_text, "start"),
             svg_text(self.left + self.width, bottom + 34, x_text, "end"),
         ]

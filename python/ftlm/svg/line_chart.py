@@ -21,16 +21,18 @@ from ftlm.svg.figure import (
     MAX_STRAY_HEIGHTS,
     NARROW_WIDTH_PX,
     TENTHS_PER_PIXEL,
-    TEXT_GROUP,
     Figure,
     PlotArea,
     Ticks,
     decimate,
+    element,
+    faint_path,
     limits,
     log_ticks,
     snap_limits,
     svg,
     svg_text,
+    text_group,
     text_width,
     ticks,
 )
@@ -312,22 +314,21 @@ class LineChart(Figure):
         if narrow:
             height += int(top - 26)
         plot = PlotArea(left, top, width - left - right, height - top - 40.0, self.frame)
-        parts = [*plot.grid(across, upward), *self._curves(plot, narrow=narrow), TEXT_GROUP]
-        parts += plot.labels((across, upward), (self.x_label, self.y_label), width)
+        texts = plot.labels((across, upward), (self.x_label, self.y_label), width)
         if not any(np.isfinite(line.y).any() for line in lines):
             middle = plot.left + plot.width / 2, plot.top + plot.height / 2
-            parts.append(svg_text(*middle, "no finite value to draw", "middle"))
+            texts.append(svg_text(*middle, "no finite value to draw", "middle"))
         if named:
-            parts += _legend_marks(legend) if narrow else _end_labels(named, plot)
-        parts.append(Markup("</g>"))
-        told = Markup("") if self.log_x or self.log_y or self.stems else _zoomable(plot, across, upward)
+            texts += _legend_marks(legend) if narrow else _end_labels(named, plot)
+        parts = [*plot.grid(across, upward), self._curves(plot, narrow=narrow), text_group(texts)]
+        data = {} if self.log_x or self.log_y or self.stems else _zoomable(plot, across, upward)
         if self.slider and not (narrow or self.log_x or self.log_y):
             # A page of many charts has few points a line, and room for as few to be read out.
             values = [(line.name, line.style, line.y) for line in lines]
-            read = slider_readout(lines[0].x, values, self.x_label, self.y_label, max(2, self.points // 2))
-            told += Markup(' data-readings="{}"').format(read)
+            places = max(2, self.points // 2)
+            data["data_readings"] = slider_readout(lines[0].x, values, self.x_label, self.y_label, places)
         described = self.description or self._describe()
-        return svg(width, height, self.title, described, parts, narrow=narrow, attributes=told)
+        return svg(width, height, self.title, described, parts, narrow=narrow, **data)
 
     def _describe(self) -> str:
         """Return sentences on the axes and the range of every line, for screen readers."""
@@ -336,44 +337,32 @@ class LineChart(Figure):
         described += "; logarithmic horizontal axis. " if self.log_x else ". "
         return described + " ".join(_describe_line(line, self.log_y) for line in self.content[0])
 
-    def _curves(self, plot: PlotArea, *, narrow: bool) -> list[Markup]:
+    def _curves(self, plot: PlotArea, *, narrow: bool) -> Markup:
         """Return bars, bands and lines as SVG markup, in a nested drawing that clips them."""
         points = max(4, self.points // 2) if narrow else self.points
-        out = [
-            Markup(
-                '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
-                'viewBox="0 0 {:.0f} {:.0f}">'
-            ).format(
-                plot.left,
-                plot.top,
-                plot.width,
-                plot.height,
-                plot.width * TENTHS_PER_PIXEL,
-                plot.height * TENTHS_PER_PIXEL,
-            )
-        ]
+        out = []
         zero = round(float(plot.y_pixels(0.0) - plot.top) * TENTHS_PER_PIXEL)
         if self.bars is not None:
             edges, heights = self.bars
             xs, ys = plot.tenths(edges, np.append(heights, 0.0))
-            rectangle = Markup(
-                '<rect class="shade2" x="{}" y="{}" width="{}" height="{}" fill="{}" fill-opacity=".55"/>'
-            )
+            shade: dict[str, str] = {"fill": LINE_STYLES[2][0], "fill_opacity": ".55"}
             for x, end, y in zip(xs[:-1], xs[1:], ys[:-1], strict=True):
-                out.append(rectangle.format(x, y, max(end - x - 8, 4), zero - y, LINE_STYLES[2][0]))
-        shaded = Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>')
+                size = {"width": max(end - x - 8, 4), "height": zero - y}
+                out.append(element("rect", class_="shade2", x=x, y=y, **size, **shade))
         for line in self.content[0]:
             if d := _outline(line, plot, points):
-                out.append(shaded.format(line.style, LINE_STYLES[line.style][0], d))
+                shade = {"class_": f"shade{line.style}", "fill": LINE_STYLES[line.style][0], "fill_opacity": "0.2"}
+                out.append(element("path", **shade, d=d))
         if self.stems:
-            axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {}h{:.0f}"/>')
-            out.append(axis.format(zero, plot.width * TENTHS_PER_PIXEL))
+            out.append(faint_path(f"M0 {zero}h{plot.width * TENTHS_PER_PIXEL:.0f}"))
         # The neutral line lies beneath the others.
         for line in sorted(self.content[0], key=lambda item: item.style != 0 or item.dots):
             if d := _stem_path(line, plot) if self.stems else _path(line, plot, points):
                 stroke = _stroke(line.style, dots=line.dots)
-                out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(stroke, d))
-        return [*out, Markup("</svg>")]
+                out.append(element("path", vector_effect="non-scaling-stroke", **stroke, d=d))
+        box = {"x": plot.left, "y": plot.top, "width": plot.width, "height": plot.height}
+        view = f"0 0 {plot.width * TENTHS_PER_PIXEL:.0f} {plot.height * TENTHS_PER_PIXEL:.0f}"
+        return element("svg", out, class_="plot", preserveAspectRatio="none", **box, viewBox=view)
 
 
 def line_styles(names: Iterable[str]) -> list[int]:
@@ -397,13 +386,11 @@ def _describe_line(line: _Line, log_y: bool) -> str:
     return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
 
 
-def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> Markup:
+def _zoomable(plot: PlotArea, across: Ticks, upward: Ticks) -> dict[str, str]:
     """Return attributes for the zoom script: axis limits, plot area, and powers of ten of the labels."""
     frame = " ".join(repr(float(v)) for v in plot.frame)
     place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
-    return Markup(' data-frame="{}" data-plot="{}" data-powers="{} {}"').format(
-        frame, place, across.power, upward.power
-    )
+    return {"data_frame": frame, "data_plot": place, "data_powers": f"{across.power} {upward.power}"}
 
 
 def _outline(line: _Line, plot: PlotArea, points: int) -> str:
@@ -428,16 +415,16 @@ def _stem_path(line: _Line, plot: PlotArea) -> str:
     return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[rows], line.y[rows]), strict=True))
 
 
-def _stroke(style: int, *, dots: bool = False) -> Markup:
+def _stroke(style: int, *, dots: bool = False) -> dict[str, str]:
+    """Return the SVG attributes of a line in a style."""
     light, _, dashes = LINE_STYLES[style]
     dashes = "" if dots else dashes
     # The measured line is wide enough to show on both sides of one that follows it exactly.
     thickness = DOT_DIAMETER_PX if dots else 3.4 if style == 0 else 1.5
-    dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
     # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
-    return Markup(
-        'class="line{}" fill="none" stroke="{}" stroke-width="{:g}" stroke-linejoin="round" stroke-linecap="{}"{}'
-    ).format(style, light, thickness, "butt" if dashes else "round", dash)
+    stroke = {"class_": f"line{style}", "fill": "none", "stroke": light, "stroke_width": f"{thickness:g}"}
+    stroke |= {"stroke_linejoin": "round", "stroke_linecap": "butt" if dashes else "round"}
+    return stroke | ({"stroke_dasharray": dashes} if dashes else {})
 
 
 def path_data(places: Iterable[tuple[float, float]]) -> str:
@@ -447,9 +434,9 @@ def path_data(places: Iterable[tuple[float, float]]) -> str:
 
 def stroke_path(style: int, places: Iterable[tuple[float, float]], width: float = 1.5, dashes: str = "") -> Markup:
     """Return the SVG path through points [px] in the color of a style."""
-    dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
-    path = Markup('<path class="line{}" fill="none" stroke="{}" stroke-width="{}"{} d="{}"/>')
-    return path.format(style, LINE_STYLES[style][0], width, dash, path_data(places))
+    stroke = {"class_": f"line{style}", "fill": "none", "stroke": LINE_STYLES[style][0], "stroke_width": f"{width}"}
+    dash = {"stroke_dasharray": dashes} if dashes else {}
+    return element("path", **stroke, **dash, d=path_data(places))
 
 
 def _path(line: _Line, plot: PlotArea, points: int) -> str:
@@ -470,7 +457,7 @@ def _path(line: _Line, plot: PlotArea, points: int) -> str:
 def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
     """Return a sample of a line's style as SVG markup, for a label."""
     at, reach = (x + length / 2, 0) if line.dots else (x, length)
-    return Markup('<path {} d="M{:.1f} {:.1f}h{}"/>').format(_stroke(line.style, dots=line.dots), at, y, reach)
+    return element("path", **_stroke(line.style, dots=line.dots), d=f"M{at:.1f} {y:.1f}h{reach}")
 
 
 def _end_labels(lines: list[_Line], plot: PlotArea) -> list[Markup]:
