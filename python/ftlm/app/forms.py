@@ -360,20 +360,16 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
     DataError
         If a field is unknown, or a number in it is invalid.
     """
-    options: dict[str, Any] = {}
-    for name in ("step", "resample"):
-        if _text(texts, name):
-            options[name] = parse_number(name, _text(texts, name))
-    for name in ("time_unit", "missing"):
-        if _text(texts, name):
-            options[name] = _text(texts, name)
-    ends = [parse_number(name, _text(texts, name)) if _text(texts, name) else None for name in ("from", "to")]
-    if ends != [None, None]:
-        options["window"] = ends
-    layout: dict[str, Any] = {name: _text(texts, name) for name in TEXT_LAYOUT_FIELDS if _text(texts, name)}
-    layout |= {
-        name: _parse_line_count(name, _text(texts, name)) for name in INTEGER_LAYOUT_FIELDS if _text(texts, name)
-    }
+
+    def parsed(parse: Callable[[str, str], Any], *names: str) -> dict[str, Any]:
+        """Return the values of those of some fields that are not empty."""
+        return {name: parse(name, text) for name in names if (text := _text(texts, name))}
+
+    options = parsed(parse_number, "step", "resample") | parsed(_plain_text, "time_unit", "missing")
+    ends = parsed(parse_number, "from", "to")
+    if ends:
+        options["window"] = [ends.get("from"), ends.get("to")]
+    layout = parsed(_plain_text, *TEXT_LAYOUT_FIELDS) | parsed(_parse_line_count, *INTEGER_LAYOUT_FIELDS)
     if layout:
         options["layout"] = layout
     return options | _roles(texts.get("columns"))
@@ -413,6 +409,10 @@ def parse_number(name: str, text: str) -> float:
         return float(text)
     except ValueError:
         raise DataError(f"{name}: {text[:40]!r} is not a number; write one such as 0.5") from None
+
+
+def _plain_text(_: str, text: str) -> str:
+    return text
 
 
 def _parse_line_count(name: str, text: str) -> int:

@@ -459,18 +459,10 @@ class ResponseOptions:
 
     def load(self, file: str) -> FrequencyData:
         """Return the frequency response in a file."""
-        columns: dict[str, Any] | None = pairs("--columns", self.columns) or None
-        return load_frequency(
-            file,
-            columns=columns,
-            frequency_unit=self.frequency_unit,
-            magnitude_unit=self.magnitude_unit,
-            phase_unit=self.phase_unit,
-            negated=self.negated,
-            output=self.output or "",
-            input=self.input or "",
-            layout=layout_options(self),
-        )
+        layout = layout_options(self)
+        options = {name: value for name, value in given_fields(self).items() if name not in layout}
+        columns: dict[str, Any] | None = pairs("--columns", options.pop("columns", None)) or None
+        return load_frequency(file, columns=columns, layout=layout, **options)
 
 
 @command

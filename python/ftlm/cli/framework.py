@@ -426,6 +426,7 @@ def say_written(*paths: str | None) -> None:
 #: Time to read a byte and to simulate a sample of an output on the reference machine [s], and range of the actual
 #: durations. Numbers with few digits need more time per byte, and oscillating simulations are refined.
 READ_TIME_PER_BYTE_S, SIMULATION_TIME_PER_SAMPLE_S, DURATION_FACTORS = 8e-8, 4e-6, (0.4, 4.0)
+MIN_ANNOUNCED_TIME_S = 0.2
 #: Time of a controller design, and of the loop analysis for one sample of the parameters [s].
 DESIGN_TIME_S, LOOP_ANALYSIS_TIME_S = {"pid": 0.1, "lqg": 1.2}, {"pid": 0.005, "lqg": 0.01}
 
@@ -439,23 +440,23 @@ def announce_reading(files: Sequence[str]) -> None:
         except (OSError, ValueError):
             # The reader of the file reports it.
             return
-    if READ_TIME_PER_BYTE_S * size > 0.2:
-        Progress("").expect(
-            "reading", *duration_bounds(estimate_duration(READ_TIME_PER_BYTE_S * size, 1), DURATION_FACTORS)
-        )
+    _announce("reading", READ_TIME_PER_BYTE_S * size)
 
 
 def announce_simulation(runs: Sequence[Run], outputs: int, *, quiet: bool) -> None:
     """Print the expected duration of simulating a model on runs if it is long."""
     samples = outputs * sum(run.length for run in runs)
-    if SIMULATION_TIME_PER_SAMPLE_S * samples > 0.2:
-        Progress("", quiet=quiet).expect(
-            "running the model",
-            *duration_bounds(estimate_duration(SIMULATION_TIME_PER_SAMPLE_S * samples, 1), DURATION_FACTORS),
-        )
+    _announce("running the model", SIMULATION_TIME_PER_SAMPLE_S * samples, quiet=quiet)
 
 
 def announce_design(design: str, samples: int) -> None:
     """Print the expected duration of a design with a number of parameter samples if it is long."""
-    seconds = DESIGN_TIME_S[design] + LOOP_ANALYSIS_TIME_S[design] * max(samples, 0)
-    Progress("").expect("designing", *duration_bounds(estimate_duration(seconds, 1), DURATION_FACTORS))
+    _announce("designing", DESIGN_TIME_S[design] + LOOP_ANALYSIS_TIME_S[design] * max(samples, 0))
+
+
+def _announce(what: str, seconds: float, *, quiet: bool = False) -> None:
+    """Print the expected duration of work that takes a time [s] on the reference machine if it is long."""
+    # The speed of this machine is measured once, which work below this time is not worth.
+    if seconds > MIN_ANNOUNCED_TIME_S:
+        bounds = duration_bounds(estimate_duration(seconds, 1), DURATION_FACTORS)
+        Progress("", quiet=quiet).expect(what, *bounds)

@@ -212,9 +212,12 @@ def record(
     board
         Identifier of the Q8-USB board.
     """
+    # All other options are arguments of `ftlm.rig.record`.
+    arguments = {name: value for name, value in locals().items() if name not in ("live", "as_json")}
     currents = parse_numbers("--amplitude", amplitude, 1, 2)
-    low, high = parse_numbers("--band", band, 2)
-    shift = None if offset is None else parse_numbers("--offset", offset, 2)
+    arguments |= {"amplitude": (currents[0], currents[-1]), "band": tuple(parse_numbers("--band", band, 2))}
+    if offset is not None:
+        arguments["offset"] = tuple(parse_numbers("--offset", offset, 2))
     stream = live.stream(rig, parameters, rate, limit)
     if stream is not None:
         print(f"live: {stream.structure}", file=sys.stderr)
@@ -222,30 +225,7 @@ def record(
     try:
         signals.install()
         with Progress("recording", quiet=as_json) as progress:
-            run = experiment.record(
-                rig,
-                input=input,
-                amplitude=(currents[0], currents[-1]),
-                period=period,
-                band=(low, high),
-                ramp=ramp,
-                file=file,
-                duration=duration,
-                limit=limit,
-                rate=rate,
-                seed=seed,
-                parameters=parameters,
-                offset=None if shift is None else (shift[0], shift[1]),
-                real_time=real_time,
-                sensor_filter=sensor_filter,
-                watchdog=watchdog,
-                arm=arm,
-                board=board,
-                out=out,
-                force=force,
-                live=stream,
-                progress=live_reporter(stream, rate, progress),
-            )
+            run = experiment.record(**arguments, live=stream, progress=live_reporter(stream, rate, progress))
     except (KeyboardInterrupt, SystemExit) as ended:
         signals.ignore()
         what = experiment.describe_interruption(ended)
