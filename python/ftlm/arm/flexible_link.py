@@ -16,7 +16,7 @@ from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Hints, Structure, check_offset
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import choose_text, parameter, setting
-from ftlm.utils.validation import short_repr
+from ftlm.utils.validation import check_choice, short_repr
 
 
 @check_arguments
@@ -138,16 +138,14 @@ def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Fo
     """Return the form and the input order; an input order selects the published form by default."""
     if form is None:
         form = "lagrange" if input_order is None else "published"
-    if form not in ("lagrange", "published"):
-        raise ModelError(f"{setting('form')} {form!r} is not known; use 'lagrange' or 'published'")
+    check_choice("form", form, ("lagrange", "published"))
     if form == "lagrange" and input_order is not None:
         raise ModelError(
             f"{setting('input_order')} {input_order!r} is not used by {parameter('form', 'lagrange')}, whose "
             f"equation of the deflection has no current; leave it out, or use {parameter('form', 'published')}"
         )
     input_order = input_order or "published"
-    if input_order not in ("published", "derived"):
-        raise ModelError(f"{setting('input_order')} {input_order!r} is not known; use 'published' or 'derived'")
+    check_choice("input_order", input_order, ("published", "derived"))
     return form, input_order
 
 
@@ -327,10 +325,7 @@ def flexible_link(
         raise ModelError(
             f"{parameter('cross_stage', 'inertial')} requires {parameter('form', 'lagrange')}; use that form"
         )
-    if parameters not in PARAMETER_SETS:
-        raise ModelError(
-            f"{setting('parameters')} {parameters!r} is not known; use {' or '.join(map(repr, PARAMETER_SETS))}"
-        )
+    check_choice("parameters", parameters, PARAMETER_SETS)
     if not (isinstance(friction, bool) or friction in ("coulomb", "stribeck")):
         raise ModelError(
             f"{setting('friction')} {short_repr(friction)} is not known; use False, 'coulomb' or 'stribeck'"

@@ -89,18 +89,12 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
 
     def controller(self) -> Lqg:
         """Return the controller from its file form."""
-        a, b, c, correction, feedback = (
-            np.array(m, dtype=np.float64) for m in (self.a, self.b, self.c, self.correction, self.feedback)
-        )
         size, count = len(self.a), len(self.measured)
-        shapes = {
-            "a": (a, (size, size)),
-            "b": (b, (size, 1)),
-            "c": (c, (len(self.outputs), size)),
-            "correction": (correction, (size + 1, count)),
-            "feedback": (feedback, (1, size)),
-        }
-        for name, (matrix, shape) in shapes.items():
+        shapes = {"a": (size, size), "b": (size, 1), "c": (len(self.outputs), size)}
+        shapes |= {"correction": (size + 1, count), "feedback": (1, size)}
+        matrices = {name: np.array(getattr(self, name), dtype=np.float64) for name in shapes}
+        for name, shape in shapes.items():
+            matrix = matrices[name]
             if matrix.shape != shape:
                 raise ModelError(f"{name} has shape {matrix.shape}, not {shape}")
             if not np.isfinite(matrix).all():
@@ -124,15 +118,15 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
             self.rate,
             self.band,
             tuple(complex(*p) for p in self.poles),
-            a,
-            b,
-            c,
+            matrices["a"],
+            matrices["b"],
+            matrices["c"],
             gain,
             phase,
         )
-        observer = Observer(realisation, tuple(self.measured), tuple(self.noise), self.drift, correction, deviations)
+        design = tuple(self.measured), tuple(self.noise), self.drift, matrices["correction"], deviations
         limit = math.inf if self.limit is None else self.limit
-        return Lqg(observer, feedback, self.tracked, limit=limit)
+        return Lqg(Observer(realisation, *design), matrices["feedback"], self.tracked, limit=limit)
 
 
 class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):

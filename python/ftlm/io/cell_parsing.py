@@ -259,7 +259,9 @@ class Timestamps:
             return np.asarray((since - since[0]) / _NANOSECONDS_PER_SECOND)
         year, month, day = (self.parts[:, place] for place in self._order(thing, dates))
         year = np.where(year < 100, year + 2000, year)
-        bad = (month < 1) | (month > 12) | (day < 1) | (day > _days_in_month(year, np.clip(month, 1, 12)))
+        months = (12 * (year - 1970) + np.clip(month, 1, 12) - 1).astype("datetime64[M]")
+        starts, ends = (m.astype("datetime64[D]").astype(np.int64) for m in (months, months + 1))
+        bad = (month < 1) | (month > 12) | (day < 1) | (day > ends - starts)
         if bad.any():
             raise bad_rows(
                 thing,
@@ -268,8 +270,7 @@ class Timestamps:
                 int(bad.sum()),
                 f"correct these rows, or say the order of day and month with {layout_parameter(dates='dmy')}",
             )
-        months = (12 * (year - 1970) + month - 1).astype("datetime64[M]")
-        days = months.astype("datetime64[D]").astype(np.int64) + day - 1
+        days = starts + day - 1
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
     def inferred_date_order(self, dates: str | None) -> str:
@@ -323,10 +324,3 @@ def _duration_ns(sign: str, whole: str, fraction: str) -> int:
     """Return a duration [ns]."""
     nanoseconds = int(whole) * _NANOSECONDS_PER_SECOND + int(fraction.ljust(9, "0") or 0)
     return -nanoseconds if sign else nanoseconds
-
-
-def _days_in_month(year: npt.NDArray[np.int64], month: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the number of days of each month."""
-    leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
-    days = np.array([31, 28, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])[month - 1]
-    return np.asarray(days + (leap & (month == 2)))

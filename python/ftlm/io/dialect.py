@@ -336,8 +336,9 @@ def find_table(
     assumed = _layout_assumptions(cut, layout_options, layout, top, units)
     if layout_options.skip is None:
         _check_above(cut[: top - header], width, source, (comma, mark))
-    if not own and names is None and top < len(cut):
-        _check_headless(cut[top], source, layout_options)
+    if not own and names is None and top < len(cut) and cut[top].words and layout_options.header is None:
+        # A first row with words and numbers may be a header.
+        raise _mixed_line(cut[top], source)
     if names is not None and not own and layout_options.separator is None:
         _check_mixed(cut, top, separator, comma, source)
     begin = cut[top].at if top < len(cut) else cut[-1].at + 1
@@ -458,7 +459,8 @@ def _first_row(cut: list[_Line], width: int) -> int:
     if first is None:
         first = next(k for k, line in enumerate(cut) if line is rows[0])
     while first > 0 and cut[first - 1].width == width and cut[first - 1].count:
-        if _is_above_units(cut, first) or _is_settings_line(cut, first - 1):
+        # A line with numbers is a header if a line of units follows it.
+        if (first < len(cut) and _is_unit_line(cut[first])) or _is_settings_line(cut, first - 1):
             break
         first -= 1
     # Short lines right below a header count as rows; reading them raises a specific error later.
@@ -466,11 +468,6 @@ def _first_row(cut: list[_Line], width: int) -> int:
     while above > 0 and cut[above - 1].has_only_numbers:
         above -= 1
     return above if above > 0 and cut[above - 1].has_only_words and cut[above - 1].width == width else first
-
-
-def _is_above_units(cut: list[_Line], first: int) -> bool:
-    """Whether the line above `first` is a header although it has numbers, because a line of units follows it."""
-    return first < len(cut) and _is_unit_line(cut[first])
 
 
 def _is_settings_line(cut: list[_Line], at: int) -> bool:
@@ -568,12 +565,6 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
             raise DataError(
                 f"{source}: line {at}: the column name {name!r} occurs {times[name]} times; rename all but one"
             )
-
-
-def _check_headless(line: _Line, source: str, layout: Layout) -> None:
-    """Raise DataError if the first row mixes words and numbers, so that it could be a header."""
-    if line.words and layout.header is None:
-        raise _mixed_line(line, source)
 
 
 def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool, str | None]) -> None:

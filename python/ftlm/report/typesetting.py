@@ -141,10 +141,16 @@ def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequ
             text = _LIMITED_INPUT.format(
                 INPUT_EFFECT_ABBREVIATIONS[limit.law], text, _number_math(_short(float(limit.value)))
             )
+    operator = _operator_math(order)
+    return Markup("{}{}{}").format(operator, THIN_SPACE, text) if operator else text
+
+
+def _operator_math(order: Order) -> Markup:
+    """Return the operator of a derivative as MathML; empty for order 0."""
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
-        return text
+        return Markup("")
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed_math(order.constant)
-    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN_SPACE, text)
+    return Markup("<msup><mi>D</mi>{}</msup>").format(value)
 
 
 def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:
@@ -153,10 +159,8 @@ def _operand_math(term: Term, delay: Mapping[str, float], limits: Sequence[Input
     if shape is None:
         return _derivative_math(term.order, term.signal, delay.get(term.signal, 0.0), limits)
     text = _expression_math(shape, delay, limits)
-    if not term.order.names and round(term.order.constant, ORDER_DECIMALS) == 0:
-        return _IN_PARENTHESES.format(text) if shape.operation == "add" else text
-    value = Markup("<mi>{}</mi>").format(str(term.order)) if term.order.names else _signed_math(term.order.constant)
-    return Markup("<msup><mi>D</mi>{}</msup>{}").format(value, _IN_PARENTHESES.format(text))
+    operator = _operator_math(term.order)
+    return operator + (_IN_PARENTHESES.format(text) if operator or shape.operation == "add" else text)
 
 
 def _expression_math(item: Expression, delay: Mapping[str, float], limits: Sequence[InputNonlinearity]) -> Markup:

@@ -24,7 +24,7 @@ from ftlm.structure.order import Order, Values, format_shortest, parse_values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
-from ftlm.utils.validation import check_known, real_number
+from ftlm.utils.validation import check_choice, check_known, real_number
 
 
 class History(tuple[float, ...]):
@@ -173,8 +173,7 @@ class Structure:
         twice = next((o for i, o in enumerate(outputs) if o in outputs[:i]), None)
         if twice is not None:
             raise ModelError(f"two equations have the output {twice}; give each output one equation")
-        if self.coupling not in ("measured", "simulated"):
-            raise ModelError(f"{setting('coupling')} {self.coupling!r} is not known; use 'measured' or 'simulated'")
+        check_choice("coupling", self.coupling, ("measured", "simulated"))
         names = [n for e in self.equations for n in e.coefficient_names]
         twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
         if twice is not None:
