@@ -27,6 +27,7 @@ from ftlm.data.sampling import (
     fill_input_gaps,
     grid_positions,
     has_too_few_values,
+    masked_rows_error,
     missing_mask,
     regular_step,
     resample_uniform,
@@ -180,13 +181,8 @@ class RunArguments:
                 continue
             if name in self.outputs:
                 if has_too_few_values(values):
-                    raise bad_rows(
-                        self.label_of(name),
-                        f"{is_missing.size - int(is_missing.sum())} values, {MIN_RUN_SAMPLES} are needed",
-                        0,
-                        int(is_missing.sum()),
-                        "use a longer record",
-                    )
+                    what = f"{int((~is_missing).sum())} values, {MIN_RUN_SAMPLES} are needed"
+                    raise bad_rows(self.label_of(name), what, 0, int(is_missing.sum()), "use a longer record")
                 notes.append(
                     describe_missing(
                         f"output {name}", is_missing, "they weigh nothing in output-error fits and figures"
@@ -194,13 +190,8 @@ class RunArguments:
                 )
                 continue
             if is_missing[0]:
-                raise bad_rows(
-                    self.label_of(name),
-                    "no value before which there is none to hold",
-                    0,
-                    int(is_missing.sum()),
-                    f"begin where the input is known, with {parameter('window')}",
-                )
+                what, remedy = "no value before which there is none to hold", "begin where the input is known, with "
+                raise masked_rows_error(self.label_of(name), what, is_missing, remedy + parameter("window"))
             out[name] = fill_input_gaps(values, behaviour[name])
             how = "its last value was held" if behaviour[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
             notes.append(describe_missing(f"input {name}", is_missing, f"{how}, which is a guess"))
@@ -278,13 +269,8 @@ class RunArguments:
             instead = f"give them no weight with {parameter('missing', 'weight')}"
             if signal in self.inputs:
                 instead = f"hold the last value before them with {parameter('missing', 'hold')}"
-            check_values(
-                vector,
-                self.label_of(signal),
-                first,
-                gaps=gaps,
-                instead=f"{instead}, or avoid them with {parameter('window')}",
-            )
+            instead += f", or avoid them with {parameter('window')}"
+            check_values(vector, self.label_of(signal), first, gaps=gaps, instead=instead)
             data[signal] = vector
             if scale != 1.0:
                 with np.errstate(over="ignore"):

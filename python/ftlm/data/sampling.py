@@ -136,9 +136,8 @@ def as_seconds(values: object, thing: str) -> tuple[Floats, str] | None:
         raise DataError(f"{thing}: not one date per row ({error}); pass datetime64, or seconds") from None
     if array.dtype.kind not in "mM" or array.ndim != 1 or array.size == 0:
         return None
-    rows = np.flatnonzero(np.isnat(array))
-    if rows.size:
-        raise bad_rows(thing, "no date", int(rows[0]), rows.size, "remove or fill these rows yourself")
+    if np.isnat(array).any():
+        raise masked_rows_error(thing, "no date", np.isnat(array), "remove or fill these rows yourself")
     lapses = array - array[0] if array.dtype.kind == "M" else array
     nanoseconds = lapses.astype("timedelta64[ns]")
     if (nanoseconds.astype(lapses.dtype) != lapses).any():
@@ -231,6 +230,12 @@ def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False,
     )
 
 
+def masked_rows_error(thing: str, what: str, is_bad: NDArray[np.bool_], remedy: str, offset: int = 0) -> DataError:
+    """Return the error on the rows at which a mask is True; ``offset`` is the number of the first row."""
+    rows = np.flatnonzero(is_bad)
+    return bad_rows(thing, what, offset + int(rows[0]), rows.size, remedy)
+
+
 def check_increasing(clock: Floats, thing: str, offset: int) -> None:
     """Raise DataError if sample times are not strictly increasing."""
     steps = np.diff(clock)
@@ -271,13 +276,13 @@ def regular_step(
                 f"{parameter('resample', Placeholder('STEP'))}"
             )
             raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
-        rows = np.flatnonzero(deviation > _MAX_JITTER_SHARE * mean)
         share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _MAX_JITTER_SHARE:g} % allowed)"
         way_out = (
             f"put the inputs on a regular grid with {parameter('resample', Placeholder('STEP'))}; outputs are "
             "compared when they were read"
         )
-        raise bad_rows(thing, f"jitter of up to {share}", offset + int(rows[0]), rows.size, way_out)
+        is_late = deviation > _MAX_JITTER_SHARE * mean
+        raise masked_rows_error(thing, f"jitter of up to {share}", is_late, way_out, offset)
     fact: tuple[str, ...] = ()
     if worst > _MIN_REPORTED_JITTER_SHARE * mean:
         row = offset + int(deviation.argmax())

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from ftlm.data.sampling import masked_rows_error
 from ftlm.data.units import TIME_UNITS, parse_unit, split_time_header
 from ftlm.errors import DataError
 from ftlm.utils.parameters import layout_parameter
-from ftlm.utils.validation import Floats, bad_rows
+from ftlm.utils.validation import Floats
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
 #: Separators before a unit at the end of a column name without brackets.
@@ -263,13 +264,8 @@ class Timestamps:
         starts, ends = (m.astype("datetime64[D]").astype(np.int64) for m in (months, months + 1))
         bad = (month < 1) | (month > 12) | (day < 1) | (day > ends - starts)
         if bad.any():
-            raise bad_rows(
-                thing,
-                "a date that is none",
-                int(np.flatnonzero(bad)[0]),
-                int(bad.sum()),
-                f"correct these rows, or say the order of day and month with {layout_parameter(dates='dmy')}",
-            )
+            remedy = f"correct these rows, or say the order of day and month with {layout_parameter(dates='dmy')}"
+            raise masked_rows_error(thing, "a date that is none", bad, remedy)
         days = starts + day - 1
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 

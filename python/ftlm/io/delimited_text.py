@@ -31,7 +31,7 @@ from ftlm.io.cell_parsing import (
     split_unit,
 )
 from ftlm.io.dialect import SEPARATOR_WORDS, Assumption, Layout, TableDialect, find_table
-from ftlm.io.table import Column, FileTable
+from ftlm.io.table import Column, FileTable, dates_problem
 from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
 from ftlm.utils.validation import bad_rows
 
@@ -362,13 +362,8 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
             )
             moments = None
         elif moments is not None:
-            problem = bad_rows(
-                f"{source}: column {name!r}",
-                f"dates or times of day, not numbers ({moments.first!r})",
-                0,
-                rows.count,
-                f"name it with {parameter('time')}, or choose another column",
-            )
+            words = f"dates or times of day, not numbers ({moments.first!r})"
+            problem = dates_problem(f"{source}: column {name!r}", words, rows.count)
         unit = (
             (dialect.units[k] if dialect.units is not None else "") or split_unit(name)[1] or split_slash_unit(name)[1]
         )
@@ -524,21 +519,14 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     blank = all(is_gap(column[row]) for row in bad)
     if blank and not dated:
         values[:, index] = [np.nan if is_gap(cell) else parse_number(cell, comma=comma, mark=mark) for cell in column]
+    first, blank = bad[0], blank and not dated
+    place = lines[first], rows.count + first, column[first]
     bad_cell = rows.bad_cells.get(index)
     if bad_cell is None:
-        rows.bad_cells[index] = _BadCells(
-            lines[bad[0]],
-            rows.count + bad[0],
-            column[bad[0]],
-            len(bad),
-            blank and not dated,
-            comma,
-            bool(dated),
-            rows.sheet,
-            column[0].strip()[:40] if ways else "",
-        )
+        other = column[0].strip()[:40] if ways else ""
+        rows.bad_cells[index] = _BadCells(*place, len(bad), blank, comma, bool(dated), rows.sheet, other)
         return
-    if bad_cell.blank and (dated or not blank):
-        bad_cell.line, bad_cell.row, bad_cell.cell = lines[bad[0]], rows.count + bad[0], column[bad[0]]
+    if bad_cell.blank and not blank:
+        bad_cell.line, bad_cell.row, bad_cell.cell = place
     bad_cell.count += len(bad)
-    bad_cell.blank &= blank and not dated
+    bad_cell.blank &= blank

@@ -18,14 +18,15 @@ import msgspec
 import numpy as np
 
 from ftlm.data.export import Header
+from ftlm.data.sampling import masked_rows_error
 from ftlm.errors import DataError
 from ftlm.io.cell_parsing import Timestamps
 from ftlm.io.delimited_text import parse_text
 from ftlm.io.dialect import Assumption, Layout
-from ftlm.io.table import Column, FileTable
-from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
+from ftlm.io.table import Column, FileTable, dates_problem
+from ftlm.utils.parameters import Placeholder, layout_parameter
 from ftlm.utils.resources import python_child
-from ftlm.utils.validation import Floats, bad_rows
+from ftlm.utils.validation import Floats
 
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
 _READER_TIMEOUT_S = 60.0
@@ -278,16 +279,9 @@ def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Colu
     values = matrix.ravel(order="F")
     thing, is_missing = f"{path.name}: column {name!r}", np.isnan(values)
     if is_missing.any():
-        rows = np.flatnonzero(is_missing)
-        problem = bad_rows(thing, "no date", int(rows[0]), rows.size, "remove or fill these rows yourself")
+        problem = masked_rows_error(thing, "no date", is_missing, "remove or fill these rows yourself")
         return Column(name, name, path, None, problem)
     first = str(np.datetime64(since, "ns")) if abs(since) < 1 << 63 else "a date"
     moments = Timestamps(np.zeros((values.size, 3), np.int64), "", np.clip(values, -9e18, 9e18).astype(np.int64), first)
-    problem = bad_rows(
-        thing,
-        f"dates, not numbers ({first})",
-        0,
-        values.size,
-        f"name it with {parameter('time')}, or choose another column",
-    )
+    problem = dates_problem(thing, f"dates, not numbers ({first})", values.size)
     return Column(name, name, path, values, problem, timestamps=moments)

@@ -355,14 +355,8 @@ def _polar(
 ) -> tuple[Complex, float, str]:
     size, angle = parts["magnitude"], parts["phase"]
     values, phase = (i.column.numbers().astype(np.float64) for i in (size, angle))
-    decibels = _resolve_unit(
-        "magnitude",
-        size,
-        magnitude_unit,
-        ("abs", "dB"),
-        "dB" if size.unit.casefold() == "db" else "abs" if size.unit else None,
-        notes,
-    )
+    file_unit = "dB" if size.unit.casefold() == "db" else "abs" if size.unit else None
+    decibels = _resolve_unit("magnitude", size, magnitude_unit, ("abs", "dB"), file_unit, notes)
     if decibels == "dB" and "deviation" in parts:
         raise DataError(
             f"column {parts['deviation'].column.name!r} is read as the standard deviation of real and imaginary "

@@ -80,6 +80,11 @@ class Column:
         return self.values
 
 
+def dates_problem(thing: str, words: str, rows: int) -> DataError:
+    """Return the error for a column of dates or times of day that is used as numbers."""
+    return bad_rows(thing, words, 0, rows, f"name it with {parameter('time')}, or choose another column")
+
+
 @dataclass(frozen=True)
 class FileTable:
     """Columns of one file, with its format, layout and the assumptions made."""
@@ -297,10 +302,6 @@ def _check_agreement(one: Column, other: Column) -> None:
         )
     rows = np.flatnonzero(~same & ~(np.isnan(a) & np.isnan(b)))
     if rows.size:
-        raise bad_rows(
-            names,
-            f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}",
-            int(rows[0]),
-            rows.size,
-            f"give files of one record, or name the time to use with {parameter('time')}",
-        )
+        what = f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}"
+        remedy = f"give files of one record, or name the time to use with {parameter('time')}"
+        raise bad_rows(names, what, int(rows[0]), rows.size, remedy)
