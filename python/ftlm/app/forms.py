@@ -361,15 +361,15 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
         If a field is unknown, or a number in it is invalid.
     """
 
-    def parsed(parse: Callable[[str, str], Any], *names: str) -> dict[str, Any]:
+    def read_fields(parse: Callable[[str, str], Any], *names: str) -> dict[str, Any]:
         """Return the values of those of some fields that are not empty."""
         return {name: parse(name, text) for name in names if (text := _text(texts, name))}
 
-    options = parsed(parse_number, "step", "resample") | parsed(_plain_text, "time_unit", "missing")
-    ends = parsed(parse_number, "from", "to")
+    options = read_fields(parse_number, "step", "resample") | read_fields(_plain_text, "time_unit", "missing")
+    ends = read_fields(parse_number, "from", "to")
     if ends:
         options["window"] = [ends.get("from"), ends.get("to")]
-    layout = parsed(_plain_text, *TEXT_LAYOUT_FIELDS) | parsed(_parse_line_count, *INTEGER_LAYOUT_FIELDS)
+    layout = read_fields(_plain_text, *TEXT_LAYOUT_FIELDS) | read_fields(_parse_line_count, *INTEGER_LAYOUT_FIELDS)
     if layout:
         options["layout"] = layout
     return options | _roles(texts.get("columns"))

@@ -48,7 +48,6 @@ class LinkParameters:
         """Inertia ratio r = (J_1 + J_2) / J_2, by which coefficients of the deflection exceed those of the hub."""
         return (self.hub_inertia + self.link_inertia) / self.link_inertia
 
-    @check_arguments
     def coefficients(self, stage: int) -> dict[str, float]:
         """Return the coefficients a, b, d, g of both equations of a stage in the published form, by name.
 
@@ -69,7 +68,6 @@ class LinkParameters:
             f"g{deflection}": -g,
         }
 
-    @check_arguments
     def lagrange_coefficients(self, stage: int) -> dict[str, float]:
         """Return the coefficients of both equations of a stage in the Lagrange form, by name.
 

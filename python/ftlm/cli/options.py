@@ -24,7 +24,7 @@ from ftlm.utils.parameters import flag_of, parameter
 #: Options of the flexible link, in the order of messages.
 LINK_OPTIONS = ("cross_stage", "cross_sensitivity", "cross_damping", "friction", "laws", "form", "input_order")
 #: Stages of the arm by the end of a structure's name.
-STAGES: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both"}
+STAGES_BY_NAME: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both"}
 
 
 class MethodOptions:
@@ -190,7 +190,7 @@ class StructureOptions:
                 f"{', '.join(wrong)}: --structure {text} has its own; leave {'it' if len(wrong) == 1 else 'them'} out, "
                 "or use --structure flexible-link:1, :2 or :both"
             )
-        stage = STAGES.get(text.partition(":")[2] or "both")
+        stage = STAGES_BY_NAME.get(text.partition(":")[2] or "both")
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use arm:1, :2 or :both")
         built = link_structure(stage, both=not alone)
@@ -198,7 +198,7 @@ class StructureOptions:
         return built.with_orders({n: whole[1] for n in built.order_names if n.startswith(whole[0])})
 
     def _flexible_link(self, text: str) -> Structure:
-        stage = STAGES.get(text.partition(":")[2])
+        stage = STAGES_BY_NAME.get(text.partition(":")[2])
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
         if self.filtered_signals or self.sensor_filter not in (None, "stock"):

@@ -245,6 +245,7 @@ ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 MOTOR_INPUTS = ("I1", "I2")
 
 
+@check_arguments
 class JointControllers:
     """Pair of controllers for both joints of the rig, which computes motor currents from angles and references.
 
@@ -263,7 +264,6 @@ class JointControllers:
         or if the sampling rates differ.
     """
 
-    @check_arguments
     def __init__(self, first: DiscretePid | Lqg | None, second: DiscretePid | Lqg | None = None) -> None:
         self.loops = (first, second)
         self._reads: list[list[int]] = []
@@ -302,7 +302,6 @@ class JointControllers:
         """Return both controllers as a dictionary for JSON."""
         return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
 
-    @check_arguments
     def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
         """Return the currents (joint 1, joint 2) [A] for measured angles and references [rad] at a time [s]."""
         angles, reference = as_floats("angles", angles), as_floats("reference", reference)

@@ -77,7 +77,6 @@ class FractionalPid:
                 raise ModelError(f"{name} = {value:g} is not an order of a fractional PID; give one above 0, at most 2")
             object.__setattr__(self, name, value)
 
-    @check_arguments
     def response(self, w: Floats | Complex) -> Complex:
         """Return the exact complex frequency response at positive frequencies [rad/s]."""
         s = 1j * as_complex("w", w)
@@ -109,6 +108,7 @@ class _Bank:
         return np.asarray(self.direct + lags @ self.weights)
 
 
+@check_arguments
 class DiscretePid:
     """Discrete-time fractional PID controller: Oustaloup's approximation as a sum of first-order lags.
 
@@ -134,7 +134,6 @@ class DiscretePid:
         If an order of the PID is above 1, gains overflow, or rate, limit, band or order is invalid.
     """
 
-    @check_arguments
     def __init__(
         self,
         pid: FractionalPid,
@@ -204,7 +203,6 @@ class DiscretePid:
             for k, n, b, w in zip(bank.keeps, bank.now, bank.before, bank.weights, strict=True)
         ]
 
-    @check_arguments
     def response(self, w: Floats | Complex) -> Complex:
         """Return the frequency response of the discrete-time controller at w [rad/s], without saturation."""
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
@@ -216,7 +214,6 @@ class DiscretePid:
         self._lags: Floats | None = None
         self._error = 0.0
 
-    @check_arguments
     def __call__(self, error: float) -> float:
         """Return the controller output for the control error of the next sample."""
         error = float(error)
@@ -324,6 +321,7 @@ LAST_CROSSOVER_TOLERANCE = 1.01
 GAIN_VARIATIONS = (0.7, 1.4)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class PidDesign(LoopDesign):
     """Result of :func:`fractional_pid`: the controller and the stability margins of its loop.
@@ -351,7 +349,6 @@ class PidDesign(LoopDesign):
     flat: tuple[float, float, float]
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
-    @check_arguments
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return measured outputs, and responses of the command to them and to the reference at w [rad/s]."""
         response = DiscretePid(self.pid, self.rate).response(w)

@@ -31,6 +31,7 @@ POLE_RANGE_RAD_S = (1e-12, 1e12)
 INTERVAL_GRID_POINTS = 9
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Shaper:
     """Input shaper: a sequence of impulses with sum 1 that causes no residual vibration of given modes.
@@ -59,7 +60,6 @@ class Shaper:
         """Delay by which the shaper extends a reference [s]."""
         return self.times[-1]
 
-    @check_arguments
     def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
         """Return the residual vibration of a mode after a shaped step, relative to that after an unshaped step.
 
@@ -72,7 +72,6 @@ class Shaper:
         """
         return residual_vibration(np.array(self.times), np.array(self.amplitudes), frequency, damping)
 
-    @check_arguments
     def impulses(self, rate: float) -> Floats:
         """Return the impulses at a sampling rate [Hz], shape (N,), with sum 1 and exact zeros at the poles.
 
@@ -102,7 +101,6 @@ class Shaper:
                 taps = _convolve(np.append(taps, np.zeros(len(part) - 1)), part)
         return taps
 
-    @check_arguments
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
         """Return a reference filtered by the shaper at a sampling rate [Hz]; its length does not change.
 

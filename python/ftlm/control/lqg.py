@@ -27,6 +27,7 @@ from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, check_
 UNKNOWN_INPUT = "unknown input"
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Observer:
     """Kalman filter of a discrete-time model with an unknown input disturbance.
@@ -68,7 +69,6 @@ class Observer:
         whole[:size, :size], whole[:size, size:] = a, b
         return whole, np.vstack([b, [[0.0]]]), np.column_stack([self.rows, np.zeros(len(self.rows))])
 
-    @check_arguments
     def over(self, run: Run) -> dict[str, Floats]:
         """Return estimates of every output and of the input disturbance for a run, from past and present samples.
 
@@ -108,7 +108,6 @@ class Observer:
         estimates = self.realisation.c @ states[:-1]
         return dict(zip(self.realisation.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: states[-1]}
 
-    @check_arguments
     def rest(self, measured: Floats) -> Floats:
         """Return the equilibrium state at measured values, if the first output has an integrator; otherwise 0."""
         states = np.zeros(self.realisation.states)
@@ -258,6 +257,7 @@ CURVE_POINTS, BAND_EXTENSION = 2500, 1e-2
 INTEGRATOR_TOLERANCE = 1e-7
 
 
+@check_arguments
 class Lqg:
     """Discrete-time LQG controller: an observer and a state feedback.
 
@@ -282,7 +282,6 @@ class Lqg:
         equilibrium. When called, if the command is not finite.
     """
 
-    @check_arguments
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
         self.observer, self.tracked, self.limit = observer, tracked, check_limit(limit)
         realisation = observer.realisation
@@ -315,7 +314,6 @@ class Lqg:
         self._states: Floats | None = None
         self._applied = 0.0
 
-    @check_arguments
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
         """Return the command for the measured outputs of a sample, in the observer's order, and a reference."""
         y = _measured_values(self.observer, measured)
@@ -330,7 +328,6 @@ class Lqg:
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
-    @check_arguments
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
         """Return frequency responses of the command to the measured outputs, (measured, W), and the reference, (W,)."""
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
@@ -376,6 +373,7 @@ class Lqg:
         )
 
 
+@check_arguments
 @dataclass(frozen=True)
 class LqgDesign(LoopDesign):
     """Result of :func:`lqg`: the controller, and the stability margins of its loop with the exact model.
@@ -405,13 +403,11 @@ class LqgDesign(LoopDesign):
         """Sampling rate [Hz]."""
         return self.realisation.rate
 
-    @check_arguments
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return measured outputs, and responses of the command to each and to the reference at w [rad/s]."""
         heard, reference_response = self.controller.response(w)
         return self.controller.observer.measured, -heard, reference_response
 
-    @check_arguments
     def with_limit(self, limit: float) -> Lqg:
         """Return the controller with another maximum magnitude of its command."""
         return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)

@@ -41,6 +41,7 @@ MIN_POLES, MAX_POLES = 2, 30
 COARSE_DB, COARSE_DEGREES = 1.0, 6.0
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Realisation:
     """Integer-order state-space realization of a model from one input, in continuous and discrete time.
@@ -77,7 +78,6 @@ class Realisation:
         """Number of states."""
         return len(self.a)
 
-    @check_arguments
     def response(self, w: Floats) -> Complex:
         """Return the frequency response of the samples to a zero-order-hold input at w [rad/s], shape (outputs, W)."""
         z = np.exp(1j * check_vector("w", as_floats("w", w)) / self.rate)

@@ -87,7 +87,6 @@ class FrequencyData:
             object.__setattr__(self, "deviation", _read_only_copy(deviation))
 
     @classmethod
-    @check_arguments
     def from_arrays(
         cls,
         frequency: ArrayLike,
@@ -137,7 +136,6 @@ class FrequencyData:
         out[order] = np.degrees(np.unwrap(np.angle(self.response[order])))
         return out
 
-    @check_arguments
     def slice(self, low: float | None = None, high: float | None = None) -> FrequencyData:
         """Return the data between two angular frequencies, both included.
 

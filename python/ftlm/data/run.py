@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from ftlm.validation.data_advice import Advice, Inspection
 
 
+@check_arguments
 @dataclass(eq=False, repr=False, init=False)
 class Run:
     """One measured experiment: regular samples of named inputs and outputs in SI units.
@@ -120,7 +121,6 @@ class Run:
         return run
 
     @classmethod
-    @check_arguments
     def from_arrays(
         cls,
         *,
@@ -199,7 +199,6 @@ class Run:
         return cls._from_checked(**arguments.checked_fields())
 
     @classmethod
-    @check_arguments
     def from_frame(
         cls,
         frame: object,
@@ -331,7 +330,6 @@ class Run:
         """Metadata of the run, such as name, seed, input, parameters and faults of a rig. The dictionary is a copy."""
         return copy.deepcopy(self._metadata)
 
-    @check_arguments
     def __getitem__(self, name: str) -> Floats:
         """Return the samples of a signal in SI units, shape (N,), read-only; raise DataError for an unknown name."""
         try:
@@ -339,7 +337,6 @@ class Run:
         except (KeyError, TypeError):
             raise self._unknown_signal_error(name) from None
 
-    @check_arguments
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and name in self.signals
 
@@ -366,7 +363,6 @@ class Run:
             f"<tbody>{rows}</tbody></table>" + (f"<ul>{warnings}</ul>" if warnings else "")
         )
 
-    @check_arguments
     def window(self, start: float | None, stop: float | None) -> Run:
         """Return the rows with start ≤ t < stop.
 
@@ -397,7 +393,6 @@ class Run:
             readings = readings.cut_window(self._intersample, first * self.step, (last - 1) * self.step, self.step)
         return self._with(_data=data, start=begin, sample_times=readings)
 
-    @check_arguments
     def split(self, duration: float) -> list[Run]:
         """Return consecutive runs that together have all rows, with equal lengths up to one row.
 
@@ -426,7 +421,6 @@ class Run:
         pieces = (self.window(float(a), float(b)) for a, b in itertools.pairwise(ends))
         return [p._with(name=f"{self.name} piece {k} of {count}", notes=()) for k, p in enumerate(pieces, 1)]
 
-    @check_arguments
     def resample(self, step: float) -> Run:
         """Return this run resampled to another step.
 
@@ -459,7 +453,6 @@ class Run:
         fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
         return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=readings)
 
-    @check_arguments
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run with the mean or the least-squares line of some signals subtracted.
 
@@ -497,7 +490,6 @@ class Run:
             facts.append(f"detrended: {words} subtracted from {name}")
         return self._with(_data=data, notes=tuple(facts), sample_times=readings)
 
-    @check_arguments
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
         """Return this run with known saturations and dead zones applied to its inputs."""
         data, readings = dict(self._data), self.sample_times
@@ -507,7 +499,6 @@ class Run:
                 readings = readings.replace_signals(**{limit.signal: limit.apply(readings.data[limit.signal])})
         return self._with(_data=data, sample_times=readings)
 
-    @check_arguments
     def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
         """Return this run with new samples of some of its signals.
 
@@ -546,7 +537,6 @@ class Run:
             check_values(checked[name], what, 0, gaps=gaps)
         return checked
 
-    @check_arguments
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.
 
@@ -586,7 +576,6 @@ class Run:
             ),
         )
 
-    @check_arguments
     def with_intersample(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with another intersample behavior of some inputs.
 
@@ -608,7 +597,6 @@ class Run:
         data = self._data if self.sample_times is None else self.sample_times.resample(behaviour, self.step)
         return self._with(_intersample=behaviour, _data={n: v[: self.length] for n, v in data.items()})
 
-    @check_arguments
     def with_outputs(self, values: Mapping[str, Floats]) -> Run:
         """Return this run with additional or replaced outputs.
 
@@ -645,7 +633,6 @@ class Run:
             sample_times=readings,
         )
 
-    @check_arguments
     def select(self, names: Iterable[str]) -> Run:
         """Return this run with only some of its signals.
 
@@ -673,7 +660,6 @@ class Run:
         inputs = tuple(name for name in signals if name in self.inputs)
         return self._with(inputs=inputs, outputs=outputs)
 
-    @check_arguments
     def require_outputs(self, names: Iterable[str]) -> None:
         """Raise DataError unless every name is an output of this run that is not constant.
 
@@ -720,7 +706,6 @@ class Run:
 
         return run_charts(self, *signals)
 
-    @check_arguments
     def advice(self, structure: Structure | None = None) -> Advice:
         """Check this run for faults and poor excitation before estimation, and return the findings.
 
@@ -755,7 +740,6 @@ class Run:
 
         return inspect_run(self)
 
-    @check_arguments
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a csv file that `ftlm.load` reads back bit for bit, without `inputs` and `outputs`.
 
@@ -780,7 +764,6 @@ class Run:
 
         write_csv(self, path, force=force)
 
-    @check_arguments
     def to_parquet(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a parquet file that `ftlm.load` reads back bit for bit; requires pyarrow.
 

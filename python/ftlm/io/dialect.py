@@ -109,7 +109,6 @@ class Layout:
             raise DataError(f"{layout_fields('sheet')} is a {type(self.sheet).__name__}; give the name of a sheet")
 
     @classmethod
-    @check_arguments
     def of(cls, layout: object) -> Layout:
         """Return the layout that an argument denotes: None, a layout, or a mapping of its fields."""
         if layout is None:
@@ -129,7 +128,6 @@ class Layout:
                 )
         return cls(**layout)
 
-    @check_arguments
     def under(self, other: Layout) -> Layout:
         """Return the merged options of two layouts; those of the other layout take precedence."""
         return replace(self, **other.to_dict())
@@ -138,7 +136,6 @@ class Layout:
         """Return the options that are set, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
-    @check_arguments
     def check_used(self, path: str, kind: str, names: tuple[str, ...]) -> None:
         """Raise DataError if an option is set that a file format does not use.
 

@@ -215,12 +215,10 @@ class Circuit:
         """Names of the parameters without a known value."""
         return tuple(n for n in self.names if n not in self.values)
 
-    @check_arguments
     def with_values(self, values: Mapping[str, float]) -> Circuit:
         """Return the circuit with further known parameter values."""
         return replace(self, values={**self.values, **values})
 
-    @check_arguments
     def impedance(self, w: ArrayLike) -> Complex:
         """Return the complex impedance [Ω] at positive angular frequencies [rad/s]; all parameters must have values."""
         return impedance_and_derivatives(self, as_floats("w", w), {})[0]

@@ -70,12 +70,10 @@ class Term:
         """Value of factor * coefficient; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
-    @check_arguments
     def as_text(self, signal: str) -> str:
         """Return the term as text, with the given text in place of its signal."""
         return self.format({self.signal: signal})
 
-    @check_arguments
     def format(self, inputs: Mapping[str, str]) -> str:
         """Return the term as text; ``inputs`` maps an input to its text with delay and nonlinearity."""
         if isinstance(self.coefficient, str):
@@ -85,7 +83,6 @@ class Term:
             text = f"{self.factor * self.coefficient!r} "
         return text + self.format_operand(inputs)
 
-    @check_arguments
     def format_operand(self, inputs: Mapping[str, str]) -> str:
         """Return the derivative of the signal or expression as text, without the coefficient."""
         shape = self.nonlinear
@@ -161,7 +158,6 @@ class Stribeck:
         """Stiction minus Coulomb friction [unit of D^alpha y]; None if the coefficient is free."""
         return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
 
-    @check_arguments
     def as_text(self, output: str) -> str:
         """Return the Stribeck term of an output as text."""
         speed = self.speed if isinstance(self.speed, str) else f"{self.speed!r}"
@@ -228,7 +224,6 @@ class Friction:
             pairs += [(more.name, more.coefficient), (more.speed_name, more.speed)]
         return {name: float(value) for name, value in pairs if name is not None}
 
-    @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
         """Return the friction with some free parameters fixed to values; the others stay free."""
         fixed = _fix_parameter(self, values)
@@ -236,7 +231,6 @@ class Friction:
             return fixed
         return replace(fixed, more=_fix_parameter(_fix_parameter(self.stribeck, values), values, "speed", "speed_name"))
 
-    @check_arguments
     def as_text(self, output: str) -> str:
         """Return the friction terms of an output as text."""
         near = "" if self.stribeck is None else f" {self.stribeck.as_text(output)}"
@@ -373,7 +367,6 @@ class Equation:
                 f"'- fc*tanh(100 {self.output})', or choose another order"
             )
 
-    @check_arguments
     def check_input_orders(self, outputs: Sequence[str]) -> None:
         """Raise ModelError if the order of an input is not below alpha, so that the output jumps with the input.
 
@@ -423,7 +416,6 @@ class Equation:
         friction = () if self.friction is None else self.friction.names
         return (*(t.coefficient for t in self.terms if isinstance(t.coefficient, str)), *friction)
 
-    @check_arguments
     def with_orders(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with some free orders fixed to values; the others stay free.
 
@@ -435,7 +427,6 @@ class Equation:
         terms = tuple(replace(t, order=t.order.substitute(values)) for t in self.terms)
         return Equation(self.output, self.order.substitute(values), terms, self.coulomb)
 
-    @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with some free coefficients fixed to values; the others stay free.
 
@@ -453,7 +444,6 @@ class Equation:
         """Whether all orders and coefficients are fixed."""
         return not self.order_names and not self.coefficient_names
 
-    @check_arguments
     def as_text(self, inputs: Mapping[str, str]) -> str:
         """Return the equation as text; ``inputs`` maps an input to its text with delay and nonlinearity."""
         right = " + ".join(t.format(inputs) for t in self.terms).replace("+ -", "- ")

@@ -74,7 +74,6 @@ class Expression:
             self.operation == "add" and all(argument.is_linear for argument in self.arguments)
         )
 
-    @check_arguments
     def program(self, channel_index: Mapping[Channel, int]) -> list[tuple[str, float]]:
         """Return the expression as postfix instructions for the core; ``channel_index`` numbers the channels.
 
@@ -95,7 +94,6 @@ class Expression:
             out.append((self.operation, self.value if self.operation == "power" else 0.0))
         return out
 
-    @check_arguments
     def evaluate(self, values: Mapping[Channel, Floats | float]) -> Any:
         """Return the values of the expression from numbers or arrays of its channels.
 
@@ -124,7 +122,6 @@ class Expression:
     def _exponent(self) -> float | int:
         return int(self.value) if self.value.is_integer() else self.value
 
-    @check_arguments
     def gradient(self, values: Mapping[Channel, Floats | float]) -> dict[Channel, Any]:
         """Return the partial derivatives with respect to the channels, by channel; the derivative of abs at 0 is 0."""
         samples = {c: np.asarray(v, dtype=np.float64) for c, v in values.items()}
@@ -160,7 +157,6 @@ class Expression:
             return self.arguments[0].value, multiply(*self.arguments[1:])
         return 1.0, self
 
-    @check_arguments
     def as_text(self, signals: Mapping[str, str] | None = None) -> str:
         """Return the expression as text; ``signals`` maps an input to its text with delay and nonlinearity."""
         texts = signals or {}

@@ -44,14 +44,12 @@ class Order:
     constant: float = 0.0
     weights: tuple[tuple[str, float], ...] = ()
 
-    @check_arguments
     def substitute(self, values: Mapping[str, float]) -> Order:
         """Return the order with values in place of some free orders; the others stay free."""
         constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
         return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in self.weights if n not in values))
 
     @classmethod
-    @check_arguments
     def parse(cls, text: str | float) -> Order:
         """Return the order that a number or text denotes.
 
@@ -90,7 +88,6 @@ class Order:
         """Whether the order is a single free order."""
         return self.constant == 0 and len(self.weights) == 1 and self.weights[0][1] == 1
 
-    @check_arguments
     def at(self, values: Mapping[str, float]) -> float:
         """Return the value of the order at given values of the free orders, rounded to 1e-9.
 

@@ -283,7 +283,6 @@ class Structure:
         followed = self.outputs if self.coupling == "simulated" or self.has_friction else ()
         return any(s not in followed and self.is_filtered(s) for s in self.signals)
 
-    @check_arguments
     def filter_states(self, initial: Initial) -> int:
         """Return the number of unknown initial states of the sensor filter for given initial terms.
 
@@ -309,12 +308,10 @@ class Structure:
             )
         return sensor.relative_degree
 
-    @check_arguments
     def has_filter_transient(self, output: str) -> bool:
         """Whether an output may contain a transient from the initial state of the sensor filter."""
         return self.all_filtered or self.is_filtered(output)
 
-    @check_arguments
     def is_filtered(self, signal: str) -> bool:
         """Whether a signal was measured through the sensor filter."""
         return self.sensor_filter is not None and signal in self.sensor_filter.signals
@@ -383,7 +380,6 @@ class Structure:
             name=f"{self.name}, {', '.join(e.output for e in equations)}",
         )
 
-    @check_arguments
     def equation(self, output: str) -> Structure:
         """Return one equation as a separate structure, with measured coupling and without order laws.
 
@@ -411,7 +407,6 @@ class Structure:
         single = replace(own, terms=tuple(free_order(k, t) for k, t in enumerate(own.terms)))
         return self._of((single,), "measured")
 
-    @check_arguments
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
         """Return the structure with orders fixed (a number) or with grid values; see :func:`parse_values`.
 
@@ -432,7 +427,6 @@ class Structure:
         equations = tuple(e.with_orders(numbers) for e in self.equations)
         return replace(self, equations=equations, order_values={n: v for n, v in lattices.items() if n not in numbers})
 
-    @check_arguments
     def with_coefficients(self, values: Mapping[str, float]) -> Structure:
         """Return the structure with some free coefficients fixed to values.
 
@@ -444,7 +438,6 @@ class Structure:
         check_known("coefficient", values, self.coefficient_names)
         return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
 
-    @check_arguments
     def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
         """Return the structure with delays of inputs [s]: a number fixes one, (lower, upper) are bounds of an estimate.
 
@@ -467,7 +460,6 @@ class Structure:
                 fixed[name] = delay
         return replace(self, delay=fixed, free_delays=free)
 
-    @check_arguments
     def with_limits(
         self, *, saturation: Mapping[str, Value] | None = None, dead_zone: Mapping[str, Value] | None = None
     ) -> Structure:
@@ -501,7 +493,6 @@ class Structure:
         late = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
         return tuple([*late, *(limit.free for limit in self.limits if limit.free is not None)])
 
-    @check_arguments
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
         """Return the structure with delays and limits fixed to values by name, such as ``delay_u`` and ``sat_u``."""
         names = {n: input_name("delay", n) for n in self.free_delays}
@@ -517,7 +508,6 @@ class Structure:
         fixed_limits = [limit for limit in self.limits if limit.free is None]
         return replace(self, free_delays={}, input_nonlinearities=_or_unset(fixed_limits))
 
-    @check_arguments
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
         """Return text of inputs with a delay or nonlinearity by name, such as ``sat(u(t - 0.035 s), 0.94)``."""
         known = {n: f"{'+' if d < 0 else '-'} {_format(abs(d), digits)}" for n, d in self.delay.items() if d}
@@ -531,7 +521,6 @@ class Structure:
         inputs = self.describe_inputs()
         return "\n".join(f"{e.as_text(inputs)}{self.offset_in_words}" for e in self.equations)
 
-    @check_arguments
     def equation_text(self, item: Equation) -> str:
         """Return an identified equation as text, with delays, nonlinearities and offset."""
         return format_equation(item, self.describe_inputs(".6g")) + self.offset_in_words

@@ -27,6 +27,8 @@ _PACKAGE_FOLDERS = ("site-packages", "dist-packages")
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
+#: Operators whose arguments are checked as those of public methods are.
+_CHECKED_OPERATORS = ("__call__", "__contains__", "__getitem__")
 #: Types that stand for a list, also of another kind.
 _LIST_TYPES = (Sequence, Iterable, Collection, tuple, list)
 #: Names of types in messages.
@@ -50,13 +52,21 @@ _MAX_NUMBER = 2.0**62
 
 
 def check_arguments(decorated: Decorated) -> Decorated:
-    """Decorate a function or a class such that an exception caused by a wrong argument becomes a ModelError.
+    """Decorate a function such that an exception caused by a wrong argument becomes a ModelError.
 
-    The arguments are compared with their annotations only after a call has failed, so successful calls take no
-    additional time. Errors of ftlm itself are not changed. A range with too many values is rejected before the call.
+    Of a class, the public methods and the operators in `_CHECKED_OPERATORS` are decorated. The arguments are compared
+    with their annotations only after a call has failed, so successful calls take no additional time. Errors of ftlm
+    itself are not changed. A range with too many values is rejected before the call.
     """
     if inspect.isclass(decorated):
         type.__setattr__(decorated, "__init__", check_arguments(decorated.__init__))
+        for name, member in list(vars(decorated).items()):
+            if name.startswith("_") and name not in _CHECKED_OPERATORS:
+                continue
+            if inspect.isfunction(member):
+                type.__setattr__(decorated, name, check_arguments(member))
+            elif isinstance(member, classmethod):
+                type.__setattr__(decorated, name, classmethod(check_arguments(member.__func__)))
         return decorated
 
     @functools.wraps(decorated)
@@ -120,7 +130,11 @@ def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, erro
     names = _Names(getattr(inspect.unwrap(function), "__globals__", {}))
     for name, value in bound.arguments.items():
         annotation = _annotation(signature.parameters[name].annotation, names)
-        if not _fits(value, annotation):
+        is_single = signature.parameters[name].kind not in (
+            inspect.Parameter.VAR_POSITIONAL,
+            inspect.Parameter.VAR_KEYWORD,
+        )
+        if is_single and not _fits(value, annotation):
             words = " or ".join(dict.fromkeys(_describe_type(kind) for kind in _alternatives(annotation)))
             raise ModelError(
                 f"{setting(name)} {short_repr(value)} is a {type(value).__name__}; give {words}"
