@@ -49,8 +49,8 @@ PLACEBO_COUNT, PLACEBO_RATIO = 19, 1.2
 PLACEBO_RATIO_IN_DOUBT = 10.0
 #: Number of parts of the run that must agree, and smallest agreement of a part relative to the median part.
 STEADY_PARTS, STEADY_SHARE = 8, 0.05
-#: Rows of the short blocks whose color and dependence on the past are tested.
-LOCAL_ROWS = 50
+#: Rows of the short blocks whose color and dependence on the past are tested, and lags of the test of color.
+LOCAL_ROWS, LOCAL_LAGS = 50, 4
 #: Maximum number of spectral lines of an input, their ratio to the neighborhood, and its number of bins.
 MAX_LINES, LINE_RATIO, LINE_NEIGHBORS = 16, 40.0, 400
 #: Weight of the newest residual in their low-pass part, which an integral action feeds back, and its length in rows.
@@ -250,14 +250,20 @@ def _line_regressors(u: Floats) -> list[Floats]:
     return columns
 
 
+def _ridge_gram(weighted: Floats, past: Floats) -> Floats:
+    """Return the normal matrix of a weighted regression on the past, with a small ridge."""
+    gram: Floats = weighted.T @ past
+    gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
+    return gram
+
+
 def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
     """Return the residual of a weighted ridge regression of the targets on the past.
 
     The ridge is small, and one refinement step corrects it.
     """
     weighted = past if weights is None else past * weights[:, None]
-    gram = weighted.T @ past
-    gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
+    gram = _ridge_gram(weighted, past)
     factor = np.linalg.cholesky(gram)
     for _ in range(2):
         targets = targets - past @ np.linalg.solve(factor.T, np.linalg.solve(factor, weighted.T @ targets))
@@ -274,7 +280,17 @@ def _score_ratio(innovation: Floats, columns: Floats) -> float:
     return float(score @ np.linalg.solve(spread, score)) / limit
 
 
-def _local_color(w: Floats, lags: int = 4) -> float:
+def _largest_score_ratio(innovation: Floats, columns: Floats) -> tuple[float, Floats]:
+    """Return the largest :func:`_score_ratio` over the sets of regressors, and the columns of its set."""
+    sizes = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(sizes > 0, sizes, 1.0)
+    sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
+    ratios = [_score_ratio(innovation, own) for own in sets]
+    best = int(np.argmax(ratios))
+    return ratios[best], sets[best]
+
+
+def _local_color(w: Floats) -> float:
     """Return the mean squared autocorrelation over short blocks, divided by its limit for white noise."""
     count = w.size // LOCAL_ROWS
     if count < 4:
@@ -282,8 +298,8 @@ def _local_color(w: Floats, lags: int = 4) -> float:
     x = w[: count * LOCAL_ROWS].reshape(count, LOCAL_ROWS)
     power = np.sum(x * x, axis=1)
     power = np.where(power > 0, power, np.inf)
-    r = np.array([np.sum(x[:, k:] * x[:, :-k], axis=1) / power for k in range(1, lags + 1)])
-    return float(np.mean(LOCAL_ROWS * r * r)) / (1 + max(0.5, 4 * math.sqrt(2 / (lags * count))))
+    r = np.array([np.sum(x[:, k:] * x[:, :-k], axis=1) / power for k in range(1, LOCAL_LAGS + 1)])
+    return float(np.mean(LOCAL_ROWS * r * r)) / (1 + max(0.5, 4 * math.sqrt(2 / (LOCAL_LAGS * count))))
 
 
 def _local_past(w: Floats, past: Floats) -> float:
@@ -393,12 +409,7 @@ class _Innovations:
         rows = self._rows(offset)
         # Through the same weights, so that the score is orthogonal to what was estimated.
         columns = _project_out(self.past[rows], self._regressors(rows, offset), self.weights[rows])
-        sizes = np.linalg.norm(columns, axis=0)
-        columns = columns / np.where(sizes > 0, sizes, 1.0)
-        sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
-        ratios = [_score_ratio(clipped[rows], columns) for columns in sets]
-        best = int(np.argmax(ratios))
-        return ratios[best], sets[best], rows
+        return *_largest_score_ratio(clipped[rows], columns), rows
 
     def test(self) -> FeedbackTest:
         """Return the result of the feedback test, after checks that the innovation is suitable."""
@@ -488,10 +499,7 @@ class _Innovations:
             w = np.clip(w / max(robust_deviation(w), 1e-300), -INPUT_CLIP, INPUT_CLIP)
             w = w - w.mean()
             remainder = columns - past @ (inverse @ from_columns)
-            sizes = np.linalg.norm(remainder, axis=0)
-            remainder = remainder / np.where(sizes > 0, sizes, 1.0)
-            sets = [remainder[:, :1], remainder[:, :3], *(remainder[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
-            least = min(least, max(_score_ratio(w, columns_of_set) for columns_of_set in sets))
+            least = min(least, _largest_score_ratio(w, remainder)[0])
         return least
 
     def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
@@ -506,9 +514,7 @@ class _Innovations:
         innovations = np.zeros(self.inputs.size)
         innovations[rows] = columns @ minimum_norm_solution(columns, self.innovation[rows], 1e-12)
         weighted = self.past * self.weights[:, None]
-        gram = weighted.T @ self.past
-        gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
-        law = np.linalg.solve(gram, weighted.T @ self.inputs)[: self.input_lags]
+        law = np.linalg.solve(_ridge_gram(weighted, self.past), weighted.T @ self.inputs)[: self.input_lags]
         out = []
         for first, last in self.places:
             x = np.concatenate([np.zeros(self.start), innovations[first:last]])
