@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -299,17 +299,9 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
             f"{parameter('method', 'output-error')}, and without a term whose interval is infinite"
         )
     centre = frequency_response(model, w, coupling=coupling)
-    values = parameter_vector(model)
-    derivative = np.zeros((values.size, *centre.shape), dtype=np.complex128)
-    for k, value in enumerate(values):
-        step = DERIVATIVE_STEP_RATIO * max(abs(value), 1e-3)
-        if not np.any(matrix[k]):
-            continue
-        above, below = values.copy(), values.copy()
-        above[k], below[k] = value + step, value - step
-        higher, lower = (
-            frequency_response(with_parameter_vector(model, v), w, coupling=coupling) for v in (above, below)
-        )
+    derivative = np.zeros((len(matrix), *centre.shape), dtype=np.complex128)
+    for k, step, above, below in shifted_models(model, np.any(matrix != 0, axis=1), DERIVATIVE_STEP_RATIO):
+        higher, lower = (frequency_response(shifted, w, coupling=coupling) for shifted in (above, below))
         with np.errstate(divide="ignore", invalid="ignore"):
             derivative[k] = (higher - lower) / (2 * step) / centre
     variances = [np.einsum("i...,ij,j...->...", part, matrix, part) for part in (derivative.real, derivative.imag)]
@@ -347,6 +339,18 @@ def with_parameter_vector(model: Model, numbers: Floats) -> Model:
         ]
         equations.append(_replace_unchecked(item, alpha, tuple(terms)))
     return replace(model, structure=replace(model.structure, equations=tuple(equations)))
+
+
+def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Iterator[tuple[int, float, Model, Model]]:
+    """Yield index, step, and the models one step above and below, for each parameter of :func:`parameter_vector`.
+
+    Only the parameters in the mask `varied` are shifted. `ratio` is the step relative to the parameter.
+    """
+    values = parameter_vector(model)
+    for k in np.flatnonzero(varied).tolist():
+        step = ratio * max(abs(float(values[k])), 1e-3)
+        shift = step * np.eye(values.size)[k]
+        yield k, step, with_parameter_vector(model, values + shift), with_parameter_vector(model, values - shift)
 
 
 def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:

@@ -20,10 +20,9 @@ from ftlm.analysis.frequency_response import (
     determinant,
     equation_polynomials,
     is_coupled,
-    parameter_vector,
     response_inputs,
+    shifted_models,
     transfer_functions,
-    with_parameter_vector,
 )
 from ftlm.errors import ModelError
 from ftlm.model.model import Model, check_model
@@ -587,25 +586,21 @@ def _standard_deviations(
     matrix = covariance_of(model)
     if matrix is None or not zeros.size:
         return [None] * zeros.size
-    values = parameter_vector(model)
-    slopes = np.zeros((values.size, zeros.size), dtype=np.complex128)
-
+    slopes = np.zeros((len(matrix), zeros.size), dtype=np.complex128)
     own = characteristic(model, coupled=coupled)[at]
     _, unit = _terms(zeros, np.array(list(own)), np.array(list(own.values())))
 
-    def value(numbers: Floats) -> tuple[Complex, Complex]:
+    def value(shifted: Model) -> tuple[Complex, Complex]:
         """Return D and dD / d ln s at the zeros, divided by the largest term of the model."""
-        polynomial = characteristic(with_parameter_vector(model, numbers), coupled=coupled)[at]
+        polynomial = characteristic(shifted, coupled=coupled)[at]
         powers = np.array(list(polynomial))
         terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
         scale = np.exp(level - unit)
         return np.sum(terms, axis=0) * scale, np.sum(powers[:, None] * terms, axis=0) * scale
 
-    _, slope = value(values)
-    for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
-        step = POLE_DERIVATIVE_STEP_RATIO * max(abs(values[k]), 1e-3)
-        shift = step * np.eye(values.size)[k]
-        (above, _), (below, _) = value(values + shift), value(values - shift)
+    _, slope = value(model)
+    for k, step, *models in shifted_models(model, np.any(matrix != 0, axis=1), POLE_DERIVATIVE_STEP_RATIO):
+        (above, _), (below, _) = map(value, models)
         with np.errstate(divide="ignore", invalid="ignore"):
             slopes[k] = -(above - below) / (2 * step) / slope
     with np.errstate(invalid="ignore"):
@@ -665,12 +660,9 @@ def steady_states(model: Model) -> tuple[SteadyState, ...]:
     matrix = covariance_of(model)
     errors: dict[tuple[str, str], tuple[float, float]] = {}
     if matrix is not None:
-        values = parameter_vector(model)
-        slopes = {pair: np.zeros((2, values.size)) for pair in pairs}
-        for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
-            step = POLE_DERIVATIVE_STEP_RATIO * max(abs(values[k]), 1e-3)
-            shift = step * np.eye(values.size)[k]
-            above, below = (_final_values(with_parameter_vector(model, values + side)) for side in (shift, -shift))
+        slopes = {pair: np.zeros((2, len(matrix))) for pair in pairs}
+        for k, step, *models in shifted_models(model, np.any(matrix != 0, axis=1), POLE_DERIVATIVE_STEP_RATIO):
+            above, below = map(_final_values, models)
             for pair, slope in slopes.items():
                 slope[:, k] = np.subtract(above[pair], below[pair]) / (2 * step)
         for pair, (turn, slope) in slopes.items():

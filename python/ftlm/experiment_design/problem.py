@@ -141,17 +141,9 @@ class Bounds:
 
         ``commands`` and ``outputs`` have one row per input and per output, in the order of the limits.
         """
-        return min(
-            1.0,
-            *(
-                limit / float(np.max(np.abs(row), initial=0.0)) if np.any(row) else 1.0
-                for limit, row in zip(self.output_limits.values(), outputs, strict=True)
-            ),
-            *(
-                limit / float(np.max(np.abs(row), initial=0.0)) if np.any(row) else 1.0
-                for limit, row in zip(self.peaks.values(), commands, strict=True)
-            ),
-        )
+        limits = [*self.output_limits.values(), *self.peaks.values()]
+        rows = zip(limits, [*outputs, *commands], strict=True)
+        return min([1.0, *(limit / float(np.max(np.abs(row))) for limit, row in rows if np.any(row))])
 
 
 def per_signal_values(

@@ -8,12 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ftlm.analysis.frequency_response import (
-    DERIVATIVE_STEP_RATIO,
-    frequency_response,
-    parameter_vector,
-    with_parameter_vector,
-)
+from ftlm.analysis.frequency_response import DERIVATIVE_STEP_RATIO, frequency_response, shifted_models
 from ftlm.experiment_design.problem import Bounds, Criterion, ModelFit
 from ftlm.model.model import Model
 from ftlm.utils.validation import Complex, Floats
@@ -114,7 +109,6 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
     own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
     orders, coefficients, _ = fit.problem.split(fit.values)
     chain = fit.problem.number_jacobian(orders, coefficients)
-    values = parameter_vector(own)
     # What drives an equation is measured, or follows with it.
     drives = (
         gains
@@ -123,16 +117,9 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
     )
     signals = fit.inputs if coupling == "simulated" else (*fit.outputs, *fit.inputs)
     slopes = np.zeros((*gains.shape, len(fit.names)), dtype=np.complex128)
-    for k, value in enumerate(values):
-        if not np.any(chain[k]):
-            continue
-        small = DERIVATIVE_STEP_RATIO * max(abs(value), 1e-3)
-        ends = []
-        for at in (value + small, value - small):
-            shifted = values.copy()
-            shifted[k] = at
-            ends.append(_output_responses(with_parameter_vector(own, shifted), w, coupling, drives, signals))
-        slopes += ((ends[0] - ends[1]) / (2 * small))[..., None] * chain[k]
+    for k, small, *models in shifted_models(own, np.any(chain != 0, axis=1), DERIVATIVE_STEP_RATIO):
+        above, below = (_output_responses(shifted, w, coupling, drives, signals) for shifted in models)
+        slopes += ((above - below) / (2 * small))[..., None] * chain[k]
     for place, item in enumerate(fit.problem.inputs, start=len(fit.names) - len(fit.problem.inputs)):
         at = fit.inputs.index(item.signal)
         slopes[:, at, :, place] = -1j * w * gains[:, at]
