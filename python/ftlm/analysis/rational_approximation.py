@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,83 +118,59 @@ def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floa
     return roots, residues, gain
 
 
-class _Builder:
-    """Builder of state-space matrices, to which filters and delays are added one at a time."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        self.a: list[dict[int, float]] = []
-        self.u: list[dict[int, float]] = []
-        self.y: list[dict[int, float]] = []
-        self.shape = (inputs, outputs)
-
-    def state(self, a: Mapping[int, float], u: Mapping[int, float], y: Mapping[int, float]) -> int:
-        self.a.append(dict(a))
-        self.u.append(dict(u))
-        self.y.append(dict(y))
-        return len(self.a) - 1
-
-    def matrices(self) -> tuple[Floats, Floats, Floats]:
-        inputs, outputs = self.shape
-        return _dense(self.a, len(self.a)), _dense(self.u, inputs), _dense(self.y, outputs)
+#: Signal inside the approximation: its coefficients, by kind and index of a state, an input or an output.
+_Signal = dict[tuple[Literal["state", "input", "output"], int], float]
 
 
-def _dense(rows: Sequence[Mapping[int, float]], width: int) -> Floats:
-    matrix = np.zeros((len(rows), width))
-    for i, row in enumerate(rows):
-        for j, value in row.items():
-            matrix[i, j] = value
-    return matrix
-
-
-#: Signal inside the approximation: its coefficients of states, inputs and outputs.
-_Signal = tuple[dict[int, float], dict[int, float], dict[int, float]]
-
-
-def _scale_signal(signal: _Signal, factor: float) -> _Signal:
-    x, u, y = ({i: factor * v for i, v in part.items()} for part in signal)
-    return x, u, y
-
-
-def _sum(signals: Iterable[_Signal]) -> _Signal:
-    total: _Signal = ({}, {}, {})
-    for signal in signals:
-        for into, part in zip(total, signal, strict=True):
-            for j, v in part.items():
-                into[j] = into.get(j, 0.0) + v
+def _sum(signals: Iterable[tuple[float, _Signal]]) -> _Signal:
+    """Return the sum of signals, each multiplied by a factor."""
+    total: _Signal = {}
+    for factor, signal in signals:
+        for source, value in signal.items():
+            total[source] = total.get(source, 0.0) + factor * value
     return total
 
 
-def _filter_signal(builder: _Builder, signal: _Signal, power: float, band: tuple[float, float], order: int) -> _Signal:
-    """Add Oustaloup's filter for s^power to a signal, one state per pole, and return the filtered signal."""
+def _dense(signals: Sequence[_Signal], kind: str, width: int) -> Floats:
+    """Return the coefficients of states, inputs or outputs in signals as a matrix with one row per signal."""
+    matrix = np.zeros((len(signals), width))
+    for i, signal in enumerate(signals):
+        for (source, j), value in signal.items():
+            if source == kind:
+                matrix[i, j] = value
+    return matrix
+
+
+def _filter_signal(
+    states: list[_Signal], signal: _Signal, power: float, band: tuple[float, float], order: int
+) -> _Signal:
+    """Add Oustaloup's filter for s^power to a signal, one state per pole, and return the filtered signal.
+
+    `states` are the derivatives of the states, to which those of the filter are appended.
+    """
     roots, residues, gain = oustaloup(power, band, order)
-    states, u, y = _scale_signal(signal, gain)
+    parts = [(gain, signal)]
     for pole, residue in zip(roots.tolist(), residues.tolist(), strict=True):
-        row, row_u, row_y = _scale_signal(signal, pole)
-        own = len(builder.a)
-        row[own] = row.get(own, 0.0) - pole
-        states[builder.state(row, row_u, row_y)] = residue / pole
-    return states, u, y
+        own: _Signal = {("state", len(states)): 1.0}
+        states.append(_sum([(pole, signal), (-pole, own)]))
+        parts.append((residue / pole, own))
+    return _sum(parts)
 
 
-def _delay_input(builder: _Builder, source: int, delay: float) -> _Signal:
+def _delay_input(states: list[_Signal], source: int, delay: float) -> _Signal:
     """Add Padé's approximation of a delay [s] to an input, in observer form, and return the delayed signal."""
     # Coefficients of sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k, x = -s tau above and + below.
     f, n = math.factorial, PADE_ORDER
     c = [f(2 * n - k) * f(n) / (f(2 * n) * f(k) * f(n - k)) for k in range(n + 1)]
-    below = [c[k] * delay**k / (c[PADE_ORDER] * delay**PADE_ORDER) for k in range(PADE_ORDER)]
-    direct = (-1.0) ** PADE_ORDER
-    above = [
-        (-1.0) ** k * c[k] * delay**k / (c[PADE_ORDER] * delay**PADE_ORDER) - direct * below[k]
-        for k in range(PADE_ORDER)
-    ]
-    first = len(builder.a)
-    last = first + PADE_ORDER - 1
-    for k in range(PADE_ORDER):
-        row = {last: -below[k]}
-        if k:
-            row[first + k - 1] = row.get(first + k - 1, 0.0) + 1.0
-        builder.state(row, {source: above[k]}, {})
-    return {last: 1.0}, {source: direct}, {}
+    below = [c[k] * delay**k / (c[n] * delay**n) for k in range(n)]
+    direct = (-1.0) ** n
+    above = [(-1.0) ** k * below[k] - direct * below[k] for k in range(n)]
+    first = len(states)
+    last = first + n - 1
+    for k in range(n):
+        before: _Signal = {("state", first + k - 1): 1.0} if k else {}
+        states.append(_sum([(1.0, {("state", last): -below[k]}), (1.0, before), (above[k], {("input", source): 1.0})]))
+    return {("state", last): 1.0, ("input", source): direct}
 
 
 @check_arguments
@@ -263,17 +239,17 @@ def state_space_matrices(
         Frequency band [rad/s] and order of the filters that approximate fractional orders.
     """
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
-    builder = _Builder(len(inputs), len(outputs))
-    sources: dict[str, _Signal] = {o: ({}, {}, {i: 1.0}) for i, o in enumerate(outputs)}
+    states: list[_Signal] = []
+    sources: dict[str, _Signal] = {o: {("output", i): 1.0} for i, o in enumerate(outputs)}
     for i, name in enumerate(inputs):
-        sources[name] = _delay_input(builder, i, delays[name]) if delays.get(name) else ({}, {i: 1.0}, {})
+        sources[name] = _delay_input(states, i, delays[name]) if delays.get(name) else {("input", i): 1.0}
     # D^alpha y = sum of c D^nu s becomes y = sum of c s^-ceil(eta) (filter for the rest) s. The integrators of an
     # equation form one chain that adds up what every term feeds in (observer form): none runs away by itself, and what
     # a model does at rest and far below the band stays exact.
     filters: dict[tuple[str, float], _Signal] = {}
     read: list[_Signal] = []
     for item in model.equations:
-        fed: dict[int, list[_Signal]] = {}
+        fed: dict[int, list[tuple[float, _Signal]]] = {}
         for term in item.terms:
             eta = round(item.order.constant - term.order.constant, 9)
             whole = math.ceil(eta)
@@ -285,17 +261,16 @@ def state_space_matrices(
             key = (term.signal, round(whole - eta, 9))
             if key not in filters:
                 source = sources[term.signal]
-                filters[key] = _filter_signal(builder, source, key[1], reach, count) if key[1] > 0 else source
-            fed.setdefault(whole, []).append(_scale_signal(filters[key], float(term.fixed or 0.0)))
-        behind: _Signal = ({}, {}, {})
+                filters[key] = _filter_signal(states, source, key[1], reach, count) if key[1] > 0 else source
+            fed.setdefault(whole, []).append((float(term.fixed or 0.0), filters[key]))
+        behind: _Signal = {}
         for level in range(max(fed), 0, -1):
-            behind = ({builder.state(*_sum([*fed.get(level, []), behind])): 1.0}, {}, {})
-        read.append(_sum([behind, *fed.get(0, [])]))
-    a, b, feedback = builder.matrices()
-    reads, direct, loop = (
-        _dense(rows, width)
-        for rows, width in zip(zip(*read, strict=True), (len(a), len(inputs), len(outputs)), strict=True)
-    )
+            states.append(_sum([*fed.get(level, []), (1.0, behind)]))
+            behind = {("state", len(states) - 1): 1.0}
+        read.append(_sum([(1.0, behind), *fed.get(0, [])]))
+    widths = {"state": len(states), "input": len(inputs), "output": len(outputs)}
+    a, b, feedback = (_dense(states, kind, width) for kind, width in widths.items())
+    reads, direct, loop = (_dense(read, kind, width) for kind, width in widths.items())
     solved = np.eye(len(outputs)) - loop
     if abs(float(np.linalg.det(solved))) < 1e-12:
         raise ModelError(
