@@ -552,57 +552,49 @@ def _join_verdicts(batch: list[Verdicts], first: int, end: int) -> Outcomes:
     return b"".join(values), b"".join(kinds)
 
 
-def search_equation(
-    work: EquationProblem,
-    *,
-    store: Store | None,
-    number: int,
-    executor: Executor | None,
-    progress: ProgressCallback | None,
-) -> _core._Found:
-    """Return the table of the order search of one equation.
+@dataclass(frozen=True)
+class Execution:
+    """How a search is executed: checkpoint file, index of the search in it, executor, and progress callback.
 
-    Without a checkpoint file and an executor it takes one call of the core, otherwise it proceeds in batches. `number`
-    is the index of the search in the file.
+    Without a file and an executor, a search takes one call of the core. Otherwise it proceeds in batches.
     """
-    if store is None and executor is None:
-        return work.search(progress)
-    algorithm = None if store is None else store.contents.algorithm
-    return _run_batches(EquationSearchState(work, algorithm), store, number, executor, progress)
+
+    store: Store | None
+    number: int
+    executor: Executor | None
+    progress: ProgressCallback | None
+
+    @property
+    def section(self) -> Section | None:
+        """Progress of the search in the checkpoint file; None without a file."""
+        return None if self.store is None else self.store.contents.sections[self.number]
 
 
-def search_coupled(
-    work: CoupledProblem,
-    *,
-    store: Store | None,
-    number: int,
-    executor: Executor | None,
-    progress: ProgressCallback | None,
-) -> _core._FoundStage:
-    """Return the table of the order search of coupled equations, like :func:`search_equation`.
+def search_equation(work: EquationProblem, execution: Execution) -> _core._Found:
+    """Return the table of the order search of one equation."""
+    store = execution.store
+    if store is None and execution.executor is None:
+        return work.search(execution.progress)
+    return _run_batches(EquationSearchState(work, None if store is None else store.contents.algorithm), execution)
 
-    The table of a finished search is read from the checkpoint file.
-    """
-    if store is None and executor is None:
-        return work.search(progress)
-    joined = None if store is None else store.contents.sections[number].table
-    if joined is not None:
-        return _table(work, joined)
-    table = _run_batches(CoupledSearchState(work), store, number, executor, progress)
+
+def search_coupled(work: CoupledProblem, execution: Execution) -> _core._FoundStage:
+    """Return the table of the order search of coupled equations; that of a finished search is read from its file."""
+    store, section = execution.store, execution.section
+    if store is None and execution.executor is None:
+        return work.search(execution.progress)
+    if section is not None and section.table is not None:
+        return _table(work, section.table)
+    table = _run_batches(CoupledSearchState(work), execution)
     if store is not None:
-        store.append_table(number, table)
+        store.append_table(execution.number, table)
     return table
 
 
-def _run_batches(
-    state: SearchState[Frame, Table],
-    store: Store | None,
-    number: int,
-    executor: Executor | None,
-    progress: ProgressCallback | None,
-) -> Table:
+def _run_batches(state: SearchState[Frame, Table], execution: Execution) -> Table:
     """Evaluate all blocks that the checkpoint file lacks, batch by batch, and return the table."""
-    section = None if store is None else store.contents.sections[number]
+    store, number, section = execution.store, execution.number, execution.section
+    executor, progress = execution.executor, execution.progress
     save = None if store is None else partial(store.save, number)
     pruned = 0
     for first, end in state.batches():

@@ -15,7 +15,6 @@ from ftlm.order_search.options import DEFAULT_INCREMENT, OrderGrid, SearchSettin
 from ftlm.order_search.result import OrderCertificate
 from ftlm.order_search.search import Job, make_job, run_job
 from ftlm.simulation.discretization import check_linear, named_signals
-from ftlm.structure.equation import Equation
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
@@ -121,10 +120,43 @@ def certify_orders(
     job = make_job(runs, equation, order_grid, SearchSettings(**CERTIFIED_SETTINGS), m=m, threads=threads)
     _check_certifiable(job)
     errors = tuple(_equation_error(job, orders, k, len(start)) for k, orders in enumerate(start))
-    certificate = certify_job(
-        job, tolerance=share, min_separation=gap, max_term_ratio=size, max_cells=most, progress=progress
+    record, item = job.records[0], job.structure.equations[0]
+    output, alpha, terms = job.equation_problem().orders
+    try:
+        answer = _core.certify(
+            [r.core() for r in job.records],
+            output=output,
+            alpha=(min(alpha), max(alpha)),
+            terms=[(signal, min(values), max(values)) for signal, values, _ in terms],
+            min_separation=gap,
+            tolerance=share,
+            max_term_ratio=size,
+            max_cells=most,
+            threads=job.threads,
+            memory=memory_limit(),
+            progress=None if progress is None else lambda count, total, _pruned: progress(count, total),
+        )
+    except ModelError as error:
+        raise named_signals(error, record.signals) from None
+    values = [answer["alpha"], *answer["orders"]] if answer["orders"] else []
+    names = [item.order, *(t.order for t in item.terms)]
+    orders = {o.names[0]: v for o, v in zip(names, values, strict=False) if o.names}
+    nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)
+    return OrderCertificate(
+        answer["at_least"],
+        answer["best"],
+        orders,
+        share,
+        {name: (min(values), max(values)) for name, values in job.values.items()},
+        gap,
+        size,
+        answer["cells"],
+        answer["open"],
+        record.m,
+        nr,
+        unstable,
+        start_errors=errors,
     )
-    return replace(certificate, start_errors=errors)
 
 
 def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: int) -> float:
@@ -173,56 +205,6 @@ def _check_tolerance(tolerance: float) -> float:
     return share
 
 
-def certify_job(
-    job: Job,
-    *,
-    tolerance: float,
-    min_separation: float,
-    max_term_ratio: float = DEFAULT_MAX_TERM_RATIO,
-    max_cells: int = DEFAULT_MAX_CELLS,
-    progress: Callable[[int, int], None] | None = None,
-) -> OrderCertificate:
-    """Return the certificate of a prepared search; see :func:`certify_orders`."""
-    _check_certifiable(job)
-    record, item = job.records[0], job.structure.equations[0]
-    intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
-    output, alpha, terms = _search_region(item, intervals, record.signals)
-    try:
-        answer = _core.certify(
-            [r.core() for r in job.records],
-            output=output,
-            alpha=alpha,
-            terms=terms,
-            min_separation=min_separation,
-            tolerance=tolerance,
-            max_term_ratio=max_term_ratio,
-            max_cells=max_cells,
-            threads=job.threads,
-            memory=memory_limit(),
-            progress=None if progress is None else lambda count, total, _pruned: progress(count, total),
-        )
-    except ModelError as error:
-        raise named_signals(error, record.signals) from None
-    values = [answer["alpha"], *answer["orders"]] if answer["orders"] else []
-    names = [item.order, *(t.order for t in item.terms)]
-    orders = {o.names[0]: v for o, v in zip(names, values, strict=False) if o.names}
-    nr, unstable = _free_run(job, orders) if orders else (math.nan, math.nan)
-    return OrderCertificate(
-        answer["at_least"],
-        answer["best"],
-        orders,
-        tolerance,
-        intervals,
-        min_separation,
-        max_term_ratio,
-        answer["cells"],
-        answer["open"],
-        record.m,
-        nr,
-        unstable,
-    )
-
-
 def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
     """Return the NR of the simulation at given orders (infinite if it fails), and the number of unstable poles."""
     settings = SearchSettings(**{**CERTIFIED_SETTINGS, "criterion": "output-error", "pruning": False})
@@ -235,15 +217,3 @@ def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
     with contextlib.suppress(FtlmError):
         return result.score / job.standard_deviations()[0], result.model.stability().unstable_poles
     return result.score / job.standard_deviations()[0], math.nan
-
-
-def _search_region(
-    item: Equation, intervals: dict[str, tuple[float, float]], signals: Sequence[str]
-) -> tuple[int, tuple[float, float], list[tuple[int, float, float]]]:
-    """Return (output index, interval of alpha, (signal index, low, high) of each term) for the core."""
-
-    def interval(order: Any) -> tuple[float, float]:
-        return intervals[order.names[0]] if order.names else (order.constant, order.constant)
-
-    terms = [(signals.index(t.signal), *interval(t.order)) for t in item.terms]
-    return signals.index(item.output), interval(item.order), terms

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 from ftlm import _core
 from ftlm.errors import ModelError
-from ftlm.structure.order import MAX_ORDER, Order, Values, order_axis, parse_values
+from ftlm.structure.order import MAX_ORDER, Values, order_axis, parse_values
 from ftlm.structure.structure import Structure
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter, setting
@@ -121,11 +121,6 @@ def check_order_grid(order_grid: OrderGrid | None) -> None:
     """Raise ModelError if an argument is not an order grid."""
     if not (order_grid is None or isinstance(order_grid, OrderGrid)):
         raise ModelError(f"order_grid is {type(order_grid).__name__}, not an OrderGrid; use ftlm.order_grid(…)")
-
-
-def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:
-    """Return the grid values of an order, which must be a number or a single free order."""
-    return list(values[order.names[0]]) if order.names else [order.constant]
 
 
 def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None:

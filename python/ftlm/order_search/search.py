@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -22,6 +23,7 @@ from ftlm.order_search.batches import (
     CoreRecord,
     CoupledProblem,
     EquationProblem,
+    Execution,
     ProgressCallback,
     coupled_state,
     equation_state,
@@ -29,22 +31,23 @@ from ftlm.order_search.batches import (
     search_equation,
 )
 from ftlm.order_search.checkpoint import Request, Store, check_record, read_store
-from ftlm.order_search.options import Norm, OrderGrid, SearchSettings, axis_of, check_order_grid
+from ftlm.order_search.options import Norm, OrderGrid, SearchSettings, check_order_grid
 from ftlm.order_search.result import SearchResult, SearchRow, StoreStatus
 from ftlm.progress import Progress
 from ftlm.simulation.discretization import (
     InitialTuple,
     Record,
+    affine,
     check_derivative_orders,
     check_frictionless,
     check_linear,
     named_coefficients,
     named_signals,
+    order_grid_tuple,
     prepare,
 )
 from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.simulation.output_samples import simulate_samples
-from ftlm.structure.order import Order
 from ftlm.structure.structure import Structure
 from ftlm.svg.charts import Landscape
 from ftlm.utils.arguments import check_arguments
@@ -205,28 +208,17 @@ class Job:
 
     def equation_problem(self) -> EquationProblem:
         """Return the search problem of the job's single equation."""
-        item, signals = self.structure.equations[0], self.records[0].signals
-        axes = [
-            (signals.index(t.column), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
-            for t in item.terms
-        ]
-        return EquationProblem(
-            *self._common_arguments(),
-            orders=(signals.index(item.output), axis_of(item.order, self.values), axes),
-            fixed=[t.fixed for t in item.terms],
-        )
+        item = self.structure.equations[0]
+        orders = order_grid_tuple(item, self.records[0].signals, self.values)
+        return EquationProblem(*self._common_arguments(), orders=orders, fixed=[t.fixed for t in item.terms])
 
     def coupled_problem(self) -> CoupledProblem:
         """Return the search problem of the job's coupled equations under their order law."""
         structure, signals = self.structure, self.records[0].signals
         names = structure.order_names
-
-        def affine(order: Order) -> tuple[float, list[float]]:
-            weights = dict(order.weights)
-            return order.constant, [weights.get(n, 0.0) for n in names]
-
+        law = partial(affine, names=names)
         laws = [
-            (signals.index(e.output), affine(e.order), [(signals.index(t.column), affine(t.order)) for t in e.terms])
+            (signals.index(e.output), law(e.order), [(signals.index(t.column), law(t.order)) for t in e.terms])
             for e in structure.equations
         ]
         return CoupledProblem(
@@ -290,15 +282,12 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
         totals = cast("_core._Counts", counts)
         result = _result(job, table[: settings.top], ranked.failures, totals, ranked.excluded_by_box)
         return replace(result, free_runs=len(ranked.table))
+    execution = Execution(store, number, executor, job.progress)
     if job.structure.has_order_law:
-        stage = search_coupled(
-            job.coupled_problem(), store=store, number=number, executor=executor, progress=job.progress
-        )
+        stage = search_coupled(job.coupled_problem(), execution)
         return _result(job, *_stage_rows(job.structure, stage), stage["counts"], 0)
     try:
-        one = search_equation(
-            job.equation_problem(), store=store, number=number, executor=executor, progress=job.progress
-        )
+        one = search_equation(job.equation_problem(), execution)
     except ModelError as error:
         raise named_signals(error, job.records[0].signals) from None
     return _result(job, *_equation_rows(job.structure, one), one["counts"], one["boxed"])

@@ -452,15 +452,14 @@ def order_grid_tuple(
 ) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
     """Return an equation with grids of orders in the form that the core takes.
 
-    It is (output index, values of alpha, [(signal index, values of the order, whether alpha and the order are free),
-    …]).
+    It is (output index, values of alpha, [(signal index, values of the order, whether coefficient and order are free),
+    …]). Every order is a number or a single free order.
     """
-    check_linear([item], "a genetic algorithm")
 
     def axis(order: Order) -> list[float]:
         return list(values[order.names[0]]) if order.names else [order.constant]
 
-    terms = [(signals.index(t.signal), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms]
+    terms = [(signals.index(t.column), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms]
     return signals.index(item.output), axis(item.order), terms
 
 
