@@ -306,5 +306,3 @@ def test_explicit_euler_of_the_manual_model(drive):
 def test_explicit_euler_steps_whole_orders_only(text):
     with pytest.raises(ftlm.ModelError, match="equation 0 has orders that explicit Euler cannot step"):
         ftlm.explicit_euler(model(text), zeros_run())
-    with pytest.raises(ftlm.ModelError, match="step = 'fine' is not known"):
-        ftlm.explicit_euler(model("D y = -y + u"), zeros_run(), step="fine")

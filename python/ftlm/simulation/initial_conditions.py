@@ -137,16 +137,15 @@ def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     evidence = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
     if key not in evidence:
-        evidence[key] = _rest_evidence(run, structure) or _slow_start_evidence(run, structure)
+        inputs, outputs = ([n for n in structure.signals if n in names] for names in (run.inputs, run.outputs))
+        evidence[key] = None
+        if inputs and outputs and all(n in run for n in structure.signals):
+            evidence[key] = _rest_evidence(run, inputs, outputs) or _slow_start_evidence(run, inputs, outputs)
     return evidence[key]
 
 
-def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
+def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:
     """Return evidence from quiet first samples, or from inputs that are constant from the first or second sample on."""
-    inputs = [n for n in structure.signals if n in run.inputs]
-    outputs = [n for n in structure.signals if n in run.outputs]
-    if not inputs or not outputs or any(n not in run for n in structure.signals):
-        return None
     if run.sample_times is not None and run.missing_samples:
         return None
     if any(np.nanstd(run[n]) == 0.0 for n in outputs):
@@ -176,16 +175,13 @@ def _rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
     if not constant or not any(np.any(run[n][1:]) for n in inputs):
         return None
     first = {n: float(drop_missing(run[n])[0]) for n in outputs}
-    return RestEvidence(0, first, dict.fromkeys(inputs, 0.0), not starts_at_rest(run, structure))
+    return RestEvidence(0, first, dict.fromkeys(inputs, 0.0), not all(is_rest(run[n]) for n in outputs))
 
 
-def _slow_start_evidence(run: Run, structure: Structure) -> RestEvidence | None:
+def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:
     """Return evidence from outputs that start at zero and move slowly at first, whatever the inputs do."""
-    inputs = [n for n in structure.signals if n in run.inputs]
-    outputs = [n for n in structure.signals if n in run.outputs]
-    if not inputs or not outputs or any(n not in run for n in structure.signals) or run.sample_times is not None:
-        return None
-    if not starts_at_rest(run, structure) or not _starts_slowly([run[n] for n in outputs]):
+    series = [run[n] for n in outputs]
+    if run.sample_times is not None or not all(map(is_rest, series)) or not _starts_slowly(series):
         return None
     return RestEvidence(1, dict.fromkeys(outputs, 0.0), dict.fromkeys(inputs, 0.0), shows_level=False)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -48,31 +47,19 @@ def respond(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dic
     The initial terms are fitted to the measured outputs by least squares.
     """
     structure = model.structure
-    coupled = structure.coupling == "simulated"
-    terms = rec.start
-    inputs = list(rec.inputs)
-    equations = [equation_tuple(e, rec.signals) for e in model.equations]
     series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
     responses: dict[str, Floats] = {}
     initial: dict[str, dict[float, float]] = {}
-
-    def keep(names: tuple[str, ...], response: tuple[Floats, list[list[float]], list[list[float]]]) -> None:
-        outputs, exponents, values = response
+    for group in [model.equations] if structure.coupling == "simulated" else [(e,) for e in model.equations]:
+        names = [e.output for e in group]
+        equations = [equation_tuple(e, rec.signals) for e in group]
+        output_filter = None if series is None else (series, [structure.is_filtered(n) for n in names])
+        outputs, exponents, values = _core.respond_with_initial(
+            rec.core(), equations, list(rec.inputs), rec.start, output_filter
+        )
         for i, name in enumerate(names):
             responses[name] = outputs[i]
             initial[name] = dict(zip(exponents[i], values[i], strict=True))
-
-    def output_filter(names: tuple[str, ...]) -> tuple[Floats, list[bool]] | None:
-        return None if series is None else (series, [structure.is_filtered(n) for n in names])
-
-    if coupled:
-        keep(
-            model.outputs,
-            _core.respond_with_initial(rec.core(), equations, inputs, terms, output_filter(model.outputs)),
-        )
-    else:
-        for name, item in zip(model.outputs, equations, strict=True):
-            keep((name,), _core.respond_with_initial(rec.core(), [item], inputs, terms, output_filter((name,))))
     return responses, initial
 
 
@@ -235,7 +222,7 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
 
 
 @check_arguments
-def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
+def explicit_euler(model: Model, run: Run) -> dict[str, Floats]:
     """Simulate a model of integer orders by explicit Euler with the step of the run, the baseline of the paper.
 
     Parameters
@@ -244,8 +231,6 @@ def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record"
         Model with integer orders only, such as :func:`ftlm.link_model` with the values of the manual.
     run
         Run with the inputs. The paper uses a step of 0.002 s.
-    step
-        Only ``"record"``, the step of the run.
 
     Returns
     -------
@@ -258,10 +243,6 @@ def explicit_euler(model: Model, run: Run, *, step: Literal["record"] = "record"
     ModelError
         If an order is fractional.
     """
-    if step != "record":
-        raise ModelError(
-            f"{setting('step')} {step!r} is not known; Euler steps at the record's own step: resample the run"
-        )
     signals = model.structure.signals
     run = apply_input_nonlinearity(run, model.structure)
     rows = [run[s] if s not in model.outputs else np.zeros(run.length) for s in signals]
