@@ -480,11 +480,11 @@ def test_it_does_not_start_without_expiration_states(bench, missing, monkeypatch
 
         def set_expiration():
             if missing in ("digital", "one line"):
-                board._hil.watchdog_set_analog_expiration_state(quanser.ANALOG_OUT, 2, np.zeros(2))
+                board._hil.watchdog_set_analog_expiration_state(*quanser.ANALOG_OUT, np.zeros(2))
                 board._analog_safe = True
             if missing == "analog":
                 states = np.full(8, 2, dtype=np.int32)
-                board._hil.watchdog_set_digital_expiration_state(quanser.DIGITAL_OUT, 8, states)
+                board._hil.watchdog_set_digital_expiration_state(*quanser.DIGITAL_OUT, states)
                 board._digital_safe = True
 
         monkeypatch.setattr(board, "set_expiration", set_expiration)

@@ -6,15 +6,17 @@ and rules of the package. See docs/rig.md before the first run on hardware.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from inspect import signature
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftlm import _core
 from ftlm.errors import RigFault
@@ -30,15 +32,20 @@ from ftlm.utils.validation import Floats
 
 #: Highest rate of the board's normal update mode [Hz]; above it the fast mode is used.
 MAX_NORMAL_RATE_HZ = 1000.0
-ANALOG_IN = np.arange(4, dtype=np.uint32)
-ANALOG_OUT = np.arange(2, dtype=np.uint32)
-ENCODER_CHANNELS = np.arange(2, dtype=np.uint32)
-SWITCH_CHANNELS = np.arange(4, dtype=np.uint32)
+
+
+def _channels(*numbers: int) -> tuple[NDArray[np.uint32], int]:
+    """Return channel numbers and their count, in the form in which the vendor's functions take them."""
+    return np.array(numbers, dtype=np.uint32), len(numbers)
+
+
+ANALOG_IN, ANALOG_OUT = _channels(0, 1, 2, 3), _channels(0, 1)
+ENCODER_CHANNELS, SWITCH_CHANNELS = _channels(0, 1), _channels(0, 1, 2, 3)
 #: Amplifier enable of both stages (active low) and master enable (active high).
-ENABLE_CHANNELS = np.array([0, 1, 4], dtype=np.uint32)
+ENABLE_CHANNELS = _channels(0, 1, 4)
 ENABLE_STATES_ON, ENABLE_STATES_OFF = np.array([0, 0, 1], dtype=np.int8), np.array([1, 1, 0], dtype=np.int8)
 #: All digital outputs of the board; the watchdog requires an expiration state for each of them.
-DIGITAL_OUT = np.arange(8, dtype=np.uint32)
+DIGITAL_OUT = _channels(*range(8))
 DIGITAL_STATE_TRISTATE = 2
 QUADRATURE_MODE_X4 = 4
 OVERFLOW_IS_AN_ERROR = 0
@@ -137,10 +144,10 @@ class QuanserBoard:
         self._seconds = 0.0
         self._analog_safe = False
         self._digital_safe = False
-        self._analog = np.zeros(len(ANALOG_IN), dtype=np.float64)
-        self._counts = np.zeros(len(ENCODER_CHANNELS), dtype=np.int32)
-        self._digital = np.zeros(len(SWITCH_CHANNELS), dtype=np.int8)
-        self._volts = np.zeros(len(ANALOG_OUT), dtype=np.float64)
+        self._analog = np.zeros(ANALOG_IN[1], dtype=np.float64)
+        self._counts = np.zeros(ENCODER_CHANNELS[1], dtype=np.int32)
+        self._digital = np.zeros(SWITCH_CHANNELS[1], dtype=np.int8)
+        self._volts = np.zeros(ANALOG_OUT[1], dtype=np.float64)
         self._rows: list[list[float]] = []
         self._rate = 0.0
         self._samples = 0
@@ -167,7 +174,7 @@ class QuanserBoard:
         check_rate(rate)
         self._rate, self._samples, self._origin, self._rows = rate, 0, math.inf, []
         speed = "normal" if rate <= MAX_NORMAL_RATE_HZ else "fast"
-        low_in, low_out = np.full(len(ANALOG_IN), -10.0), np.full(len(ANALOG_OUT), -10.0)
+        low_in, low_out = np.full(ANALOG_IN[1], -10.0), np.full(ANALOG_OUT[1], -10.0)
         with self._translate_errors("configuring the board") as hil:
             try:
                 hil.watchdog_clear()
@@ -177,29 +184,19 @@ class QuanserBoard:
             else:
                 # Clearing an expired watchdog restores the previous outputs.
                 self._write((0.0, 0.0))
-                hil.write_digital(ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_OFF)
+                hil.write_digital(*ENABLE_CHANNELS, ENABLE_STATES_OFF)
             self._is_expired = False
             hil.set_card_specific_options(f"update_rate={speed};decimation=1", OPTIONS_SIZE)
-            hil.set_analog_input_ranges(ANALOG_IN, len(ANALOG_IN), low_in, -low_in)
-            hil.set_analog_output_ranges(ANALOG_OUT, len(ANALOG_OUT), low_out, -low_out)
-            hil.set_digital_directions(SWITCH_CHANNELS, len(SWITCH_CHANNELS), ENABLE_CHANNELS, len(ENABLE_CHANNELS))
+            hil.set_analog_input_ranges(*ANALOG_IN, low_in, -low_in)
+            hil.set_analog_output_ranges(*ANALOG_OUT, low_out, -low_out)
+            hil.set_digital_directions(*SWITCH_CHANNELS, *ENABLE_CHANNELS)
             self._write((0.0, 0.0))
-            hil.write_digital(ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_OFF)
-            modes = np.full(len(ENCODER_CHANNELS), QUADRATURE_MODE_X4, dtype=np.int32)
-            hil.set_encoder_quadrature_mode(ENCODER_CHANNELS, len(ENCODER_CHANNELS), modes)
-            hil.set_encoder_counts(
-                ENCODER_CHANNELS, len(ENCODER_CHANNELS), np.zeros(len(ENCODER_CHANNELS), dtype=np.int32)
-            )
+            hil.write_digital(*ENABLE_CHANNELS, ENABLE_STATES_OFF)
+            modes = np.full(ENCODER_CHANNELS[1], QUADRATURE_MODE_X4, dtype=np.int32)
+            hil.set_encoder_quadrature_mode(*ENCODER_CHANNELS, modes)
+            hil.set_encoder_counts(*ENCODER_CHANNELS, np.zeros(ENCODER_CHANNELS[1], dtype=np.int32))
             self._task = hil.task_create_reader(
-                max(2, round(rate / 10.0)),
-                ANALOG_IN,
-                len(ANALOG_IN),
-                ENCODER_CHANNELS,
-                len(ENCODER_CHANNELS),
-                SWITCH_CHANNELS,
-                len(SWITCH_CHANNELS),
-                None,
-                0,
+                max(2, round(rate / 10.0)), *ANALOG_IN, *ENCODER_CHANNELS, *SWITCH_CHANNELS, None, 0
             )
             hil.task_set_buffer_overflow_mode(self._task, OVERFLOW_IS_AN_ERROR)
 
@@ -209,10 +206,10 @@ class QuanserBoard:
         Without tristate digital lines, the board would keep its analog outputs.
         """
         with self._translate_errors("setting the watchdog's expiration states") as hil:
-            hil.watchdog_set_analog_expiration_state(ANALOG_OUT, len(ANALOG_OUT), np.zeros(len(ANALOG_OUT)))
+            hil.watchdog_set_analog_expiration_state(*ANALOG_OUT, np.zeros(ANALOG_OUT[1]))
             self._analog_safe = True
-            states = np.full(len(DIGITAL_OUT), DIGITAL_STATE_TRISTATE, dtype=np.int32)
-            hil.watchdog_set_digital_expiration_state(DIGITAL_OUT, len(DIGITAL_OUT), states)
+            states = np.full(DIGITAL_OUT[1], DIGITAL_STATE_TRISTATE, dtype=np.int32)
+            hil.watchdog_set_digital_expiration_state(*DIGITAL_OUT, states)
             self._digital_safe = True
 
     def unsafe(self) -> str | None:
@@ -244,9 +241,7 @@ class QuanserBoard:
             if on:
                 self.gate.check()
             self._run_unless_expired(
-                lambda: hil.write_digital(
-                    ENABLE_CHANNELS, len(ENABLE_CHANNELS), ENABLE_STATES_ON if on else ENABLE_STATES_OFF
-                ),
+                lambda: hil.write_digital(*ENABLE_CHANNELS, ENABLE_STATES_ON if on else ENABLE_STATES_OFF),
                 is_end=not on,
             )
 
@@ -359,7 +354,7 @@ class QuanserBoard:
                 self.gate.check()
             if self._hil is not None:
                 self._volts[:] = volts
-                self._hil.write_analog(ANALOG_OUT, len(ANALOG_OUT), self._volts)
+                self._hil.write_analog(*ANALOG_OUT, self._volts)
 
     def _run_unless_expired(self, act: Callable[[], None], *, is_end: bool) -> None:
         """Perform an action, and ignore its error if the watchdog has expired.
@@ -384,8 +379,25 @@ class QuanserBoard:
             return False
         return self._is_expired
 
-    def _translate_errors(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> _ErrorTranslator:
-        return _ErrorTranslator(self, what, self._hil if hil is None else hil, guard)
+    @contextlib.contextmanager
+    def _translate_errors(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> Iterator[Any]:
+        """Convert vendor errors in a ``with`` block to `RigFault`, and latch them with the guard of a run.
+
+        `what` is the name of the operation, and `hil` the vendor handle, by default that of the board.
+        """
+        handle = self._hil if hil is None else hil
+        if handle is None:
+            raise RigFault(f"Q8-USB, {what}: the board is not open")
+        try:
+            yield handle
+        except self._error as error:
+            fault = self._fault(what, error)
+            if guard is not None:
+                # A locked board rejects every further call with its own error; report the expiry as the cause.
+                if self._has_expired():
+                    fault = RigFault(f"{WATCHDOG_EXPIRED_MESSAGE} (Q8-USB, {what})")
+                guard.fail(str(fault))
+            raise fault from None
 
     def _fault(self, what: str, error: Exception) -> RigFault:
         code = getattr(error, "error_code", None)
@@ -397,38 +409,6 @@ class QuanserBoard:
                 message = str(error)
             words = f"{message or 'no message'} (error {code})"
         return RigFault(f"Q8-USB, {what}: {words}")
-
-
-class _ErrorTranslator:
-    """Context manager that converts vendor errors to `RigFault`, and latches them during a run.
-
-    Parameters
-    ----------
-    board, what, hil
-        Board, name of the operation, and vendor handle.
-    guard
-        Guard of the current run, or None.
-    """
-
-    def __init__(self, board: QuanserBoard, what: str, hil: Any, guard: _core.Guard | None) -> None:
-        self._board, self._what, self._hil, self._guard = board, what, hil, guard
-
-    def __enter__(self) -> Any:
-        if self._hil is None:
-            raise RigFault(f"Q8-USB, {self._what}: the board is not open")
-        return self._hil
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        board = self._board
-        if error is None or not isinstance(error, board._error):
-            return
-        fault = board._fault(self._what, error)
-        if self._guard is not None:
-            # A locked board rejects every further call with its own error; report the expiry as the cause.
-            if board._has_expired():
-                fault = RigFault(f"{WATCHDOG_EXPIRED_MESSAGE} (Q8-USB, {self._what})")
-            self._guard.fail(str(fault))
-        raise fault from None
 
 
 #: Maximum length of a string property of the board.

@@ -309,25 +309,9 @@ def record(
     duration, limit, rate = check_times(duration, limit, rate)
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
     commands = excitation.commands(rate, duration)
-    experiment = Experiment(
-        rig,
-        duration,
-        limit,
-        rate,
-        seed,
-        parameters,
-        offset,
-        real_time,
-        sensor_filter,
-        watchdog,
-        arm,
-        board,
-        excitation.shape if name is None else name,
-        out,
-        force,
-        live,
-        progress,
-    )
+    setup = RigSetup(rig, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board)
+    name = excitation.shape if name is None else name
+    experiment = Experiment(setup, duration, limit, rate, name, out, force, live, progress)
     return experiment.record_run(lambda board: FixedCommands(commands), {"input": excitation.to_dict()})
 
 
@@ -349,13 +333,10 @@ class CommandSource(Protocol):
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """Arguments of an experiment, validated; see :func:`record`."""
+class RigSetup:
+    """Arguments that select a board and define how it is run; see :func:`record`."""
 
     rig: str | Board
-    duration: float
-    limit: float
-    rate: float
     seed: int
     parameters: str | os.PathLike[str] | ArmParameters
     offset: tuple[float, float] | None
@@ -364,14 +345,9 @@ class Experiment:
     watchdog: float
     arm: bool
     board: str
-    name: str
-    out: str | os.PathLike[str] | None
-    force: bool
-    live: Streaming | None
-    progress: Callable[[int, int], None] | None
 
-    def _selected_board(self) -> tuple[Board, dict[str, Any]]:
-        """Return the selected board, and its metadata for the run."""
+    def select_board(self, limit: float) -> tuple[Board, dict[str, Any]]:
+        """Return the selected board for runs of at most `limit` seconds, and its metadata for the run."""
         virtual = isinstance(self.rig, str) and self.rig == "virtual"
         if self.offset is not None and not virtual:
             raise ModelError("offset applies only to the virtual arm; leave it out for a board")
@@ -388,7 +364,7 @@ class Experiment:
                         "motor 2"
                     )
                 arm = replace(arm, current_offset=(first, second))
-            board = VirtualBoard(arm, seed=self.seed, real_time=self.real_time, horizon=self.limit)
+            board = VirtualBoard(arm, seed=self.seed, real_time=self.real_time, horizon=limit)
             return board, {"parameters": arm.to_dict()}
         if isinstance(self.rig, str):
             check_choice("rig", self.rig, ("virtual", "q8"))
@@ -398,23 +374,39 @@ class Experiment:
         own = getattr(self.rig, "parameters", None)
         return self.rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
 
+
+@dataclass(frozen=True)
+class Experiment:
+    """Arguments of an experiment, validated; see :func:`record`."""
+
+    setup: RigSetup
+    duration: float
+    limit: float
+    rate: float
+    name: str
+    out: str | os.PathLike[str] | None
+    force: bool
+    live: Streaming | None
+    progress: Callable[[int, int], None] | None
+
     def record_run(self, source_on: Callable[[Board], CommandSource], more_details: dict[str, Any]) -> Run:
         """Run the experiment with a command source and return the recorded run."""
+        setup = self.setup
         # Flags that let an arm move must be bool; truthy values are rejected.
-        for name, flag in (("real_time", self.real_time), ("arm", self.arm), ("force", self.force)):
+        for name, flag in (("real_time", setup.real_time), ("arm", setup.arm), ("force", self.force)):
             if not isinstance(flag, bool):
                 raise ModelError(f"{setting(name)} {short_repr(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
             raise ModelError(f"progress is a {type(self.progress).__name__}; give a function of (done, total)")
-        if self.sensor_filter is not None and not (
-            isinstance(self.sensor_filter, str) and self.sensor_filter == "stock"
+        if setup.sensor_filter is not None and not (
+            isinstance(setup.sensor_filter, str) and setup.sensor_filter == "stock"
         ):
             raise ModelError(
-                f"{setting('sensor_filter')} {short_repr(self.sensor_filter)} is not known; use 'stock' or None"
+                f"{setting('sensor_filter')} {short_repr(setup.sensor_filter)} is not known; use 'stock' or None"
             )
-        board, details = self._selected_board()
-        paced = self.real_time or board.hardware or bool(getattr(board, "real_time", False))
-        if board.hardware and not self.arm:
+        board, details = setup.select_board(self.limit)
+        paced = setup.real_time or board.hardware or bool(getattr(board, "real_time", False))
+        if board.hardware and not setup.arm:
             raise ModelError(
                 f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
                 f"with {parameter('arm', True)}"
@@ -428,22 +420,22 @@ class Experiment:
         source = source_on(board)
         about: dict[str, Any] = {
             "rig": board.name,
-            "seed": self.seed,
+            "seed": setup.seed,
             "rate": self.rate,
             "duration": self.duration,
             "real_time": paced,
-            "watchdog": self.watchdog,
-            "sensor_filter": self.sensor_filter,
+            "watchdog": setup.watchdog,
+            "sensor_filter": setup.sensor_filter,
             **more_details,
             **details,
         }
         link = Rig(
             board,
             rate=self.rate,
-            watchdog=self.watchdog,
+            watchdog=setup.watchdog,
             limit=self.limit,
             limits=Limits(),
-            sensor_filter=STOCK_FILTER if self.sensor_filter else None,
+            sensor_filter=STOCK_FILTER if setup.sensor_filter else None,
         )
         step, live = 1.0 / self.rate, self.live
         if live is not None and not math.isclose(live.step, step, rel_tol=1e-9):

@@ -41,6 +41,8 @@ FAULT_INJECTIONS = {
 _FAULT_CHANNELS = {"dead encoder": 2, "saturated gauge": 2, "limit switch": 4, "deflection": 2}
 #: Shortest watchdog timeout of runs without real time [s]; they cannot be late, only the program can terminate.
 _MIN_FAST_WATCHDOG_S = 2.0
+#: Longest start of the watchdog process [s].
+_WATCHDOG_START_TIMEOUT_S = 10.0
 
 
 @dataclass
@@ -274,7 +276,7 @@ def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Pop
     )
 
 
-def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterPage, *, patience: float = 10.0) -> None:
+def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterPage) -> None:
     """Wait until the watchdog process is ready; end the process if it does not become ready.
 
     Parameters
@@ -283,21 +285,19 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
         Process from `spawn_watchdog`.
     page
         Registers of the output stage.
-    patience
-        Maximum waiting time [s].
 
     Raises
     ------
     OSError
         If the process ended, or was not ready in time.
     """
-    until = time.monotonic() + patience
+    until = time.monotonic() + _WATCHDOG_START_TIMEOUT_S
     try:
         while not page.get("ready"):
             if process.poll() is not None:
                 raise OSError(f"the watchdog process ended at its start (exit code {process.returncode})")
             if time.monotonic() > until:
-                raise OSError(f"the watchdog process did not start within {patience:g} s")
+                raise OSError(f"the watchdog process did not start within {_WATCHDOG_START_TIMEOUT_S:g} s")
             time.sleep(0.002)
     except BaseException:
         process.kill()
