@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from msgspec import UNSET, UnsetType
 
@@ -365,20 +365,8 @@ class Structure:
 
     def _of(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:
         """Return a structure that has only the given equations, without coefficient laws."""
-        orders = {n for e in equations for n in e.order_names}
-        signals = tuple(dict.fromkeys(s for e in equations for s in e.signals))
-        return replace(
-            self,
-            equations=equations,
-            order_values={n: v for n, v in self.order_values.items() if n in orders},
-            coupling=coupling,
-            delay={n: v for n, v in self.delay.items() if n in signals},
-            free_delays={n: v for n, v in self.free_delays.items() if n in signals},
-            input_nonlinearities=_or_unset([limit for limit in self.limits if limit.signal in signals]),
-            sensor_filter=restrict_filter(self.sensor_filter, signals),
-            coefficient_law=(),
-            name=f"{self.name}, {', '.join(e.output for e in equations)}",
-        )
+        name = f"{self.name}, {', '.join(e.output for e in equations)}"
+        return restrict_structure(self, equations, coupling=coupling, coefficient_law=(), name=name)
 
     def equation(self, output: str) -> Structure:
         """Return one equation as a separate structure, with measured coupling and without order laws.
@@ -558,7 +546,23 @@ def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
     return {name: round(alpha + i, 9) for i, name in enumerate(names)}
 
 
-def restrict_filter(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
+def restrict_structure(structure: Structure, equations: tuple[Equation, ...], **changes: Any) -> Structure:
+    """Return a structure with other equations, restricted to their orders and signals, and with other changes."""
+    orders = {n for e in equations for n in e.order_names}
+    signals = {s for e in equations for s in e.signals}
+    return replace(
+        structure,
+        equations=equations,
+        order_values={n: v for n, v in structure.order_values.items() if n in orders},
+        delay={n: v for n, v in structure.delay.items() if n in signals},
+        free_delays={n: v for n, v in structure.free_delays.items() if n in signals},
+        input_nonlinearities=_or_unset([limit for limit in structure.limits if limit.signal in signals]),
+        sensor_filter=_restrict_filter(structure.sensor_filter, signals),
+        **changes,
+    )
+
+
+def _restrict_filter(sensor: SensorFilter | None, signals: Collection[str]) -> SensorFilter | None:
     """Return a sensor filter restricted to some signals; None if none of them is filtered."""
     if sensor is None:
         return None

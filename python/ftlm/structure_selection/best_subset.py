@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
-from msgspec import UNSET
 
 from ftlm import _core
 from ftlm.data.run import Run
@@ -21,7 +20,7 @@ from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, minimize_cost
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
-from ftlm.structure.structure import Offset, Structure, restrict_filter
+from ftlm.structure.structure import Offset, Structure, restrict_structure
 from ftlm.structure_selection.candidates import Change, NestedStructures, Variant, describe_structure, signature
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Folds, fix_initial_conditions
 from ftlm.utils.validation import Floats
@@ -237,16 +236,7 @@ def _candidate_orders(inside: NestedStructures, term: Term, top: float) -> list[
 
 def _with_terms(structure: Structure, terms: Sequence[Term], top: float, offset: Offset) -> Structure:
     item = replace(structure.equations[0], order=Order(top), terms=tuple(terms))
-    signals = tuple(dict.fromkeys((item.output, *item.signals)))
-    return replace(
-        structure,
-        equations=(item,),
-        order_values={},
-        offset=offset,
-        delay={n: v for n, v in structure.delay.items() if n in signals},
-        input_nonlinearities=tuple(x for x in structure.limits if x.signal in signals) or UNSET,
-        sensor_filter=restrict_filter(structure.sensor_filter, signals),
-    )
+    return restrict_structure(structure, (item,), offset=offset)
 
 
 def _is_valid_input_set(structure: Structure, terms: Sequence[Term], top: float, runs: Sequence[Run]) -> bool:

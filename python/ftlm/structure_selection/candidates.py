@@ -11,7 +11,7 @@ from ftlm.errors import ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.input_nonlinearity import input_name
-from ftlm.structure.structure import Structure, restrict_filter
+from ftlm.structure.structure import Structure, restrict_structure
 
 #: Integer values that replace a free order.
 INTEGER_ORDER_VALUES = (0.0, 1.0, 2.0, 3.0)
@@ -126,28 +126,18 @@ class NestedStructures:
                 t for t in item.terms if t.coefficient not in droppable or t.coefficient in variant.coefficients
             )
             equations.append(self._with_frictions(replace(item, terms=terms), variant.frictions))
-        names = {n for e in equations for n in e.order_names}
-        signals = tuple(dict.fromkeys(n for e in equations for n in (e.output, *e.signals)))
-        dropped_inputs = {i.name for i in structure.free_inputs} - variant.inputs
-        free = {
-            n: v
-            for n, v in structure.free_delays.items()
-            if n in signals and input_name("delay", n) not in dropped_inputs
-        }
-        candidate = replace(
+        dropped = {i.name for i in structure.free_inputs} - variant.inputs
+        candidate = restrict_structure(
             structure,
-            equations=tuple(equations),
-            order_values={n: v for n, v in structure.order_values.items() if n in names},
-            delay={n: v for n, v in structure.delay.items() if n in signals},
-            free_delays=free,
-            input_nonlinearities=tuple(
-                x for x in structure.limits if x.signal in signals and x.name not in dropped_inputs
-            )
-            or UNSET,
-            sensor_filter=restrict_filter(structure.sensor_filter, signals),
-        ).with_orders({n: v for n, v in variant.integer_orders if n in names})
-        offset = structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none"
-        return replace(candidate, offset=offset)
+            tuple(equations),
+            offset=structure.offset if structure.offset == "ramp" else "constant" if variant.offset else "none",
+        )
+        candidate = replace(
+            candidate,
+            free_delays={n: v for n, v in candidate.free_delays.items() if input_name("delay", n) not in dropped},
+            input_nonlinearities=tuple(x for x in candidate.limits if x.name not in dropped) or UNSET,
+        )
+        return candidate.with_orders({n: v for n, v in variant.integer_orders if n in candidate.order_names})
 
     def is_valid(self, variant: Variant) -> bool:
         """Whether a variant can be built, with distinct orders of each signal.

@@ -18,7 +18,7 @@ from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
 from ftlm.svg.html_page import Page, ReportMixin, Section, Table
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import to_frame
-from ftlm.utils.formatting import Cell, finite
+from ftlm.utils.formatting import Cell, attributes, json_value
 from ftlm.utils.validation import Floats
 
 #: Maximum number of printed rows, and the fit [%] below which values are not distinguished.
@@ -216,27 +216,17 @@ class Selection(ReportMixin):
         """Return the candidates and the choice as a dictionary for JSON, without the identification."""
         return {
             "chosen": self.winner.name,
-            "reason": self.reason,
-            "validation": self.validation,
-            "fitted": self.fitted,
+            **attributes(self, ("reason", "validation", "fitted")),
             "candidates": [
                 {
                     "structure": t.name,
-                    "parameters": t.parameters,
-                    "estimation": dict(t.estimation),
-                    "validation": {n: dict(v) for n, v in t.validation.items()},
-                    "score": finite(t.score),
-                    "bic": None if t.bic is None else finite(t.bic),
-                    "values": dict(t.values),
-                    "standard_errors": {n: finite(e) for n, e in t.errors.items()},
-                    "insignificant": list(t.insignificant),
-                    "unstable": t.unstable,
-                    "failed": t.failed,
+                    **attributes(t, ("parameters", "estimation", "validation", "score", "bic", "values")),
+                    "standard_errors": json_value(t.errors),
+                    **attributes(t, ("insignificant", "unstable", "failed")),
                 }
                 for t in self.trials
             ],
-            "findings": [f.to_dict() for f in self.findings],
-            "warnings": list(self.warnings),
+            **attributes(self, ("findings", "warnings")),
         }
 
     def __str__(self) -> str:

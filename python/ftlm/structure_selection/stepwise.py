@@ -146,26 +146,19 @@ class CandidateEvaluator:
     def map_candidates(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """Return the results of a function for candidates, in the same order, with progress reports."""
         self.known_count += len(items)
-        return self._in_order(work, items, self._report_progress)
-
-    def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-        """Return the results of a function for items, in the same order, without progress reports."""
-        return self._in_order(work, items, lambda: None)
-
-    def _report_progress(self) -> None:
-        self.done_count += 1
-        if self.progress is not None:
-            self.progress(self.done_count, self.known_count)
-
-    def _in_order(
-        self, work: Callable[[Item], Result], items: Sequence[Item], report: Callable[[], None]
-    ) -> list[Result]:
         out: list[Result] = []
         with interruptible_pool(self.threads) as workers:
             for result in workers.map(work, items):
                 out.append(result)
-                report()
+                self.done_count += 1
+                if self.progress is not None:
+                    self.progress(self.done_count, self.known_count)
         return out
+
+    def map_items(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """Return the results of a function for items, in the same order, without progress reports."""
+        with interruptible_pool(self.threads) as workers:
+            return list(workers.map(work, items))
 
     def validate(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
         """Return the trial of a fitted candidate on validation data; a failed fit gives a failed trial."""
