@@ -81,22 +81,22 @@ def _kernel_available_bytes(system: Path) -> list[int]:
     return [int(match[1]) << 10] if match else []
 
 
+#: Folder, file of the limit, file of the usage, and entry of the reclaimable cache, by version of control groups.
+_CGROUP_FILES = {
+    1: ("sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    2: ("sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"),
+}
+
+
 def _cgroup_available_bytes(system: Path) -> list[int]:
     """Return the free memory of each control group [bytes], v1 and v2; reclaimable page cache counts as free."""
     amounts = []
     for line in _text(system / "proc/self/cgroup").splitlines():
         number, controllers, name = (*line.split(":", 2), "", "")[:3]
-        if number == "0" and not controllers:
-            root, most, now, droppable = "sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"
-        elif "memory" in controllers.split(","):
-            root, most, now, droppable = (
-                "sys/fs/cgroup/memory",
-                "memory.limit_in_bytes",
-                "memory.usage_in_bytes",
-                "total_inactive_file",
-            )
-        else:
+        version = 2 if number == "0" and not controllers else 1 if "memory" in controllers.split(",") else None
+        if version is None:
             continue
+        root, most, now, droppable = _CGROUP_FILES[version]
         parts = [part for part in name.split("/") if part not in ("", "..")]
         for depth in range(len(parts), -1, -1):
             folder = system.joinpath(root, *parts[:depth])
