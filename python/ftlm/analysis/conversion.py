@@ -422,8 +422,7 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     if twice:
         raise ModelError(
             f"{', '.join(twice)}: name of an input and of an output; pass {parameter('inputs')} and "
-            f"{parameter('outputs')} "
-            "with other names"
+            f"{parameter('outputs')} with other names"
         )
     rows = zip(results, parts, strict=True)
     return equation("\n".join(_equation_text(name, signals, *part) for name, part in rows), coupling="measured")

@@ -38,8 +38,7 @@ def check_no_input_nonlinearity(model: Model, what: str) -> None:
     for limit in model.structure.limits:
         raise ModelError(
             f"{limit.signal} passes a {INPUT_EFFECT_LABELS[limit.law]} before it acts, which {what} cannot represent; "
-            "use simulations "
-            "(simulate, compare), or a model of the equation without it"
+            "use simulations (simulate, compare), or a model of the equation without it"
         )
 
 

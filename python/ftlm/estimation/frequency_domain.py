@@ -193,8 +193,7 @@ def _fit_response(
     if count <= numbers:
         raise DataError(
             f"{count // 2} frequencies give {count} values, and {numbers} parameters are free "
-            f"({', '.join(problem.names)}); "
-            "measure more frequencies, or fix numbers"
+            f"({', '.join(problem.names)}); measure more frequencies, or fix numbers"
         )
     if isinstance(progress, Progress):
         progress.expect(

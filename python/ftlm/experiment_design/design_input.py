@@ -314,9 +314,8 @@ def _design_candidates(
     feasible = [d for d in initial_designs if d.score > -math.inf]
     if not feasible:
         raise ModelError(
-            f"no input of this length makes {', '.join(fit.names[i] for i in goal.indices)} separately "
-            f"identifiable from "
-            "the other parameters; name fewer parameters, or make the run longer"
+            f"no input of this length makes {', '.join(fit.names[i] for i in goal.indices)} separately identifiable "
+            "from the other parameters; name fewer parameters, or make the run longer"
         )
     # Of each kind the best one: what they lead to differs more than what they are.
     kinds: dict[str, Design] = {}
@@ -468,9 +467,8 @@ def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
     drifting = [o for o, limit in bounds.output_limits.items() if math.isinf(limit)]
     if poles.origin_order > 0 and drifting:
         raise ModelError(
-            f"the model integrates its input (order {poles.origin_order:g}), so that {drifting[0]} may drift "
-            f"without limit; "
-            f"say how far it may go by {parameter('limits')}, or give {parameter('reference_run')} a run"
+            f"the model integrates its input (order {poles.origin_order:g}), so that {drifting[0]} may drift without "
+            f"limit; say how far it may go by {parameter('limits')}, or give {parameter('reference_run')} a run"
         )
 
 

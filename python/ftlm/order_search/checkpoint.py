@@ -376,8 +376,7 @@ class Store:
         content = self.contents
         return DataError(
             f"store {self.path} is of ftlm {content.version}, whose rounds follow algorithm {content.algorithm}; this "
-            f"version's is {ALGORITHM_VERSION}: finish the search with that version, or start it again in another "
-            "file"
+            f"version's is {ALGORITHM_VERSION}: finish the search with that version, or start it again in another file"
         )
 
     def _append(self, added: Sequence[Frame]) -> None:

@@ -119,17 +119,15 @@ class OrderCertificate:
         if self.lower_bound == 0:
             return (
                 f"certificate: nothing is proved of all orders with {intervals} ({separations}): {self.open_cells} of "
-                f"{cells} are "
-                "left; narrow the intervals, keep orders farther apart, or allow more boxes"
+                f"{cells} are left; narrow the intervals, keep orders farther apart, or allow more boxes"
             )
         # Rounded up: a share that is said must be true.
         share = math.ceil(1000 * self.proved_tolerance - 1e-4) / 10
         text = (
             f"certificate: no orders with {intervals} ({separations}), on the order grid or between, have an RMS "
-            f"equation error "
-            f"below {self.lower_bound:.5g} with coefficients whose terms are together at most "
-            f"{self.max_term_ratio:g} times the "
-            f"output; {orders_text} leave {self.best:.5g}, so nothing is better by more than {share:g} % ({cells})"
+            f"equation error below {self.lower_bound:.5g} with coefficients whose terms are together at most "
+            f"{self.max_term_ratio:g} times the output; {orders_text} leave {self.best:.5g}, so nothing is better by "
+            f"more than {share:g} % ({cells})"
         )
         if self.open_cells:
             text += (
@@ -411,8 +409,7 @@ def search_summary(searches: Mapping[str, SearchResult]) -> Table:
         "worse than the last row kept."
         + "".join(
             f" Of the {number(s.exclusion_counts['bound'])} under “bound” of {_search_name(name)}, "
-            f"{number(s.excluded_by_box)} are in "
-            "boxes of orders that one bound excludes whole."
+            f"{number(s.excluded_by_box)} are in boxes of orders that one bound excludes whole."
             for name, s in searches.items()
             if s.excluded_by_box
         ),

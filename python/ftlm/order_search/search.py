@@ -134,8 +134,7 @@ def rank_by_free_runs(
     if not scored:
         raise ModelError(
             f"the simulations of the best {len(table)} candidates by equation error all diverge; check the signs of "
-            "the "
-            "non-linear terms, or search by equation error"
+            "the non-linear terms, or search by equation error"
         )
     scored.sort(key=lambda row: (row.score, row.index))
     return [replace(row, rank=rank) for rank, row in enumerate(scored, 1)]

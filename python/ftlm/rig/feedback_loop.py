@@ -279,9 +279,8 @@ def _numbers(reference: ArrayLike) -> Floats:
     raw = as_array("reference", reference)
     if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
         raise DataError(
-            "reference is not an array of numbers of shape (rows, 2), hub angles [rad] with one row per sample, nor "
-            "a pair of "
-            "angles to hold"
+            "reference is not an array of numbers of shape (rows, 2), hub angles [rad] with one row per sample, nor a "
+            "pair of angles to hold"
         )
     return np.array(raw, dtype=np.float64)
 

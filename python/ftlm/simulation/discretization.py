@@ -210,9 +210,8 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
         return {**channel, "samples": np.append(rate, rate[-1])}
     if name not in run:
         raise DataError(
-            f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
-            f"it has {', '.join(run.signals)}: name the columns with {parameter('inputs')} and "
-            f"{parameter('outputs')}"
+            f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; it has "
+            f"{', '.join(run.signals)}: name the columns with {parameter('inputs')} and {parameter('outputs')}"
         )
     delay = structure.delay.get(name)
     if delay and name not in run.inputs:
@@ -532,8 +531,7 @@ def prepare(
                 raise DataError(
                     f"{term.column} is constant on every run, so {term} and the offset in the equation of "
                     f"{item.output} are not separately identifiable; add a run in which it changes, fix its "
-                    f"coefficient, "
-                    f"or use {parameter('offset', 'none')}"
+                    f"coefficient, or use {parameter('offset', 'none')}"
                 )
     return prepared
 

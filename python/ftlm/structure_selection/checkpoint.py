@@ -202,9 +202,8 @@ class Store:
         if (request.algorithm, request.version) != (stored.algorithm, stored.version):
             raise DataError(
                 f"store {path} was written by ftlm {stored.version}, algorithm {stored.algorithm}; this is "
-                f"{request.version}, "
-                f"algorithm {request.algorithm}: finish the selection with that version, or start it again in another "
-                "file"
+                f"{request.version}, algorithm {request.algorithm}: finish the selection with that version, or start "
+                "it again in another file"
             )
         difference = request.difference(stored)
         if difference is not None:

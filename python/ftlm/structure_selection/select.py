@@ -209,8 +209,7 @@ def select(
     if delay and (unknown := [n for n in delay if n not in folds.runs[0].inputs]):
         raise ModelError(
             f"{parameter('delay')}: {unknown[0]!r} is not an input{nearest(unknown[0], folds.runs[0].inputs)}; the "
-            "runs "
-            f"have {', '.join(folds.runs[0].inputs)}"
+            f"runs have {', '.join(folds.runs[0].inputs)}"
         )
     automatic = [IntegerOrderForm(2, 1, bool(delay)).structure(problem) for problem in sought]
     for structure in (*searched, *every.values(), *automatic):

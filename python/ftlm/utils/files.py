@@ -309,8 +309,7 @@ class JsonFormat(Generic[T]):
         by = f", {short_repr(writer, MAX_NAME_CHARACTERS)}" if writer else ""
         return DataError(
             f"{path} is a {self.what} of a later version of ftlm{by}: it has schema {short_repr(schema)}, and this "
-            "version, "
-            f"{__version__}, reads up to {self.latest_schema}; upgrade ftlm"
+            f"version, {__version__}, reads up to {self.latest_schema}; upgrade ftlm"
         )
 
     def check_schema(self, path: str | os.PathLike[str], read: SchemaRecord, of: int) -> None:
