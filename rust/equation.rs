@@ -10,7 +10,7 @@ use crate::series;
 /// Orders closer than this are equal. Orders of a grid are multiples of its increment up to rounding.
 pub const ORDER_GRAIN: f64 = 1e-9;
 
-/// Term D^ν s. Its coefficient is stored beside the structure.
+/// Term D^ν s. Its coefficient is stored in the [`Equation`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Term {
     /// Index of the signal in the record.
@@ -35,7 +35,7 @@ pub struct Structure {
 pub struct Equation {
     /// Orders and signals.
     pub structure: Structure,
-    /// One coefficient a term.
+    /// Coefficient of each term.
     pub coefficients: Vec<f64>,
 }
 
@@ -62,8 +62,8 @@ pub enum Initial {
     },
     /// Output level: an unknown constant that is added to the simulated output, one a record and equation.
     ///
-    /// It is no term of the equation, so that it is one number whatever the orders. The record holds deviations from a
-    /// reference; an equation error has no term for the level.
+    /// It is not a term of the equation, so its value does not depend on the orders. The record holds deviations from a
+    /// reference. The equation error has no term for the level.
     Level {
         /// Other initial conditions, not an offset.
         under: Box<Initial>,
@@ -71,17 +71,17 @@ pub enum Initial {
     /// Sensor filter with nonzero initial conditions.
     ///
     /// Filtered signals lack the response of the filter to inputs before the record. That transient is a sum of the
-    /// filter's responses to an impulse and to derivatives of one.
+    /// filter's responses to an impulse and to derivatives of an impulse.
     Filtered {
         /// Other initial conditions, possibly with an offset, not filtered.
         under: Box<Initial>,
-        /// Number of these responses.
+        /// Number of these responses: the relative degree of the filter.
         states: u8,
     },
 }
 
 impl Equation {
-    /// A structure with one finite coefficient a term.
+    /// Return an equation with one finite coefficient per term.
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::NotFinite`].
@@ -98,7 +98,8 @@ impl Equation {
         Ok(equation)
     }
 
-    /// Return an error if a record with so many signals, all of them possible inputs, cannot supply the equation.
+    /// Return an error if the equation needs a signal beyond the number `signals` of the record. Any signal may be an
+    /// input.
     ///
     /// # Errors
     /// As [`Structure::check`] and [`Equation::new`].
@@ -175,7 +176,7 @@ impl Initial {
         }
     }
 
-    /// Other initial conditions with the same offset and filter transient.
+    /// Return the initial conditions `start` with the offset and filter transient of this one.
     ///
     /// ```
     /// use ftlm::equation::Initial;
@@ -248,7 +249,7 @@ impl Initial {
         }
     }
 
-    /// Exponents that stand for an impulse, −1, and its derivatives, −2, −3, ….
+    /// Exponents of the filter transient: −1 for an impulse, −2, −3, … for its derivatives.
     pub(crate) fn impulses(&self) -> impl Iterator<Item = f64> {
         let states = if let Self::Filtered { states, .. } = self { *states } else { 0 };
         (1..=states).map(|k| -f64::from(k))
@@ -381,7 +382,7 @@ pub(crate) fn missing_signal_error(signal: usize, signals: usize) -> Error {
     }
 }
 
-/// 0, 1, … below `order`: the powers of t that D^order annihilates.
+/// Integers 0, 1, … below `order`: exponents of the powers of t whose derivative D^order is zero.
 fn whole_below(order: f64) -> impl Iterator<Item = f64> {
     (0_u32..).map(f64::from).take_while(move |&i| i < order.min(MAX_ORDER) - ORDER_GRAIN)
 }
@@ -413,8 +414,8 @@ pub fn grains(order: f64) -> i64 {
     (order * 1e9).round() as i64
 }
 
-/// Largest size of an order law within the bounds of its free orders. The sum of several may exceed an order's own
-/// range, which is checked at every point; tables by integer order need memory in proportion to it.
+/// Largest magnitude of an order law within the bounds of its free orders. A law may exceed the range of one order,
+/// which is checked at every point. The memory of tables by integer order is proportional to this limit.
 pub const MAX_REACHED_ORDER: f64 = 100.0;
 
 /// An affine order law: constant + Σ weight·free order.
@@ -427,11 +428,11 @@ pub struct AffineOrder {
 }
 
 impl AffineOrder {
-    /// Check that there is a weight for each free order, and that no order within their bounds is extreme.
+    /// Check that each free order has a weight, and that the law within their bounds is at most [`MAX_REACHED_ORDER`]
+    /// in magnitude.
     ///
     /// # Errors
-    /// [`Error::Length`] for other weights than free orders; [`Error::OutOfRange`] for an order that may exceed
-    /// [`MAX_REACHED_ORDER`] in size.
+    /// [`Error::Length`] for a wrong number of weights; [`Error::OutOfRange`] for an order beyond that limit.
     pub fn check(&self, bounds: &[(f64, f64)]) -> Result<()> {
         check_length("weights of an order", bounds.len(), self.weights.len())?;
         let free = self.weights.iter().zip(bounds).map(|(w, (low, high))| w.abs() * low.abs().max(high.abs()));
@@ -447,7 +448,7 @@ impl AffineOrder {
         })
     }
 
-    /// Value at these free orders.
+    /// Value of the law at these free orders.
     #[must_use]
     pub fn at(&self, free: &[f64]) -> f64 {
         tidy(self.constant + self.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>())
@@ -509,10 +510,11 @@ impl Filter {
     }
 }
 
-/// Largest checked system. All 2^n choices of columns are examined; larger systems are not checked.
+/// Largest number of equations that is checked. The check examines all 2^n sets of columns, so larger systems are not
+/// checked.
 const MOST_EQUATIONS: usize = 16;
 
-/// Highest order of an entry, its coefficient, and the sum of the absolute values that make up the coefficient.
+/// Leading term of a polynomial entry: order, coefficient, and sum of the absolute values added to that coefficient.
 type Leading = Option<(f64, f64, f64)>;
 
 fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
@@ -523,7 +525,7 @@ fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading 
     }
 }
 
-/// Return an error if coupled equations leave an output undetermined.
+/// Return an error if coupled equations do not determine every output.
 ///
 /// As a polynomial in s the determinant must have the order of its largest products. If these cancel, the equations
 /// repeat or contradict each other.

@@ -22,7 +22,8 @@ use crate::series_system::System;
 /// Maximum number of halvings of a step that increases the cost.
 const MAX_STEP_HALVINGS: usize = 8;
 
-/// Increase of the cost (−2 log-likelihood) that counts as none: the likelihood ratio differs from 1 by a millionth.
+/// Increase of the cost (−2 log-likelihood) up to which a step is accepted. The likelihood ratio then differs from 1 by
+/// a millionth.
 const COST_TOLERANCE: f64 = 1e-6;
 
 /// Equations to refine: structures, fixed coefficients, exponents and exclusions of their initial terms.
@@ -161,7 +162,8 @@ impl CoupledProblem<'_> {
         Ok(Some(Iterate { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
     }
 
-    /// New coefficients of all equations, with covariances if requested; None if the inverse matrix is unstable.
+    /// New coefficients of all equations, with covariances if requested; None if the inverse of the system matrix is
+    /// unstable.
     fn step(
         &self,
         solutions: &[Solution],

@@ -51,7 +51,7 @@ pub struct InstrumentalFit {
     /// True if the last step changed no coefficient by more than the tolerance; otherwise the estimates are the iterate
     /// with the least output error.
     pub converged: bool,
-    /// True if the estimated model is unstable, so that its instruments were damped.
+    /// True if the estimated model is unstable. Its instruments then decay by the factor ρ < 1 per sample.
     pub damped: bool,
 }
 
@@ -292,7 +292,7 @@ impl<'a> CoupledProblem<'a> {
         }
     }
 
-    /// Step every equation once, with instruments from one coupled simulation.
+    /// Compute one step of every equation, with instruments from one coupled simulation.
     fn step(
         &self,
         solutions: &[Solution],

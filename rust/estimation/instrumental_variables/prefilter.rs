@@ -88,7 +88,7 @@ pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
 
 /// Second-order low-pass filter as a series, with cutoff frequency `omega` in rad/s.
 ///
-/// The equation holds unchanged between signals that all pass this filter.
+/// If all signals pass this filter, their equation is unchanged.
 ///
 /// # Errors
 /// As [`Filter::series`].
@@ -113,7 +113,7 @@ pub(super) fn state_variable_filter(pole: f64, order: f64, record: &Record) -> R
     Filter { numerator: vec![(1.0, order)], denominator }.series(record.m(), record.step())
 }
 
-/// The series 1.
+/// Series of the constant 1.
 pub(super) fn unit(m: usize) -> Vec<f64> {
     let mut one = vec![0.0; m];
     if let Some(first) = one.first_mut() {
@@ -122,13 +122,13 @@ pub(super) fn unit(m: usize) -> Vec<f64> {
     one
 }
 
-/// Resonators of [`project`] per decade and input. Their damping ratio makes neighbors overlap.
+/// Number of resonators of [`project`] per decade and input. At their damping ratio the passbands of neighbors overlap.
 const RESONATORS_PER_DECADE: usize = 8;
 const RESONATOR_DAMPING: f64 = 0.2;
 
 /// Relative norm below which the remaining columns of [`project`] are linearly dependent and excluded. The responses
-/// have almost no component along such directions, noise has as much as along any other, and rounding errors (10⁻¹¹ for
-/// columns of a thousand pulses) would determine them.
+/// have almost no component along such directions, while noise has as much as along any other. Rounding errors (10⁻¹¹
+/// for columns of a thousand pulses) would determine the directions.
 const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 
 /// Return a record with noise-free substitutes ([`project`]) for all signals except the inputs.

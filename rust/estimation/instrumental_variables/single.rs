@@ -1,8 +1,8 @@
 //! Instrumental variables for one equation: the regression of one step, and the iteration to convergence.
 //!
-//! The equation is filtered by 1/D̂, so that its error is close to the white noise of the output. It is correlated with
-//! instruments without noise: the inputs and the simulated output. Both depend on the last estimate, so the step is
-//! iterated.
+//! The equation is filtered by 1/D̂, so that its error is close to the white noise of the output. The filtered
+//! regressors are correlated with instruments without noise: the inputs and the simulated output. Filter and
+//! instruments depend on the last estimate, so the step is iterated.
 
 use super::prefilter::damped_inverse;
 use super::solution::{
@@ -127,7 +127,8 @@ pub struct Scratch {
 }
 
 impl Scratch {
-    /// Buffers of steps that return [`Interrupted`](crate::error::Error::Interrupted) after a stop request.
+    /// Return work buffers for steps that end with [`Interrupted`](crate::error::Error::Interrupted) after a stop
+    /// request.
     #[must_use]
     pub fn until(stop: &Stop) -> Self {
         Self { buffers: Buffers::default(), stop: stop.clone() }

@@ -122,8 +122,8 @@ const RANK_TOLERANCE: f64 = 1e-13;
 /// Orthonormalize the instruments of all records, one column over all records for each of k free coefficients.
 ///
 /// The result is the factor Q of a QR factorization, by the Gram–Schmidt process with reorthogonalization. The span is
-/// unchanged, so the estimate is the same. The products of Q with the regressors have the condition number of the
-/// regressors, the products of the instruments themselves have its square.
+/// unchanged, so the estimate is the same. The condition number of the products of Q with the regressors is that of the
+/// regressors. Products of the instruments themselves would have its square.
 ///
 /// O(records · k² m), where k counts the free coefficients of one record.
 ///
@@ -189,7 +189,7 @@ fn subtract_projection(column: &mut [f64], direction: &[f64], along: Option<f64>
     column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
 }
 
-/// Orthogonalize a column by `clear`, twice if its norm drops by half, and normalize it.
+/// Orthogonalize a column with the function `clear`, twice if its norm drops by half, and normalize it.
 ///
 /// Return false if the remainder is at rounding level.
 fn orthonormalize_column(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
@@ -213,8 +213,8 @@ fn stacked_norm(pieces: &[Vec<f64>]) -> f64 {
     pieces.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
 }
 
-/// Add the long-run covariance of the summed scores to a k × k matrix, with Bartlett weights
-/// (doi:10.2307/1913610). Filtered residuals are not white if other measured outputs enter the equation.
+/// Add the long-run covariance of the summed scores, with Bartlett weights (doi:10.2307/1913610), to the k × k matrix
+/// `meat`. Filtered residuals are not white if other measured outputs enter the equation.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn add_long_run_covariance(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
     let m = scores.first().map_or(0, Vec::len);

@@ -28,7 +28,8 @@ pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<
     robust_covariance(&attempt.jacobian, series, shares.as_deref())
 }
 
-/// Covariance from a Jacobian multiplied by robust weights, and unweighted residuals by run and output.
+/// Covariance of the parameters from a Jacobian multiplied by robust weights, and unweighted residuals by run and
+/// output.
 ///
 /// # Errors
 /// As [`covariance_of_residuals`].
@@ -45,7 +46,7 @@ pub fn robust_covariance(jacobian: &[Vec<f64>], series: Vec<Vec<f64>>, shares: O
     covariance_of_residuals(&rows, &series, squares(&series))
 }
 
-/// Pseudo-residuals of Huber's loss: least squares on them has the covariance of the M-estimator.
+/// Pseudo-residuals of Huber's loss. Their least-squares covariance is that of the M-estimator.
 #[allow(clippy::cast_precision_loss)]
 fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<Vec<f64>> {
     let finite: Vec<f64> = series.iter().flatten().copied().filter(|e| !e.is_nan()).collect();
@@ -161,9 +162,9 @@ fn quadratic_form(rows: &[&[f64]], covariances: &[f64]) -> Vec<f64> {
 /// Covariance of least-squares estimates with autocorrelated noise, modeled by an autoregression of the residuals.
 ///
 /// The regressors do not depend on the noise, so the autocovariances determine the covariance. An autoregression
-/// describes them with few parameters; sums over lags lose slow correlations such as 0.9 per sample. The fit removes
-/// the noise along its orthonormal basis from the residuals, which is corrected for. The loss is larger if the noise
-/// has the spectrum of the regressors.
+/// describes them with few parameters. Sums over lags lose slow correlations such as 0.9 per sample. The fit removes
+/// the noise along the orthonormal `basis` of its regressors from the residuals. The result is corrected for this loss,
+/// which is larger if the noise has the spectrum of the regressors.
 #[allow(clippy::cast_precision_loss)]
 fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[Vec<f64>]) -> Vec<f64> {
     let mut total = vec![0.0; answers.len() * answers.len()];

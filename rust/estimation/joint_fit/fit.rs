@@ -22,22 +22,23 @@ use crate::recording::{Recording, Recordings, Sampling};
 use crate::regressors::BANK_LIMIT;
 use crate::signal::statistics::{mean, median, white_noise_deviation};
 
-/// Share of the progress of a fit that belongs to the multistart. Each sweep takes [`SWEEP_PROGRESS_SHARE`] of the
-/// rest.
+/// Share of the multistart in the progress of a fit. Each later sweep over all runs takes [`SWEEP_PROGRESS_SHARE`] of
+/// the rest.
 const MULTISTART_PROGRESS_SHARE: f64 = 0.5;
 const SWEEP_PROGRESS_SHARE: f64 = 0.3;
-/// Residual of unit weight in a coarse fit, relative to the standard deviation of the output.
+/// Noise standard deviation assumed in a coarse fit, relative to the standard deviation of the output.
 const COARSE_RESIDUAL_RATIO: f64 = 0.01;
-/// Smallest noise standard deviation of an output relative to its standard deviation; smallest one of a warm start.
+/// Smallest noise standard deviation of an output in a warm start, relative to the standard deviation of the output.
 const MIN_NOISE_RATIO: f64 = 1e-3;
 const MIN_NOISE_DEVIATION: f64 = 1e-300;
-/// Maximum evaluations of each survivor on all samples, or on the first part of a long record.
+/// Maximum number of evaluations of each survivor of the multistart on all samples, or on the first part of a long
+/// record.
 const MAX_FINAL_EVALUATIONS: usize = 60;
 
 /// Standard deviation of an output, and an initial guess of its noise standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutputScale {
-    /// Root mean variance over all runs.
+    /// Standard deviation: root of the mean variance over all runs.
     pub deviation: f64,
     /// Standard deviation of the white noise.
     pub noise: f64,
@@ -93,7 +94,7 @@ pub enum Initialization {
     },
     /// A single initial guess: values of all free parameters.
     InitialGuess(Vec<f64>),
-    /// Warm start from a fit of the same structure to similar runs, with its grid and weights.
+    /// Warm start from a fit of the same structure to similar runs, with the grid and weights of that fit.
     WarmStart {
         /// Values of all free parameters.
         values: Vec<f64>,
@@ -101,7 +102,7 @@ pub enum Initialization {
         noise: Vec<f64>,
         /// Block pulses per sampling interval.
         pulses_per_sample: usize,
-        /// Candidates of its multistart; empty if there was none.
+        /// Candidates of the multistart of that fit; empty if there was none.
         candidates: Vec<Candidate>,
     },
 }
@@ -194,7 +195,7 @@ impl<'a> FitProblem<'a> {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct EquationFit {
-    /// Estimates by name.
+    /// Estimates by parameter name.
     pub values: BTreeMap<String, f64>,
     /// The optimum; its parameters are in the sequence of [`ParameterSet::names`].
     pub fit: JointFit,
@@ -333,7 +334,8 @@ pub fn fit(
 /// Origin label of a given initial guess.
 const GIVEN_START_ORIGIN: &str = "given start";
 
-/// Finish a fit with converged weights: prefer a stable optimum, refine the step and compute statistics.
+/// Finish a fit with converged weights: choose a stable optimum over an unstable one, refine the step, compute
+/// statistics.
 fn finish_fit(
     free: &ParameterSet,
     best: Candidate,
@@ -357,7 +359,7 @@ fn finish_fit(
     Ok(JointFit { optimum: optimum.into_statistics(), candidates, stability })
 }
 
-/// Fit a candidate with iterated weights until they converge.
+/// Fit a candidate by iteratively reweighted least squares until the weights converge.
 fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -> Result<(Candidate, Objective<'a>)> {
     let (attempt, grid) = fit_reweighted(&runner.result.iterate, grid, loss)?;
     Ok((runner.with_result(attempt), grid))

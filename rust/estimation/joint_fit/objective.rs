@@ -101,7 +101,8 @@ impl<'a> Objective<'a> {
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
     }
 
-    /// Objective with shifts of the residuals of all samples, by run and output, in units of the outputs.
+    /// Objective with constants `shifts` added to the residuals of all samples, by run and output, in units of the
+    /// outputs.
     #[must_use]
     pub fn with_residual_shifts(&self, shifts: &[Vec<Vec<f64>>]) -> Self {
         let mut experiments = Vec::clone(&self.experiments);
@@ -178,7 +179,7 @@ impl<'a> Objective<'a> {
         self.problem.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
-    /// Minimize the cost in the coordinates of another problem, see `ParameterSet::problem_at`.
+    /// Minimize the cost in the coordinates of another problem (see `ParameterSet::problem_at`).
     ///
     /// # Errors
     /// As [`Problem::minimize`].
@@ -323,7 +324,7 @@ impl<'a> Objective<'a> {
 
     /// Robust standard deviation of the residuals by output, in units of the weights.
     ///
-    /// If more than half of the residuals are zero, the root mean square of all.
+    /// If more than half of the residuals are zero, it is the root mean square of all residuals.
     #[must_use]
     pub fn residual_scales(&self, attempt: &OptimizationResult) -> Vec<f64> {
         let of = |e: &Vec<f64>| match robust_deviation(e) {

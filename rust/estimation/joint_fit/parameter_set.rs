@@ -14,26 +14,27 @@ use crate::fractional::kernels::MAX_ORDER;
 use crate::nonlinear::FreeFrictionLaw;
 use crate::signal::statistics::median;
 
-/// Default upper bound of free orders, unless the structure contains a higher order.
+/// Default upper bound of free orders. It is higher if the structure contains a higher order.
 pub const SEARCHED_ORDER: f64 = 3.0;
 /// Default bounds of the highest orders.
 pub const ALPHA_BOUNDS: (f64, f64) = (0.05, SEARCHED_ORDER);
 /// Default bounds of the highest orders of equations with friction.
 const FRICTION_BOUNDS: (f64, f64) = (1.001, 2.0);
-/// Ratios estimated from the equations lie at least this far above their lower bound, and below [`MAX_RATIO`].
-/// [`DEFAULT_RATIO_EXCESS`] above the lower bound is the initial guess if no equation determines the ratio.
+/// Smallest distance of an estimated ratio of the coefficient law from its lower bound. Ratios are below [`MAX_RATIO`].
+/// If no equation determines a ratio, its initial guess is [`DEFAULT_RATIO_EXCESS`] above the lower bound.
 const MIN_RATIO_EXCESS: f64 = 0.05;
 const MAX_RATIO: f64 = 20.0;
 const DEFAULT_RATIO_EXCESS: f64 = 0.5;
 
-/// Set of free parameters of a structure: orders are affine in the free orders, coefficients are products of free ones.
+/// Free parameters of a structure. Orders are affine in the free orders, coefficients are products of free
+/// coefficients.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterSet {
     /// The structure.
     pub structure: ParametricStructure,
     /// Names of the free orders.
     pub orders: Vec<String>,
-    /// Names of the free coefficients, including the factors of laws.
+    /// Names of the free coefficients, including the factors of coefficient laws.
     pub coefficients: Vec<String>,
     /// Coefficients determined by a law.
     pub products: Vec<Law>,
@@ -120,8 +121,8 @@ impl ParameterSet {
 
     /// Problem with coordinates for an optimization from `start`.
     ///
-    /// Nonzero coefficients use logarithms unless `plain` or there are nonlinear terms, whose initial guesses may have
-    /// wrong signs. The parameters with the indices `fixed` are fixed at their values.
+    /// The coordinate of a nonzero coefficient is its logarithm, unless `plain` or there are non-linear terms, whose
+    /// initial guesses may have wrong signs. The parameters with the indices `fixed` are fixed at their values.
     #[must_use]
     pub fn problem_at(&self, start: &Iterate, plain: bool, fixed: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
@@ -188,7 +189,7 @@ impl ParameterSet {
         self.coefficients.iter().map(of).collect()
     }
 
-    /// Integer orders within the bounds: second order with first and zeroth derivatives.
+    /// Integer orders within the bounds, as of a second-order equation with first and zeroth derivatives.
     #[must_use]
     pub fn integer_orders(&self) -> Vec<f64> {
         let mut usual: BTreeMap<&String, f64> = BTreeMap::new();
@@ -249,7 +250,7 @@ fn upper_order_bound(structure: &ParametricStructure, name: &String, above: bool
     numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
 }
 
-/// Time scaling of a problem: the unit of time of its runs, and the power of it in each parameter.
+/// Time scaling of a problem: the unit of time of its runs, and the exponent of that unit in each parameter.
 #[derive(Debug, Clone)]
 pub struct TimeScaling {
     unit: Unit,
@@ -261,7 +262,7 @@ pub struct TimeScaling {
 impl TimeScaling {
     /// Time scaling for runs of the given (sampling interval, duration).
     ///
-    /// The unit belongs to the geometric mean of the lowest frequency of the runs and the Nyquist frequency.
+    /// The unit is the inverse of the geometric mean of the lowest frequency of the runs and the Nyquist frequency.
     #[must_use]
     pub fn from_runs(problem: &Problem, spans: &[(f64, f64)]) -> Self {
         let spans: Vec<f64> = spans.iter().map(|(step, duration)| libm::log(*step) + libm::log(*duration)).collect();
@@ -273,13 +274,13 @@ impl TimeScaling {
         }
     }
 
-    /// ln of the unit of time.
+    /// Natural logarithm of the unit of time.
     #[must_use]
     pub fn unit(&self) -> f64 {
         self.unit.log_unit()
     }
 
-    /// Factor of each parameter for its value in the unit. It depends on the orders only, which have no unit.
+    /// Factor that converts each parameter to the unit of time. It depends on the orders only.
     fn factors(&self, values: &[f64]) -> Vec<f64> {
         let of = |i: usize| match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => self.unit.factor(j, &values[..self.orders]),
@@ -288,7 +289,7 @@ impl TimeScaling {
         (0..self.size).map(of).collect()
     }
 
-    /// Relative decrease of parameter i with a step of the orders, at a constant value in the unit.
+    /// Relative decrease of parameter i by a step of the orders that keeps its value in the unit of time.
     fn relative_decrease(&self, i: usize, step: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => {
@@ -298,19 +299,19 @@ impl TimeScaling {
         }
     }
 
-    /// Convert parameters to the unit.
+    /// Convert parameters to the unit of time.
     #[must_use]
     pub fn to_scaled(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v * f).collect()
     }
 
-    /// Convert parameters back from the unit.
+    /// Convert parameters from the unit of time back to seconds.
     #[must_use]
     pub fn to_unscaled(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v / f).collect()
     }
 
-    /// Convert a small step in the unit to a step of the parameters at the given values.
+    /// Convert a small step in the unit of time to a step of the parameters at the given values.
     #[must_use]
     pub fn step(&self, values: &[f64], changes: &[f64]) -> Vec<f64> {
         let factors = self.factors(values);
@@ -318,7 +319,8 @@ impl TimeScaling {
         values.iter().enumerate().map(of).collect()
     }
 
-    /// Standard errors in the unit, from a row-major covariance; infinite for a parameter that is not identifiable.
+    /// Standard errors in the unit of time, from a row-major covariance; infinite for a parameter that is not
+    /// identifiable.
     #[must_use]
     pub fn standard_errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
         let (n, factors) = (values.len(), self.factors(values));

@@ -1,5 +1,5 @@
-//! Problem of a joint fit, with friction or nonlinear terms or without: iterates, optimization, candidates and feasible
-//! steps.
+//! Problem of a joint fit: iterates, optimization, candidates and feasible steps. Equations may have friction and
+//! non-linear terms.
 
 use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
@@ -106,13 +106,13 @@ impl Problem {
         self.model.order_bounds.iter().copied().chain(coefficients).chain(ends).collect()
     }
 
-    /// True if an equation is unstable at a point and free initial terms may compensate the growth.
+    /// True if an equation is unstable at a point and has free initial terms, which may cancel the unstable mode.
     #[must_use]
     pub fn is_unstable(&self, point: &ParameterPoint) -> bool {
         self.is_linear() && !self.model.initial.is_at_rest() && self.model.is_unstable(point)
     }
 
-    /// Minimize the cost by Levenberg–Marquardt; if `steady`, a stable iterate does not become unstable.
+    /// Minimize the cost by Levenberg–Marquardt. If `steady`, a stable model does not become unstable.
     ///
     /// # Errors
     /// As [`fit_until`], with friction or nonlinear terms [`nonlinear::fit`].
@@ -199,7 +199,7 @@ impl OptimizationResult {
         Self { iterate, cost, residuals, jacobian, initial, initial_responses, evaluations, status }
     }
 
-    /// Cost per residual: 1 at the noise floor if the weights are right.
+    /// Cost per residual, which is about 1 if the weights match the noise and the model is complete.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn cost_per_residual(&self) -> f64 {
@@ -236,7 +236,7 @@ impl OptimizationResult {
 const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 /// Rounding error of the difference of two orders, each rounded to 1e-9. Orders of other signals may equal the highest.
 const ORDER_ROUNDING_TOLERANCE: f64 = 2e-9;
-/// Relative singular value below which a constraint normal is linearly dependent.
+/// Relative singular value below which the normal of a constraint is linearly dependent on others.
 const DIRECTION_RANK_TOLERANCE: f64 = 1e-9;
 
 /// Affine constraint a·x + b ≥ m.

@@ -4,8 +4,9 @@
 //! State-variable filters 1/(s + λ)^n give first coefficients for several λ (Garnier & Young). Refined instrumental
 //! variables improve them: with the exact simulation x as instrument and y − x as residual, the step d of the
 //! coefficients of the denominator A solves Σ_t Ψ_i (y − x − Σ_j Φ_j d_j) = 0, Ψ_i = s^i/A x, Φ_j = s^j/A y. Other
-//! guesses add a pole or a pair of poles to the optimum of a lower order. The best continue in the logarithms of p and q
-//! of the sections s² + p s + q, where every point is stable and no pole is faster than the samples resolve.
+//! guesses add a pole or a pair of poles to the optimum of a lower order. The best guesses are refined in the
+//! logarithms of p and q of the second-order sections s² + p s + q. In these coordinates every point is stable. Poles
+//! above the Nyquist frequency are excluded by bounds.
 
 use std::borrow::Cow;
 use std::f64::consts::PI;
@@ -34,28 +35,32 @@ use crate::signal::statistics::{inner, mean, median};
 
 /// Poles λ of the state-variable filters relative to the frequency that halves the power of the output.
 const FILTER_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
-/// Poles added to an optimum of lower order, relative to the same frequency, and damping of an added pair.
+/// Poles added to an optimum of lower order, relative to the frequency that halves the power of the output.
 const ADDED_POLE_RATIOS: [f64; 7] = [0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0];
+/// Damping ratio of an added pair of poles.
 const ADDED_PAIR_DAMPING: f64 = 0.05;
-/// Steps of the instrumental variables, and halvings of one that does not decrease the cost.
+/// Maximum number of steps of the instrumental variables.
 const INSTRUMENT_STEPS: usize = 8;
+/// Maximum number of halvings of a step that does not decrease the cost.
 const MAX_HALVINGS: usize = 5;
-/// Initial guesses that continue, and evaluations of each. Costs that differ less are one optimum.
+/// Number of initial guesses that are refined.
 const CONTINUED_GUESSES: usize = 3;
+/// Maximum number of evaluations of each refined guess.
 const SECTION_EVALUATIONS: usize = 40;
+/// Relative difference of two costs below which they belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
 const COST_TOLERANCE: f64 = 1e-8;
-/// Largest magnitude of p/2 and √q of a section times the step: a real pole that is faster and a pair above the
-/// Nyquist frequency are not determined by the samples.
+/// Largest p/2 and √q of a section, times the step. The samples do not determine faster real poles, nor pairs above the
+/// Nyquist frequency.
 const MAX_DECAY_STEP: f64 = 1.0;
 const MAX_FREQUENCY_STEP: f64 = PI;
 /// Smallest magnitude of a pole times the duration of the longest run.
 const MIN_POLE_DURATION: f64 = 1e-4;
 /// Smallest damping of an initial guess.
 const MIN_DAMPING: f64 = 1e-4;
-/// Least number of runs on which guesses are compared.
+/// Smallest number of runs on which guesses are compared.
 const MIN_RUNS: usize = 2;
-/// Delays that continue.
+/// Number of delays for which guesses are refined.
 const CONTINUED_DELAYS: usize = 3;
 
 /// Exact simulation at a point.
@@ -63,21 +68,24 @@ type Evaluation<'a> = evaluation::Evaluation<ExactSimulation<'a>>;
 /// Complex pole.
 type Pole = (f64, f64);
 
-/// One equation whose autoregressive coefficients are those of a polynomial.
+/// One equation of integer orders, whose autoregressive coefficients are the coefficients of its denominator.
 struct Equation<'a> {
     model: FreeModel,
     experiments: &'a [Experiment],
-    /// Coefficient of each order of the output, from the lowest; the orders below are integrators.
+    /// Index of the coefficient of each order of the output, from the lowest order. Lower orders than that are
+    /// integrators.
     own: Vec<usize>,
     integrators: usize,
     stop: &'a Stop,
-    /// Frequency that halves the power of the output, step and duration of the runs.
+    /// Frequency \[rad/s\] that halves the power of the output.
     frequency: f64,
+    /// Pulse width \[s\].
     step: f64,
+    /// Duration of the longest run \[s\].
     duration: f64,
 }
 
-/// Guess with its cost.
+/// Initial guess with its cost.
 struct Guess {
     cost: f64,
     point: ParameterPoint,
@@ -134,10 +142,10 @@ pub fn integer_order_optima(
     Ok(Some(candidates))
 }
 
-/// Runs on which the guesses of an equation are compared, of many runs those with the most excitation.
+/// Return the runs on which the guesses of an equation are compared: of many runs those with the most excitation.
 ///
-/// In turn each input contributes the run in which it varies most, until there are two runs and the samples of a coarse
-/// fit. The optima start from these guesses on all runs.
+/// Each input in turn adds the run in which it varies most, until there are two runs and enough samples for a coarse
+/// fit. The optima on all runs start from these guesses.
 fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment]) -> Vec<&'a Experiment> {
     let mut inputs: Vec<usize> = equation.terms.iter().map(|(signal, ..)| *signal).collect();
     inputs.retain(|signal| *signal != equation.output);
@@ -184,7 +192,7 @@ fn single_output(experiment: &Experiment, i: usize) -> Experiment {
 }
 
 impl<'a> Equation<'a> {
-    /// Equation i of a model; None if its autoregressive coefficients are not free ones of their own.
+    /// Equation i of a model; None if an autoregressive coefficient is fixed or shared.
     #[allow(clippy::cast_precision_loss)]
     fn new(model: &FreeModel, i: usize, experiments: &'a [Experiment], stop: &'a Stop) -> Option<Self> {
         let equation = &model.equations[i];
@@ -276,7 +284,7 @@ impl<'a> Equation<'a> {
         Ok(evaluations)
     }
 
-    /// Delays at which a filter of second order fits best: local minima of its cost.
+    /// Local minima of the cost of a second-order model over the delay, best first.
     fn likely_delays(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         if delays.len() <= CONTINUED_DELAYS {
             return Ok(if delays.is_empty() { vec![Vec::new()] } else { delays.to_vec() });
@@ -350,7 +358,7 @@ impl<'a> Equation<'a> {
         Ok(guesses)
     }
 
-    /// Refine the best distinct guesses by variable projection over their sections.
+    /// Refine the best distinct guesses by variable projection over their second-order sections.
     fn refine(&self, mut guesses: Vec<Guess>) -> Result<Vec<Guess>> {
         guesses.retain(|guess| guess.cost.is_finite());
         guesses.sort_by(|a, b| a.cost.total_cmp(&b.cost));
@@ -393,7 +401,7 @@ impl<'a> Equation<'a> {
         Ok(exact.evaluate(&self.model, self.experiments, point, &linear).ok().filter(|e| cost(e).is_finite()))
     }
 
-    /// Coefficients of s^0 … s^(n − 1) of the divisor.
+    /// Coefficients of s^0 … s^(n − 1) of the denominator.
     fn divisor(&self, point: &ParameterPoint) -> Vec<f64> {
         let own = self.own.iter().map(|&j| -point.coefficients[j]);
         std::iter::repeat_n(0.0, self.integrators).chain(own).collect()
@@ -419,7 +427,7 @@ impl<'a> Equation<'a> {
         mirrored
     }
 
-    /// Point with unstable poles reflected and poles within the bounds of the sampling.
+    /// Point with unstable poles reflected at the imaginary axis and fast poles moved below the Nyquist frequency.
     fn stabilize(&self, point: &ParameterPoint) -> ParameterPoint {
         let (fastest, slowest) = (MAX_FREQUENCY_STEP / self.step, MIN_POLE_DURATION / self.duration);
         let poles = self.poles(point);
@@ -435,7 +443,7 @@ impl<'a> Equation<'a> {
         self.at_poles(point, &poles.into_iter().map(within).collect::<Vec<_>>())
     }
 
-    /// Logarithms of p and q of the sections s² + p s + q, then of the real pole that is left.
+    /// Logarithms of p and q of the sections s² + p s + q, then of the remaining real pole.
     fn sections(&self, poles: &[Pole]) -> Vec<f64> {
         let slowest = MIN_POLE_DURATION / self.duration;
         let mut real: Vec<f64> = poles.iter().filter(|(_, im)| *im == 0.0).map(|(re, _)| (-re).max(slowest)).collect();

@@ -30,7 +30,8 @@ use crate::signal::statistics::median;
 const MAX_START_PULSES: usize = 1024;
 /// Cutoff frequencies of the prefilters relative to the bandwidth of the outputs; None for no prefilter.
 const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 2] = [Some(2.0), None];
-/// Cutoff frequencies under an order law: the equations that it ties have several minima, which differ by cutoff.
+/// Cutoff frequencies of structures with an order law. Their equation errors have several minima, which depend on the
+/// cutoff.
 const PREFILTER_CUTOFF_RATIOS_BY_LAW: [Option<f64>; 5] = [Some(1.0), Some(2.0), Some(4.0), Some(8.0), None];
 /// Difference below which two orders are equal.
 const ORDER_TOLERANCE: f64 = 1e-9;
@@ -93,7 +94,7 @@ impl<'a> OrderGrids<'a> {
 
     /// Candidates from order grids on prefiltered records, at given values of the free input parameters.
     ///
-    /// The prefilter commutes with the equation: all signals pass it, so the true coefficients are unchanged while
+    /// All signals pass the prefilter, which commutes with the equation. The true coefficients are unchanged, while
     /// noise above the bandwidth is removed.
     fn candidates_at_inputs(
         &self,
@@ -188,8 +189,8 @@ impl InitialGuessSource for OrderGrids<'_> {
     }
 }
 
-/// Largest distance of initial guesses of a delay, as phase at the bandwidth of the output. There are at most
-/// [`MAX_DELAY_STARTS`] combinations over all inputs with free parameters.
+/// Largest distance of neighboring initial guesses of a delay, as phase at the bandwidth of the output. There are at
+/// most [`MAX_DELAY_STARTS`] combinations over all inputs with free parameters.
 const MAX_DELAY_PHASE_RAD: f64 = 1.0;
 const MAX_DELAY_STARTS: f64 = 12.0;
 /// Number of initial guesses of a saturation or dead zone, from [`MIN_LIMIT_RATIO`] of the largest input upwards.
@@ -198,8 +199,8 @@ const MIN_LIMIT_RATIO: f64 = 0.1;
 
 /// Initial guesses of free delays and limits, each with a description.
 ///
-/// A fit with a delay too far off ends in a local optimum shifted by an oscillation. A limit above all samples has no
-/// effect.
+/// From a poor guess of the delay a fit converges to a local optimum shifted by one period of an oscillation. A limit
+/// above all samples has no effect.
 pub(super) fn input_points(free: &ParameterSet, source: &Recordings, fastest: f64) -> Result<Vec<(Vec<f64>, String)>> {
     let inputs = &free.structure.inputs;
     let axes = inputs.iter().map(|item| input_axis(item, inputs.len(), source, fastest)).collect::<Result<Vec<_>>>()?;

@@ -28,7 +28,7 @@ pub(super) struct GridRow {
 }
 
 impl GridRow {
-    /// Values of the named orders.
+    /// Values of the orders with these names.
     pub(super) fn values(&self, names: &[String]) -> Vec<f64> {
         let value = |name: &String| self.orders.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, value)| *value);
         names.iter().map(value).collect()
@@ -221,13 +221,13 @@ fn standard_deviation(values: &[f64]) -> f64 {
     mean(&squares).sqrt()
 }
 
-/// Best rows of an order grid from which the coefficients follow by a law.
+/// Number of best rows of an order grid for which the coefficients are computed by a coefficient law.
 const ROWS_BY_LAW: usize = 4;
 /// Maximum number of initial guesses from one order grid under an order law.
 const MAX_GUESSES_UNDER_ORDER_LAW: usize = 8;
-/// Number of best rows of an order grid among which these are chosen.
+/// Number of best rows of an order grid from which the initial guesses under an order law are chosen.
 const ROWS_UNDER_ORDER_LAW: usize = 4000;
-/// Least difference of two of them in at least one order: more than one increment of the grid.
+/// Smallest difference of two initial guesses in at least one order: more than one increment of the grid.
 const MIN_ORDER_SEPARATION: f64 = 0.35;
 /// Ratios of a coefficient law at which the coefficients of one equation follow from those of another.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
@@ -244,9 +244,9 @@ pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &s
 
 /// Initial guesses from the best rows of an order grid.
 ///
-/// One guess is the best row. Under an order law there are several, because the equation errors of the equations that it
-/// ties have several minima; each differs from every better one in at least one order. A row with the orders of a guess
-/// in `before` is not repeated, but counts.
+/// Without an order law the only guess is the best row. The equation error under an order law has several minima, so
+/// several rows are returned. Each differs from every better row in at least one order. A row with the orders of a
+/// guess in `before` is omitted, but counts toward the maximum number.
 pub(super) fn grid_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
@@ -279,7 +279,8 @@ fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
     values.iter().zip(others).all(|(a, b)| (a - b).abs() <= ORDER_TOLERANCES.0 + ORDER_TOLERANCES.1 * b.abs())
 }
 
-/// Candidates with the coefficients of one equation from another by the law, the rest by least squares.
+/// Candidates in which the coefficients of one equation follow from another by the coefficient law, the rest by least
+/// squares.
 ///
 /// The motor hub of a flexible arm is overdamped: current and friction nearly cancel, and the link equation explains
 /// the rest of the acceleration equally well. An unconstrained estimate of the hub equation then converges to the link
@@ -330,7 +331,7 @@ pub(super) fn law_candidates(
     Ok(attempts)
 }
 
-/// Increment of the order grid of the initial guesses; a start within half of it leads to the optimum.
+/// Increment of the order grid of the initial guesses. A fit from within half an increment converges to the optimum.
 const START_INCREMENT: f64 = 0.2;
 /// Number of grid points above which the orders of other signals get fewer values.
 const MAX_START_CANDIDATES: u128 = 200_000;
@@ -385,7 +386,7 @@ pub(super) fn start_axes(free: &ParameterSet) -> Axes {
     axes
 }
 
-/// Small grid of the typical orders of a structure; None if there are none.
+/// Small grid of the typical orders of a structure; None if no typical orders are known.
 pub(super) fn natural_axes(free: &ParameterSet) -> Option<Axes> {
     let natural = &free.structure.hints.natural;
     let axis = |(name, &(low, high)): (&String, &(f64, f64))| {
@@ -419,7 +420,7 @@ fn candidate_count(equation: &ParametricEquation, axes: &Axes) -> u128 {
 
 /// Groups of equations that share no free order, so that an order search can treat them separately.
 ///
-/// Equations tied by an order law form one group. Equations without free orders are omitted.
+/// Equations with a common order law form one group. Equations without free orders are omitted.
 pub(super) fn independent_groups(structure: &ParametricStructure) -> Vec<ParametricStructure> {
     let mut groups: Vec<(BTreeSet<&String>, Vec<&ParametricEquation>)> = Vec::new();
     for item in &structure.equations {

@@ -65,7 +65,8 @@ impl LowPassCache {
 /// Share of the power below the bandwidth of a signal.
 const POWER_SHARE: f64 = 0.9;
 
-/// Bandwidth \[rad/s\] that contains 90 % of the power of samples, `step` \[s\] apart; NaN without samples. O(N log N).
+/// Bandwidth \[rad/s\] that contains 90 % of the power of samples with the sampling interval `step` \[s\]; NaN without
+/// samples. O(N log N).
 ///
 /// ```
 /// use ftlm::estimation::joint_fit::initial_guesses::power_frequency;

@@ -1,8 +1,9 @@
-//! Initial guesses from a scan of resonances: for fixed autoregressive terms the output error is linear in the rest.
+//! Initial guesses from a scan over the resonance frequency. With fixed autoregressive terms the output error is linear
+//! in the other coefficients.
 //!
 //! With feedback between signals or autocorrelated residuals, equation-error least squares does not identify the
-//! autoregressive terms. Here they are placed on a grid of frequencies and damping ratios. All other coefficients and
-//! the initial terms follow by linear least squares on the output error.
+//! autoregressive terms. Here the autoregressive terms are placed on a grid of frequencies and damping ratios. All
+//! other coefficients and the initial terms follow by linear least squares on the output error.
 
 use std::collections::BTreeMap;
 
@@ -34,7 +35,7 @@ const FREQUENCY_RATIOS: [f64; 14] = [
     5.891_744_851_769_920_5,
     8.0,
 ];
-/// Damping ratios of the scan.
+/// Damping ratios of the scan over resonance frequencies.
 const DAMPING_RATIOS: [f64; 4] = [0.03, 0.15, 0.5, 1.0];
 /// Maximum number of points of a scan that become candidates.
 const MAX_SCAN_CANDIDATES: usize = 4;
@@ -76,7 +77,7 @@ pub(super) fn scan_candidates(
     Ok(out)
 }
 
-/// True if an offset coincides with a given initial term: they are not separately identifiable.
+/// Return true if an offset coincides with an initial term, so that the two are not separately identifiable.
 fn has_duplicate_offset(fixed: &ParametricStructure) -> bool {
     let exponents = match fixed.initial.under() {
         Initial::Powers(powers) if !fixed.history => powers,

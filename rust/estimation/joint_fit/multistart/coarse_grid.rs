@@ -9,18 +9,17 @@ use crate::signal::statistics::mean;
 /// Samples of the coarse fits over all runs; each run has at least `MIN_RUN_SAMPLES`.
 pub const MAX_COARSE_SAMPLES: usize = 1200;
 const MIN_RUN_SAMPLES: usize = 400;
-/// Largest decimation without a check of the bandwidth. Above it, half a period of the frequency that contains 90 % of
-/// the power needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]: with fewer, the grid is refined to the samples again. The
-/// first part of a record can represent it if its outputs have at least [`MIN_DEVIATION_RATIO`] of the standard
-/// deviation of the whole.
+/// Largest decimation without a check of the bandwidth. With a larger one, half a period of the frequency below which
+/// 90 % of the power lies needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]. The first part of a record represents the
+/// record if the standard deviation of its outputs is at least [`MIN_DEVIATION_RATIO`] of that of the whole.
 const MAX_UNCHECKED_DECIMATION: usize = 10;
 const MIN_SAMPLES_PER_HALF_PERIOD: f64 = 6.0;
 const MIN_DEVIATION_RATIO: f64 = 0.7;
 
 /// Sampling of the runs for the multistart.
 ///
-/// Decimation must not alias the motion. If a long record needs a larger decimation, its first part is used instead,
-/// provided that it varies like the whole record.
+/// Decimation must not alias the signals. If a long record would need too large a decimation, its first part is used
+/// instead, provided that it varies like the whole record.
 ///
 /// # Errors
 /// If an output of the structure is no signal of the runs.
@@ -48,7 +47,8 @@ pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampl
     Ok(Sampling { decimation: carried, leading_intervals: Some(first), ..all })
 }
 
-/// Leading intervals of each run that represent long records at `count` intervals in all; None for short records.
+/// Number of leading intervals of each run that represents long records, about `count` over all runs; None for short
+/// records.
 ///
 /// # Errors
 /// If an output of the structure is no signal of the runs.
@@ -63,7 +63,7 @@ fn output_samples<'a>(free: &ParameterSet, source: &'a Recordings) -> Result<Vec
     free.structure.equations.iter().map(|equation| source.samples(equation.output)).collect()
 }
 
-/// True if the outputs vary in the first intervals like in the whole record.
+/// True if the outputs have a similar standard deviation in the first intervals as in the whole record.
 fn varies_like_whole(outputs: &[Vec<&[f64]>], first: usize) -> bool {
     outputs.iter().flatten().all(|samples| {
         standard_deviation(&samples[..=first.min(samples.len() - 1)])

@@ -28,20 +28,21 @@ const COARSE_SAMPLES: usize = 1200;
 const MAX_BODY_ORDER: f64 = 2.0;
 /// Initial Coulomb friction relative to the largest input force on the body.
 const COULOMB_FORCE_RATIOS: [f64; 4] = [0.01, 0.05, 0.2, 0.5];
-/// Initial Coulomb friction relative to the estimate with the measured sign of the velocity.
+/// Initial Coulomb friction relative to its estimate from the linear equation with the measured sign of the velocity.
 const MEASURED_SIGN_RATIOS: [f64; 2] = [1.0, 0.3];
-/// Initial Stribeck friction relative to Coulomb friction, and its speed relative to the speed of the body.
+/// Initial Stribeck friction relative to Coulomb friction.
 const STRIBECK_COULOMB_RATIOS: [f64; 3] = [0.02, 0.2, 1.0];
+/// Initial Stribeck velocity relative to the root-mean-square speed of the body.
 const STRIBECK_SPEED_RATIOS: [f64; 3] = [0.05, 0.2, 0.6];
 /// Initial inertia of the attached bodies relative to the inertia of the body.
 const LOAD_INERTIA_RATIOS: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
-/// Largest number of initial guesses in which each body carries a load of its own.
+/// Largest number of initial guesses in which each body has its own fraction of attached inertia.
 const MAX_LOAD_COMBINATIONS: usize = 64;
-/// Largest difference of two orders that are action and reaction of two coupled equations.
+/// Largest difference of the orders of two terms that are action and reaction of two coupled equations.
 const MAX_REACTION_ORDER_GAP: f64 = 0.5;
 /// Smallest peak-to-peak motion of a body, in standard deviations of its noise.
 const MIN_MOTION_NOISE_RATIO: f64 = 10.0;
-/// Prefix of the signal of the measured sign of a velocity.
+/// Prefix of the name of the signal that is the sign of a measured velocity.
 const SIGN_PREFIX: &str = "coulomb_";
 
 /// Values by name: orders, coefficients and input parameters.
@@ -131,7 +132,7 @@ fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<
     Ok(())
 }
 
-/// Structure with other friction.
+/// Structure with the friction parameters that the function `other` returns.
 fn with_friction(
     structure: &ParametricStructure,
     other: impl Fn(&FrictionParameters) -> Option<FrictionParameters>,
@@ -256,7 +257,7 @@ fn with_measured_sign(
     with_measured_inputs(&signed, &Recordings::new(runs)?, equations)
 }
 
-/// Order sets of the linear fits: integer orders, and natural orders of the hints.
+/// Order sets of the linear fits: integer orders, and the typical orders of the prior knowledge.
 ///
 /// Equations that share orders determine each of them poorly. An overdamped body has another optimum at every order.
 fn order_sets(free: &ParameterSet) -> Vec<Values> {
@@ -304,9 +305,9 @@ fn fit_frictionless_equations(
 
 /// Initial guesses of isolated bodies with the coupling forces of the attached bodies added.
 ///
-/// Coupling forces follow from action and reaction. A body driven by measured neighbors may be explained by their
-/// motion alone, without its input and its friction, so each body is fitted in isolation first. All bodies carry the
-/// same fraction of their inertia if `together`, or each its own.
+/// Coupling forces follow from action and reaction. The measured motion of its neighbors may explain a body without its
+/// input and friction, so each body is fitted in isolation first. If `together`, the attached inertia is the same
+/// fraction of the inertia of every body; otherwise each body has its own fraction.
 fn loaded_body_guesses(
     free: &ParameterSet,
     course: MultistartContext<'_>,
@@ -400,7 +401,7 @@ fn value_at(values: &Values, name: &str) -> f64 {
     values.get(name).copied().unwrap_or(0.0)
 }
 
-/// Coefficients by which attached bodies act on a body, scaled by the inertia ratio.
+/// Coefficients of the reaction forces of attached bodies on a body, scaled by the inertia ratio.
 fn reaction_coefficients(
     structure: &ParametricStructure,
     item: &ParametricEquation,

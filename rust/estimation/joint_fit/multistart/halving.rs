@@ -11,27 +11,29 @@ use crate::estimation::joint_fit::progress::ProgressListener;
 use crate::estimation::output_error::{Experiment, MinimizationSettings};
 use crate::parallel::Stop;
 
-/// Evaluations of every candidate. Then those near the best get [`SECOND_BUDGET_EVALUATIONS`].
+/// Number of evaluations of every candidate in the first budget. Candidates near the best then get
+/// [`SECOND_BUDGET_EVALUATIONS`].
 pub(super) const FIRST_BUDGET_EVALUATIONS: usize = 15;
 pub(super) const SECOND_BUDGET_EVALUATIONS: usize = 60;
-/// Initial guesses of a submodel that continue.
+/// Smallest number of initial guesses of a submodel that continue after the prescreening.
 pub(super) const MIN_SURVIVORS: usize = 8;
-/// Evaluations of the prescreening.
+/// Number of evaluations of each candidate in the prescreening.
 pub(super) const PRESCREEN_EVALUATIONS: usize = 2;
 /// Maximum number of candidates that continue on all samples.
 pub(super) const MAX_FINAL_SURVIVORS: usize = 3;
 /// Ratio to the best coarse cost above which a candidate does not continue.
 pub(super) const MAX_SURVIVOR_COST_RATIO: f64 = 3.0;
-/// Ratio to its initial guess below which a coefficient counts as 0: in logarithms an optimization stops at e^-20.
+/// Ratio to its initial guess below which a coefficient counts as 0. In logarithmic coordinates an optimization stops
+/// at e^-20.
 const ZERO_COEFFICIENT_RATIO: f64 = 1e-8;
 /// Relative difference of two costs below which they can belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
-/// Relative difference of all parameters below which candidates coincide; absolute one of the orders of an optimum.
+/// Relative difference of all parameters, or absolute difference of the orders, below which two candidates coincide.
 const SAME_PARAMETER_TOLERANCE: f64 = 0.02;
-/// Relative difference of the orders of the same optimum, added to the absolute one.
+/// Relative tolerance of the orders of the same optimum, added to the absolute tolerance.
 const SAME_ORDER_RELATIVE_TOLERANCE: f64 = 1e-5;
 
-/// Executor of budgets: number of starts for the progress, threads, progress callback.
+/// Executor of one rung of successive halving: number of starts, threads and progress callback.
 #[derive(Clone, Copy)]
 pub(super) struct RungExecutor<'a> {
     pub starts: usize,
@@ -144,7 +146,7 @@ impl Rung<'_> {
     }
 }
 
-/// Set coefficients to 0 that vanished in logarithmic coordinates, so that they can change their sign.
+/// Set coefficients that became negligible in logarithmic coordinates to 0, so that they can change their sign.
 fn zero_vanishing_coefficients(free: &ParameterSet, start: &Candidate, mut ended: Candidate) -> Candidate {
     if free.products.is_empty() && !free.has_friction() {
         let before = &start.result.iterate.point.coefficients;
@@ -171,8 +173,8 @@ pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
     competitive_candidates(&first)
 }
 
-/// Candidates with a cost within a fixed ratio (`MAX_SURVIVOR_COST_RATIO`) of the best; the input need not be sorted
-/// after the first.
+/// Candidates with a cost within a fixed ratio (`MAX_SURVIVOR_COST_RATIO`) of the best; the first candidate of the
+/// input must be the best.
 #[must_use]
 pub fn competitive_candidates(reached: &[Candidate]) -> Vec<Candidate> {
     let limit = reached.first().map_or(0.0, |best| MAX_SURVIVOR_COST_RATIO * best.cost_per_residual());
@@ -190,7 +192,7 @@ pub fn is_same_optimum(one: &Candidate, other: &Candidate) -> bool {
         && are_all_close(&inputs(other), &inputs(one), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
-/// True if two candidates agree in all parameters. Several order grids contain the same points.
+/// True if two candidates agree in all parameters, as those of order grids with common points do.
 #[must_use]
 pub fn is_same_iterate(one: &Candidate, other: &Candidate) -> bool {
     are_all_close(&other.result.values(), &one.result.values(), SAME_PARAMETER_TOLERANCE, 0.0)

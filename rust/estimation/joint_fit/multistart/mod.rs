@@ -2,10 +2,10 @@
 //!
 //! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
 //! samples. They start from optima of integer orders with the orders freed ([`IntegerOrderProblem`]) and from order
-//! grids. Submodels supply further candidates, because the full problem reaches their optima, too: problems with one
-//! term less ([`ReducedProblem`]) or one fixed order ([`FixedOrderProblem`]). Bodies with friction start from linear
-//! fits ([`run_friction_multistart`]), nonlinear terms from fits with the measured values of their expressions
-//! ([`run_nonlinear_multistart`]).
+//! grids. Optima of submodels are further candidates of the full problem. A submodel has one term less
+//! ([`ReducedProblem`]) or one fixed order ([`FixedOrderProblem`]). Equations with friction start from linear fits
+//! ([`run_friction_multistart`]). Equations with non-linear terms start from fits with the measured values of their
+//! expressions ([`run_nonlinear_multistart`]).
 
 mod coarse_grid;
 mod friction;

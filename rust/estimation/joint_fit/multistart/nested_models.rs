@@ -16,7 +16,7 @@ pub struct ReducedProblem {
     coefficient: String,
     order: Order,
     value: f64,
-    /// True if the coefficient is fixed and all signals remain in the equation.
+    /// True if the coefficient is fixed, so that all signals remain in the equation. False if the term is removed.
     pub keeps_signals: bool,
 }
 
@@ -35,7 +35,8 @@ impl ReducedProblem {
         Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
     }
 
-    /// Embed a candidate in the full problem. The free order of a term with coefficient 0 is set to half the highest.
+    /// Embed a candidate in the full problem. The free order of a term with coefficient 0 is set to half of the highest
+    /// order.
     #[must_use]
     pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
         let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
@@ -61,7 +62,7 @@ impl ReducedProblem {
     }
 }
 
-/// Submodels with one term less; empty if a law ties orders or coefficients to one another.
+/// Submodels with one term less; empty if the structure has an order law or a coefficient law.
 ///
 /// A free input term of fixed order is removed if it is not the only one and the equations are not coupled. The signals
 /// of one machine are correlated, so there can be optima in which one signal replaces the others. For the same reason a
@@ -228,7 +229,7 @@ impl FixedOrderProblem {
     }
 }
 
-/// Submodels with one order fixed, if there are several orders. None may fit better than the full problem.
+/// Submodels with one order fixed, if there are several orders. No submodel may fit better than the full problem.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn fixed_order_problems(free: &ParameterSet) -> Vec<FixedOrderProblem> {

@@ -3,7 +3,7 @@
 //! With measured values a derived signal is one more input, and the order grids of linear equations give initial
 //! guesses, ranked by simulations of the nonlinear equations. Derivatives of measured signals are taken of raw and of
 //! smoothed samples. With friction, output-error fits of these equations are the guesses. Without friction such fits
-//! add guesses only if no other one reaches the noise, as do fits without the nonlinear terms.
+//! add guesses only if no other guess reaches the noise level. The same holds for fits without the non-linear terms.
 
 use super::coarse_grid::coarse_sampling;
 use super::friction::{guess_at, run_friction_multistart, values_of};
@@ -107,7 +107,7 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
     Ok(ended)
 }
 
-/// Best candidates of a problem with some of the parameters as guesses of the full one.
+/// Return the best candidates of a problem with fewer parameters as initial guesses of the full problem.
 fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> Result<Vec<Candidate>> {
     let of = |runner: &Candidate| {
         let mut values = values_of(less, runner);
@@ -119,7 +119,7 @@ fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> 
     candidates.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
 }
 
-/// Problem without the nonlinear terms; None if an equation has no others.
+/// Problem without the nonlinear terms; None if an equation has only non-linear terms.
 fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterSet> {
     let recorded = structure.recorded_count();
     let of = |item: &ParametricEquation| {
@@ -137,7 +137,7 @@ fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterS
     ParameterSet::from_structure(ParametricStructure { bounds, ..less }).ok()
 }
 
-/// Recordings with the derived signals as measured ones, after smoothing of what is differentiated.
+/// Recordings in which the derived signals are measured signals. Samples are smoothed before they are differentiated.
 fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, half_width: usize) -> Result<Recordings> {
     let of = |run: &Recording| {
         if run.has_nonuniform_samples() {
@@ -184,7 +184,7 @@ fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_wi
     Ok(Channel { is_filtered, ..Channel::new(name, samples, role) })
 }
 
-/// Derivative of smoothed samples by Grünwald–Letnikov.
+/// Grünwald–Letnikov derivative of smoothed samples.
 fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usize) -> Vec<f64> {
     let first = if run.is_at_rest { 0.0 } else { samples[0] };
     let deviations: Vec<f64> = smooth(&samples, half_width).iter().map(|v| v - first).collect();
@@ -193,7 +193,7 @@ fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usi
     series::multiply(&weights, &deviations, deviations.len()).into_iter().map(|v| scale * v).collect()
 }
 
-/// Samples smoothed by local cubics (Savitzky–Golay), over shorter windows near the ends.
+/// Samples smoothed by local cubic polynomials (Savitzky–Golay filter), with shorter windows near the ends.
 #[allow(clippy::cast_precision_loss)]
 fn smooth(samples: &[f64], half_width: usize) -> Vec<f64> {
     let of = |k: usize| {

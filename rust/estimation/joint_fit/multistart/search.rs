@@ -120,7 +120,7 @@ struct MultistartState<'a> {
     course: MultistartContext<'a>,
     laps: RungExecutor<'a>,
     coarse: Objective<'a>,
-    /// The grid of half the step, if it was computed.
+    /// Grid with half the step; None if it was not needed.
     half: Option<Objective<'a>>,
     starts: Vec<Candidate>,
     /// Candidates of the full problem after the first budget.
@@ -130,7 +130,7 @@ struct MultistartState<'a> {
     candidates: Vec<Candidate>,
 }
 
-/// Multistart of a problem with few initial terms; return the candidates and their grid.
+/// Run the multistart of a problem with few initial terms; return the candidates and their grid.
 fn multistart_without_history<'a>(
     free: &'a ParameterSet,
     course: MultistartContext<'a>,
@@ -303,7 +303,8 @@ impl<'a> MultistartState<'a> {
         self.evaluate_and_add(&ended.iter().take(1).map(|runner| one.embed(runner, self.free)).collect::<Vec<_>>())
     }
 
-    /// Add the optima without offsets: offsets of the runs can hide which measured signal is the input.
+    /// Add the optima of the model without offsets. With a free offset per run, a fit may converge without the true
+    /// input.
     fn add_model_without_offset(&mut self) -> Result<()> {
         let structure = &self.free.structure;
         let plain = structure.initial.without_offset();
@@ -347,10 +348,10 @@ fn rank_candidates(
     Ok(order.into_iter().filter_map(|i| runners[i].take()).collect())
 }
 
-/// Multistart of a problem with many initial terms per run, which are added for the survivors only.
+/// Run the multistart of a problem with many initial terms per run, which are added for the survivors only.
 ///
-/// The initial terms move most optima by less than their distance. The survivors are ranked again after a budget with
-/// all initial terms.
+/// The initial terms shift most optima by less than the distance between two optima. The survivors are ranked again
+/// after a budget with all initial terms.
 fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let few = free.with_initial_terms(free.structure.initial.with_under(Initial::Caputo), false)?;
     let (reached, coarse) = multistart_without_history(&few, course)?;

@@ -14,14 +14,14 @@ use crate::regressors::Record;
 use crate::series;
 use crate::signal::statistics::white_noise_deviation;
 
-/// Span over which the velocity is measured, as a fraction of the run, and its smallest size in noise standard
-/// deviations.
+/// Time over which a velocity is measured, as a fraction of the duration of the run.
 const VELOCITY_SPAN_FRACTION: f64 = 0.01;
+/// Smallest motion over that time that counts as sliding, in standard deviations of the noise.
 const VELOCITY_NOISE_RATIO: f64 = 5.0;
 /// Iterations in which the friction force at rest is recomputed from the input forces.
 const MAX_REST_ITERATIONS: usize = 4;
 
-/// One run: its pulse means, and the sign of the measured velocity, 0 at rest.
+/// Pulse means of one run, and the sign of the measured velocity, which is 0 at rest.
 struct Part {
     record: Record,
     sign: Vec<f64>,
