@@ -29,7 +29,7 @@ pub struct Regression {
     pub columns: Vec<Vec<f64>>,
     /// y minus the terms with fixed coefficients.
     pub target: Vec<f64>,
-    /// First row of each record, and the end of the last.
+    /// Index of the first row of each record, then the number of rows.
     pub starts: Vec<usize>,
     exponents: Vec<f64>,
     fixed: Vec<Option<f64>>,
@@ -39,7 +39,7 @@ impl Regression {
     /// Build the regressors I^{α−ν} s of an equation, and t^e per record.
     ///
     /// # Errors
-    /// [`Error::Length`] if `fixed` does not match the terms or there is no record; invalid structures.
+    /// [`Error::Length`] if `fixed` does not match the terms or there is no record; as [`Structure::check`].
     pub fn new(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Self> {
         check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
         if records.is_empty() {

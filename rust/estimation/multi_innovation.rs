@@ -1,9 +1,9 @@
 //! Multi-innovation least squares (paper (42)–(44)): the recursion as published, and its exact closed form.
 //!
 //! One step of (44) with the p newest rows is a block step of recursive least squares. After all rows the recursion has
-//! minimized Σ w_i (m_i − q_iᵀX)² + (X − X₀)ᵀK₀⁻¹(X − X₀) with w_i = min(p, M − i + 1), because every row takes part in
-//! each step in which it is one of the p newest. The innovation length p therefore only weights the data against the
-//! prior.
+//! minimized Σ w_i (m_i − q_iᵀX)² + (X − X₀)ᵀK₀⁻¹(X − X₀) with w_i = min(p, M − i + 1), because a row is used in every
+//! step in which it is one of the p newest. Apart from the last rows, the innovation length p therefore only weights
+//! the data relative to the prior.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, Error, Result};
@@ -63,7 +63,7 @@ impl Prior {
     }
 }
 
-/// Settings of the recursion (44).
+/// Settings of the recursion (44) of the paper.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Innovation {
     /// Innovation length p ≥ 1.
@@ -137,8 +137,8 @@ pub fn closed_form(
     regression.estimate(&solution, &dropped)
 }
 
-/// Solution of the weighted rows with those of the prior, of these inverse covariances, and the dependent columns. The
-/// first `needed` must not be.
+/// Least-squares solution of the weighted rows and of prior rows with the inverse covariances `prior`; also the
+/// linearly dependent columns. The first `needed` columns must be independent.
 fn weighted_solution(
     (columns, target, starts): (&[impl AsRef<[f64]>], &[f64], &[usize]),
     length: usize,
@@ -155,7 +155,7 @@ fn weighted_solution(
     }
 }
 
-/// Rows times the square roots of their weights, and below them those of the prior.
+/// Rows times the square roots of their weights, with the rows of the prior below them.
 fn weighted_rows(
     mut columns: Vec<Vec<f64>>,
     mut target: Vec<f64>,
@@ -224,7 +224,7 @@ pub fn path(
     run_recursion((columns, target, &[0, target.len()]), length, &prior, stop)
 }
 
-/// Coefficients after every step of the recursion through records that begin at `starts`, step by step.
+/// Coefficients after every step of the recursion through records whose first rows are `starts`.
 fn run_recursion(
     (columns, target, starts): (&[impl AsRef<[f64]>], &[f64], &[usize]),
     length: usize,
@@ -250,7 +250,7 @@ fn run_recursion(
     Ok(trace)
 }
 
-/// Inverse prior covariances of a checked problem.
+/// Check a problem; return the inverse prior covariances.
 fn check_problem(
     columns: &[impl AsRef<[f64]>],
     target: &[f64],

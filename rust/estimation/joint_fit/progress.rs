@@ -1,4 +1,4 @@
-//! Progress of a fit, which never decreases.
+//! Monotonic progress of a fit.
 
 use crate::error::Result;
 
@@ -8,7 +8,7 @@ pub const PROGRESS_PARTS: usize = 1000;
 /// Progress callback of (parts done, [`PROGRESS_PARTS`]); an error ends the fit.
 pub type ProgressListener<'a> = dyn Fn(usize, usize) -> Result<()> + 'a;
 
-/// Progress of a fit as a share of 1, over phases of unknown length.
+/// Progress of a fit as a fraction of 1, over phases of unknown length.
 pub struct FitProgress<'a> {
     listener: &'a ProgressListener<'a>,
     share_done: f64,
@@ -18,13 +18,13 @@ pub struct FitProgress<'a> {
 }
 
 impl<'a> FitProgress<'a> {
-    /// Progress 0, with a callback.
+    /// Return a progress of 0 with a callback.
     #[must_use]
     pub fn new(listener: &'a ProgressListener<'a>) -> Self {
         Self { listener, share_done: 0.0, reported_parts: None, phase_start: 0.0, last: 0.0 }
     }
 
-    /// Advance to a share of the whole.
+    /// Advance to a fraction of the whole.
     ///
     /// # Errors
     /// The error of the callback.
@@ -39,8 +39,8 @@ impl<'a> FitProgress<'a> {
         (self.listener)(parts, PROGRESS_PARTS)
     }
 
-    /// Advance within a phase that ends at a share of the whole. A phase can count from zero repeatedly; each sweep
-    /// takes the share `sweep` of the rest.
+    /// Advance within a phase that ends at the fraction `share` of the whole, after `count` of `of` parts. A phase can
+    /// count from zero repeatedly. Each count takes the fraction `sweep` of the rest of the phase.
     ///
     /// # Errors
     /// As [`FitProgress::advance_to`].

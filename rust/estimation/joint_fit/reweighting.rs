@@ -8,7 +8,7 @@ use super::problem::{Iterate, OptimizationResult};
 use crate::error::{Error, Result};
 use crate::signal::statistics::HUBER_THRESHOLD;
 
-/// Standard deviations above which a residual is an outlier: one in two million for normal noise.
+/// Standard deviations above which a residual is an outlier: one in two million samples of normal noise.
 const OUTLIER_DEVIATIONS: f64 = 5.0;
 /// Change of the robust weights below which they have converged.
 const ROBUST_WEIGHT_TOLERANCE: f64 = 2e-3;
@@ -28,9 +28,9 @@ pub enum Loss {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct RobustSummary {
-    /// Residuals beyond 1.345 standard deviations, which are downweighted; 18 % of normal noise.
+    /// Number of residuals beyond 1.345 standard deviations, which are downweighted: 18 % of normal noise.
     pub reduced_weight_count: usize,
-    /// Residuals beyond five standard deviations.
+    /// Number of residuals beyond five standard deviations.
     pub outliers: usize,
     /// Number of residuals.
     pub samples: usize,
@@ -70,9 +70,9 @@ pub(super) fn are_weights_equal(before: Option<&Vec<Vec<Vec<f64>>>>, after: Opti
     }
 }
 
-/// Maximum evaluations of each optimization.
+/// Maximum number of evaluations of each optimization.
 pub const EVALUATIONS_PER_REWEIGHTING: usize = 120;
-/// Maximum number of reweightings. Robust weights converge by a factor of about four each.
+/// Maximum number of reweightings. Each one reduces the error of the robust weights by a factor of about four.
 const MAX_REWEIGHTINGS: usize = 4;
 const MAX_ROBUST_REWEIGHTINGS: usize = 15;
 /// Relative difference between noise levels and weights below which the weights have converged.

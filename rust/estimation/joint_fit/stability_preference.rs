@@ -14,15 +14,16 @@ use super::structure::Coefficient;
 use crate::error::{Error, Result};
 use crate::signal::statistics::mean;
 
-/// Number of segments of the runs whose sums of squares are compared; then the 99 % quantile of Student's t for one
-/// degree of freedom less.
+/// Number of segments of the runs whose sums of squares are compared.
 const COMPARISON_SEGMENTS: f64 = 20.0;
+/// 99 % quantile of Student's t with one degree of freedom less than the number of segments.
 const STUDENT_T_QUANTILE_99: f64 = 2.54;
 /// Ratio of the residuals above which the better optimum is chosen without a test: instability can show up only at the
 /// end of a run.
 const DECISIVE_RESIDUAL_RATIO: f64 = 2.0;
-/// Maximum number of stable candidates of the multistart to try, and evaluations of each.
+/// Maximum number of stable candidates of the multistart that are tried.
 const MAX_STABLE_CANDIDATES: usize = 3;
+/// Maximum number of evaluations of each stable candidate.
 const EVALUATIONS_PER_CANDIDATE: usize = 60;
 
 /// Comparison of an unstable optimum with the best stable one.
@@ -31,8 +32,8 @@ const EVALUATIONS_PER_CANDIDATE: usize = 60;
 pub struct StabilityComparison {
     /// True if the unstable optimum is the result, because it fits significantly better or no stable one exists.
     pub keeps_unstable: bool,
-    /// Relative excess of the root mean square residual of the stable one. Infinite if there is none, negative if the
-    /// unstable one was no optimum.
+    /// Relative excess of the root mean square residual of the stable optimum. It is infinite without a stable optimum,
+    /// and negative if the unstable model was not an optimum.
     pub residual_excess: f64,
     /// True if the stable one lies on the stability limit and is no local optimum.
     pub at_stability_limit: bool,
@@ -130,7 +131,7 @@ fn is_unstable(free: &ParameterSet, runner: &Candidate) -> bool {
     free.problem.is_unstable(&runner.result.iterate.point)
 }
 
-/// Names of the free autoregressive coefficients, with their fixed factors.
+/// Free autoregressive coefficients by name, with the known factor that multiplies each in its term.
 fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
     let own = free.structure.equations.iter().flat_map(|equation| equation.autoregressive_terms());
     own.filter_map(|term| match &term.coefficient {

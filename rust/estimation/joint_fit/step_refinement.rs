@@ -16,7 +16,8 @@ const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
 /// Fewest block pulses of a grid whose optimum is corrected for its step without optimizations on finer grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
-/// Corrections by one pair of finer grids. Each leaves about the relative error of the grid of the last one.
+/// Maximum number of corrections by one pair of finer grids. Each correction multiplies the error of the last by about
+/// the relative discretization error of the grid.
 const MAX_CORRECTIONS: usize = 4;
 
 /// Optimum on the finest grid, and its extrapolation to zero step.
@@ -119,9 +120,9 @@ pub fn refine_step<'a>(
 
 /// Optimum of a long record for zero step size, by deferred correction; None if that needs a finer grid.
 ///
-/// The residuals of two finer grids at the optimum, extrapolated to zero step, replace those of the grid: the difference
-/// depends on the parameters only slightly, so that it is added to the samples and the grid is fitted again (Stetter,
-/// doi:10.1007/BF01432879), until the estimate does not move. The finer grids are simulated without derivatives.
+/// At the optimum, the residuals of two finer grids are extrapolated to zero step. Their difference from the residuals
+/// of the grid hardly depends on the parameters. It is added to the samples, and the grid is fitted again until the
+/// estimate does not change (Stetter, doi:10.1007/BF01432879). The finer grids are simulated without derivatives.
 ///
 /// # Errors
 /// As [`covariance`] and the source; [`Error::Interrupted`].
@@ -161,8 +162,8 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
     Ok(None)
 }
 
-/// Differences of the residuals at the limit for zero step from those of a grid, by run and output, in units of the
-/// outputs; None where they are large relative to the noise or a simulation is not finite.
+/// Differences of the residuals extrapolated to zero step from those of a grid, by run and output, in units of the
+/// outputs. None where they are large relative to the noise or a simulation is not finite.
 fn limit_shifts(
     place: &Iterate,
     grid: &Objective<'_>,
@@ -241,7 +242,7 @@ fn is_within_errors(clock: &TimeScaling, one: &[f64], other: &[f64], (at, spread
     ways.zip(&errors).all(|((a, b), error)| (a - b).abs() <= MAX_CHANGE_STANDARD_ERRORS * error)
 }
 
-/// Extrapolate two grids beyond the finer one, by the difference divided by `share`.
+/// Extrapolate the estimates of two grids: add their difference, divided by `share`, to the estimate of the finer grid.
 fn extrapolate(
     grid: &Objective<'_>,
     clock: &TimeScaling,
@@ -254,7 +255,7 @@ fn extrapolate(
     Ok(clock.to_unscaled(&grid.problem.last_feasible_point(&fine, &target)?))
 }
 
-/// Start on half the step: the optimum is expected to move a quarter as far as at the last halving.
+/// Initial guess on half the step. The optimum is expected to move a quarter as far as at the last halving.
 fn extrapolated_start(
     grid: &Objective<'_>,
     clock: &TimeScaling,
@@ -269,7 +270,8 @@ fn extrapolated_start(
     }
 }
 
-/// Best other candidate, with converged weights, if it fits better than one stopped at the limit of its domain.
+/// Best other candidate, with converged weights, if it fits better than the result `stuck`, which stopped at the limit
+/// of its domain.
 ///
 /// Unstable candidates are excluded if the objective requires stability.
 ///
@@ -307,8 +309,8 @@ fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -
 
 /// Select the extrapolated limit or the optimum of the finer grid, whichever fits better on half the step.
 ///
-/// Extrapolation along a straight line leaves a flat curved valley of poorly determined parameters. If the residuals
-/// are linear along the line and the grids agree, the limit is better.
+/// If poorly determined parameters have a curved valley, a straight extrapolation leaves it. If the residuals are
+/// linear along the line and the grids agree, the limit is better.
 fn select_limit_or_optimum(
     best: &OptimizationResult,
     grid: &Objective<'_>,

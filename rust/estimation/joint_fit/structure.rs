@@ -14,9 +14,9 @@ const ORDER_TOLERANCE: f64 = 1e-9;
 /// Coefficient of a term: free or fixed.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Coefficient {
-    /// Its name.
+    /// Name of the free coefficient.
     Free(String),
-    /// Its value.
+    /// Value of the fixed coefficient.
     Known(f64),
 }
 
@@ -40,11 +40,11 @@ impl Coefficient {
 pub struct ParametricTerm {
     /// Index of the signal.
     pub signal: usize,
-    /// ν.
+    /// Order ν of the derivative.
     pub order: Order,
-    /// The coefficient.
+    /// Coefficient, free or fixed.
     pub coefficient: Coefficient,
-    /// Its known factor.
+    /// Known factor of the coefficient.
     pub factor: f64,
 }
 
@@ -62,11 +62,11 @@ impl ParametricTerm {
 /// Friction parameters fc, fs and vs of the output of an equation, each a factor times a coefficient.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionParameters {
-    /// fc.
+    /// Coulomb friction fc.
     pub coulomb: (f64, Coefficient),
-    /// fs; 0 without a Stribeck effect.
+    /// Stribeck friction fs, the excess of static over Coulomb friction; 0 without a Stribeck effect.
     pub stribeck: (f64, Coefficient),
-    /// vs.
+    /// Stribeck velocity vs.
     pub speed: (f64, Coefficient),
 }
 
@@ -81,9 +81,9 @@ impl FrictionParameters {
 pub struct ParametricEquation {
     /// Index of the output.
     pub output: usize,
-    /// α.
+    /// Highest order α.
     pub order: Order,
-    /// The right-hand side.
+    /// Terms of the right-hand side.
     pub terms: Vec<ParametricTerm>,
     /// Friction on the velocity of the output, if any.
     pub friction: Option<FrictionParameters>,
@@ -119,7 +119,7 @@ impl ParametricEquation {
         std::iter::once(&self.order).chain(self.terms.iter().map(|term| &term.order))
     }
 
-    /// Terms of its own output.
+    /// Terms of the output of the equation.
     pub fn autoregressive_terms(&self) -> impl Iterator<Item = &ParametricTerm> {
         self.terms.iter().filter(|term| term.signal == self.output)
     }
@@ -160,7 +160,7 @@ impl ParametricEquation {
 /// Free parameter of an input and its name.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Input {
-    /// Its name, such as `delay_u`.
+    /// Name of the parameter, such as `delay_u`.
     pub name: String,
     /// Kind of the parameter and its input.
     pub free: FreeInput,
@@ -169,9 +169,9 @@ pub struct Input {
 /// Coefficient law: a coefficient that equals sign · Π factors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Law {
-    /// The coefficient.
+    /// Name of the coefficient.
     pub name: String,
-    /// ±1.
+    /// Sign, ±1.
     pub sign: f64,
     /// Names of the factors, repeated for powers.
     pub factors: Vec<String>,
@@ -186,7 +186,7 @@ pub struct Hints {
     pub natural: BTreeMap<String, Vec<f64>>,
     /// Physical lower bound of each ratio of the coefficient law; default 1.
     pub ratio_lower_bounds: BTreeMap<String, f64>,
-    /// Coefficients tied by the law to another equation and positive by physics.
+    /// Coefficients that the law determines from another equation and that are positive by physics.
     pub positive: BTreeSet<String>,
     /// Approximate physical values of coefficients.
     pub known: BTreeMap<String, f64>,
@@ -276,7 +276,7 @@ impl ParametricStructure {
     /// Check that signals have names and orders form valid equations.
     ///
     /// # Errors
-    /// [`Error::Structure`] for an equation without terms, or a signal that is not there; an order out of range.
+    /// [`Error::Structure`] for an equation without terms, a signal that does not exist, or an order out of range.
     pub fn check(&self) -> Result<()> {
         if self.equations.is_empty() {
             return Err(Error::Structure { what: "a model without an equation".into(), remedy: "add one".into() });
@@ -295,7 +295,7 @@ impl ParametricStructure {
         self.equations.iter().try_for_each(ParametricEquation::check)
     }
 
-    /// Substitute values for some free orders.
+    /// Return the structure with values for some free orders.
     ///
     /// # Errors
     /// As [`ParametricStructure::check`].
@@ -310,7 +310,7 @@ impl ParametricStructure {
         Ok(out)
     }
 
-    /// Substitute values for some free coefficients.
+    /// Return the structure with values for some free coefficients.
     #[must_use]
     pub fn with_coefficients(&self, values: &BTreeMap<String, f64>) -> Self {
         let mut out = self.clone();
@@ -331,7 +331,7 @@ impl ParametricStructure {
         Self { inputs: Vec::new(), ..self.clone() }
     }
 
-    /// Replace equation number `place`, and remove bounds of orders that no longer occur.
+    /// Return the structure with another equation at index `place`, without the bounds of orders that no longer occur.
     #[must_use]
     pub fn with_equation(&self, place: usize, equation: ParametricEquation) -> Self {
         let mut out = self.clone();
@@ -398,7 +398,7 @@ impl Order {
         self.constant + self.weights.iter().map(|(name, weight)| weight * value(name)).sum::<f64>()
     }
 
-    /// Substitute values for some free orders.
+    /// Return the order with values for some free orders.
     #[must_use]
     pub fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
         let weighted = self.weights.iter().filter_map(|(name, weight)| values.get(name).map(|value| weight * value));
@@ -407,7 +407,7 @@ impl Order {
         Self { constant, weights }
     }
 
-    /// Form used by the estimators, with the weights in the sequence of `names`.
+    /// Convert to an order with unnamed weights, in the sequence of `names`.
     #[must_use]
     pub fn affine(&self, names: &[String]) -> AffineOrder {
         let weight = |name: &String| self.weights.iter().find(|(n, _)| n == name).map_or(0.0, |(_, weight)| *weight);

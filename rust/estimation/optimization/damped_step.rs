@@ -14,14 +14,16 @@ use crate::linalg::orthogonal::norm;
 use crate::linalg::small::{self, back_substitute};
 use crate::signal::statistics::inner;
 
-/// Smallest damping; below it the rounding error of the factor dominates.
+/// Smallest damping; below it the rounding error of the QR factor dominates.
 pub(crate) const MIN_DAMPING: f64 = 1e-12;
-/// Distance from a linear constraint, in the change of the residuals relative to their norm, up to which it is active.
+/// Distance from a linear constraint up to which it is active. The distance is the change of the residuals, relative to
+/// their norm.
 const ACTIVE_CONSTRAINT_TOLERANCE: f64 = 1e-9;
 
-/// Linearization of a problem at a point: R of [J | e] with J in coordinates and unit columns, and the free parameters.
+/// Linearization of a problem at a point: QR factor R of [J | e], with J in coordinates and scaled to unit columns.
 ///
-/// Eliminated parameters come first, so that the lower part of R belongs to the others with these projected out.
+/// Eliminated parameters come first. The lower part of R then belongs to the other parameters, with the eliminated ones
+/// projected out.
 pub(crate) struct LinearizedProblem {
     r: Vec<f64>,
     /// Parameter of each column.
@@ -32,7 +34,7 @@ pub(crate) struct LinearizedProblem {
     gradient: Vec<f64>,
     /// Distances from the bounds, in scaled steps.
     distance_to_bounds: Vec<(f64, f64)>,
-    /// Linear inequality constraints on scaled steps: unit normal, and largest product with a step.
+    /// Linear inequality constraints on scaled steps: unit normal, and largest dot product of the normal with a step.
     constraints: Vec<(Vec<f64>, f64)>,
     /// True for parameters excluded from the steps.
     is_fixed: Vec<bool>,
@@ -100,7 +102,7 @@ impl LinearizedProblem {
         }
     }
 
-    /// Largest gradient component of a free parameter, without what points out of active constraints.
+    /// Largest gradient component of a free parameter, without components that point out of active constraints.
     pub(crate) fn max_gradient(&self) -> f64 {
         let mut gradient = self.gradient.clone();
         for (k, multiplier) in self.active_constraints() {
@@ -114,7 +116,7 @@ impl LinearizedProblem {
         !self.constraints.is_empty()
     }
 
-    /// Constraints against which the gradient pushes, with their multipliers.
+    /// Active constraints that block the descent direction: index and Lagrange multiplier.
     pub(crate) fn active_constraints(&self) -> Vec<(usize, f64)> {
         let near = |k: &usize| self.constraints[*k].1 <= ACTIVE_CONSTRAINT_TOLERANCE * self.norm;
         let active: Vec<usize> = (0..self.constraints.len()).filter(near).collect();
@@ -137,7 +139,8 @@ impl LinearizedProblem {
         (step, falls)
     }
 
-    /// Step with secant curvature over the parameters that are not eliminated; None if the model has no minimum.
+    /// Step with secant curvature over the parameters that are not eliminated; None if the quadratic model has no
+    /// minimum.
     pub(crate) fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
         let step = self.step_within_bounds(|is_fixed| self.minimize_with_curvature(is_fixed, damping, curvature))?;
         let falls = self.predicted_decrease(&step, self.eliminated_count) - self.curvature_change(&step, curvature);
@@ -179,7 +182,8 @@ impl LinearizedProblem {
         (-2.0 * along - quadratic) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
-    /// Product JᵀJ s in coordinates, by parameter, with the eliminated parameters projected out.
+    /// Product JᵀJ s of the Gauss–Newton matrix with a step s, by parameter, with the eliminated parameters projected
+    /// out.
     pub(crate) fn columns_along(&self, step: &[f64]) -> Vec<f64> {
         let k = self.scales.len();
         let scaled: Vec<f64> = self.order.iter().zip(&self.scales).map(|(&i, scale)| step[i] * scale).collect();
@@ -246,7 +250,7 @@ impl LinearizedProblem {
 
 /// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for fixed parameters.
 ///
-/// Eliminated parameters have the smallest damping. Constraints hold normal · s ≤ room.
+/// Eliminated parameters have the smallest damping. Each constraint (normal, room) means normal · s ≤ room.
 fn triangular_damped_step(
     r: &[f64],
     is_fixed: &[bool],
@@ -291,7 +295,7 @@ fn triangular_damped_step(
 
 /// Minimize ‖R x − rhs‖ for upper-triangular R under normal · x ≤ room, where x = 0 is feasible.
 ///
-/// In z = R x − rhs it is a problem of least distance, which nonnegative least squares solve (Lawson & Hanson,
+/// In z = R x − rhs this is a least-distance problem, which is solved by nonnegative least squares (Lawson & Hanson,
 /// doi:10.1137/1.9781611971217, §23.4).
 fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(Vec<f64>, f64)]) -> Vec<f64> {
     let (k, size) = (rhs.len(), norm(rhs));
@@ -373,7 +377,8 @@ pub trait LeastSquaresProblem {
         (f64::INFINITY, f64::INFINITY)
     }
 
-    /// Linear inequality constraints on steps from a point: normal, in the coordinates, and largest product with a step.
+    /// Linear inequality constraints on steps from a point: normal in the coordinates, and largest dot product of the
+    /// normal with a step.
     fn constraints(&self, _point: &Self::Point) -> Vec<(Vec<f64>, f64)> {
         Vec::new()
     }
@@ -388,7 +393,7 @@ pub trait LeastSquaresProblem {
         0.0
     }
 
-    /// True if a point is admissible. No step leads from an admissible point to one that is not.
+    /// True if a point is admissible. Steps from an admissible point to an inadmissible one are rejected.
     fn is_admissible(&self, _point: &Self::Point) -> bool {
         true
     }
@@ -398,7 +403,7 @@ pub trait LeastSquaresProblem {
         true
     }
 
-    /// Whether the first step may be almost Gauss–Newton, as the minimization follows an optimum that is nearly known.
+    /// True if the optimum is nearly known, so that the first step may be almost Gauss–Newton.
     fn starts_near_optimum(&self) -> bool {
         false
     }
@@ -436,7 +441,7 @@ impl Curvature {
         self.matrix.chunks_exact(self.count.max(1)).map(|row| row.iter().zip(step).map(|(a, s)| a * s).sum()).collect()
     }
 
-    /// Second-order change of twice the cost along a step, by this matrix.
+    /// Quadratic form sᵀ B s of this matrix B: second-order change of twice the cost along a step s.
     pub(crate) fn quadratic_form(&self, step: &[f64]) -> f64 {
         self.times(step).iter().zip(step).map(|(a, s)| a * s).sum()
     }
@@ -453,7 +458,7 @@ impl Curvature {
         }
     }
 
-    /// Update the matrix by a step: `change` of the gradient, and `columns`, the part of it due to JᵀJ.
+    /// Update the matrix after a step. `change` is the change of the gradient, and `columns` the part of it due to JᵀJ.
     pub(crate) fn update(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
         let target: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
@@ -480,16 +485,17 @@ impl Curvature {
         }
     }
 }
-/// Number of steps that are extrapolated.
+/// Number of last steps whose sum is extrapolated.
 const EXTRAPOLATION_STEPS: usize = 4;
-/// Ratio of the norm of the sum of the steps to the sum of their norms below which they have no common direction.
+/// Ratio of the norm of the sum of the steps to the sum of their norms. Below it the steps have no common direction.
 const MIN_STRAIGHTNESS: f64 = 0.8;
 /// Relative decrease of the cost per step above which no extrapolation is needed.
 const MAX_GAIN_PER_STEP: f64 = 1e-3;
 /// Evaluations after an extrapolation within which the cost must decrease.
 const MAX_TRIAL_EVALUATIONS: usize = 6;
-/// Factor of the sum of the steps, initially and at most.
+/// Initial factor by which the sum of the steps is multiplied.
 const INITIAL_EXTRAPOLATION_FACTOR: f64 = 2.0;
+/// Largest factor by which the sum of the steps is multiplied.
 const MAX_EXTRAPOLATION_FACTOR: f64 = 16.0;
 
 /// Last steps of a minimization, and the point before a trial extrapolation.
@@ -540,7 +546,7 @@ impl<P> ValleyExtrapolation<P> {
         self.steps.clear();
     }
 
-    /// Point to return to if the trial extrapolation failed; also if the search terminates during the trial.
+    /// Return the point before the trial extrapolation if the trial failed or the search ends during it, else None.
     pub(crate) fn outcome(&mut self, cost: f64, evaluations: usize, ends: bool) -> Option<P> {
         let (from, least, since) = self.trial_start.take()?;
         if cost < least {

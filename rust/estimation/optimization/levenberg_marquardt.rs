@@ -18,7 +18,7 @@ use crate::error::{check_length, Error, Result};
 
 /// Damping of the first step: close to Gauss–Newton, but safe for an initial guess that is off by some tens of percent.
 const INITIAL_DAMPING: f64 = 1e-3;
-/// Damping of the first step near an optimum: almost Gauss–Newton, which takes no steps along a valley.
+/// Damping of the first step near an optimum: almost Gauss–Newton.
 const INITIAL_DAMPING_NEAR_OPTIMUM: f64 = 1e-6;
 /// Damping above which a step is at rounding level.
 const MAX_DAMPING: f64 = 1e12;
@@ -26,7 +26,8 @@ const MAX_DAMPING: f64 = 1e12;
 const DAMPING_FACTOR: f64 = 10.0;
 /// Ratio of actual to predicted decrease of the cost above which the damping is decreased.
 const ACCEPTABLE_GAIN_RATIO: f64 = 0.25;
-/// Rounding error of the residuals relative to the signals, for the convergence test if no step decreases the cost.
+/// Rounding error of the residuals relative to the signals. It is used in the convergence test if no step decreases the
+/// cost.
 const RELATIVE_ROUNDING_ERROR: f64 = 1e-10;
 
 /// Reason of termination.

@@ -7,10 +7,11 @@ use crate::linalg::dense;
 use crate::linalg::orthogonal::{norm, project_out};
 use crate::linalg::small::back_substitute;
 
-/// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
+/// Relative norm of a response to an initial term outside the span of the other responses, below which it is linearly
+/// dependent.
 pub(crate) const RANK_TOLERANCE: f64 = 1e-12;
 
-/// Residuals at a point, and intermediates `P` of each experiment for their derivatives.
+/// Residuals at a point, and intermediate results `P` of each experiment for their derivatives.
 pub(crate) struct Evaluation<P> {
     /// The point, with optimal values of the linear coefficients.
     pub(crate) point: ParameterPoint,
@@ -31,8 +32,9 @@ impl<P> Evaluation<P> {
 
     /// Eliminate the linear coefficients and the initial terms from the residuals of each experiment.
     ///
-    /// `columns` are the weighted responses to the initial terms, each with its equation, or with none for a level. `of`
-    /// returns the orthonormal basis of these and the effects of the linear coefficients.
+    /// `columns` are the weighted responses to the initial terms, each with the index of its equation, or None for a
+    /// level. The function `of` returns the orthonormal basis of these responses and the effects of the linear
+    /// coefficients.
     pub(crate) fn eliminate(
         &mut self,
         linear: &[usize],
@@ -74,7 +76,7 @@ impl<P> Evaluation<P> {
     }
 }
 
-/// Damping of the unit columns: a coefficient that is identifiable only at this level, that of rounding, is not
+/// Damping of the unit columns. It is at the level of rounding, so a coefficient that is not identifiable is not
 /// changed.
 const COLLINEARITY_DAMPING: f64 = 1e-7;
 

@@ -1,6 +1,6 @@
 //! Cache of kernels and spectra across the evaluations of one optimization.
 //!
-//! Kernels of unchanged orders, their spectra, and everything shared by runs on one grid are computed once.
+//! Kernels of unchanged orders and their spectra are computed once for all runs on a grid.
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -17,8 +17,9 @@ use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::Kernel;
 
-/// Maximum number of cached powers of t for long records, and for others.
+/// Maximum number of cached powers of t for long records.
 const MAX_POWERS_LONG_RECORD: usize = 8;
+/// Maximum number of cached powers of t for short records.
 const MAX_POWERS_SHORT_RECORD: usize = 64;
 
 /// Smallest length of a run relative to the longest on its grid; shorter runs would need unnecessarily long transforms.
@@ -26,7 +27,7 @@ const MIN_LENGTH_RATIO: f64 = 0.7;
 
 /// Cache of runs with the same step and filter: kernels, powers of t, and A⁻¹ at the last point, for the longest run.
 struct GridCache {
-    /// Zero record of the length of the longest run.
+    /// Record of zeros with the length of the longest run.
     bare: Record,
     /// Sensor filter of all signals.
     filter: Option<Rc<SeriesFilter>>,
@@ -108,7 +109,7 @@ impl EvaluationCache {
         Ok(places.into_iter().map(shelf).collect())
     }
 
-    /// Responses to the initial terms t^e of equations, each with at least `m` pulses of `n` outputs.
+    /// Responses of `n` outputs to initial terms t^e, given as (equation, e) in `terms`, over at least `m` pulses.
     ///
     /// # Errors
     /// As [`SystemInverse::initial_term_responses`].
@@ -215,7 +216,7 @@ impl EvaluationCache {
         term
     }
 
-    /// Filter a series that is no signal of the record.
+    /// Apply the sensor filter to a series that is not a signal of the record.
     pub(crate) fn filter_series(&self, series: &[f64]) -> Vec<f64> {
         self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.apply(series))
     }

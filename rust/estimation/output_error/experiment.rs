@@ -7,14 +7,14 @@ use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 
-/// One run to compare with: pulse means on a grid with a sample at every `pulses_per_sample`-th edge.
+/// One run of measured data: pulse means on a grid with a sample at every `pulses_per_sample`-th pulse edge.
 #[derive(Debug, Clone)]
 pub struct Experiment {
     /// Pulse means of all signals, shared by experiments that differ in weights only.
     pub record: Arc<Record>,
     /// Block pulses per sampling interval.
     pub pulses_per_sample: usize,
-    /// Point samples of each equation's output, one more than there are intervals.
+    /// Samples of the output of each equation; their number is that of the sampling intervals plus one.
     pub samples: Vec<Vec<f64>>,
     /// Sensor filter of the simulated outputs, if any: a series of the length of the record, and a flag per output.
     pub filter: Option<(Vec<f64>, Vec<bool>)>,
@@ -33,7 +33,7 @@ pub struct Experiment {
 /// Nonuniform sample times, all of which are compared.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonuniformSamples {
-    /// Sample times.
+    /// Sample times, as an interpolation of pulse means.
     pub readings: SampleInterpolation,
     /// Jumps near the samples of each zero-order-hold signal of the record; None for other signals.
     pub jumps: Vec<Option<Jumps>>,
@@ -42,7 +42,7 @@ pub struct NonuniformSamples {
 /// Values of a signal at the sample times.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointValues {
-    /// Values at the samples, after a jump; None for the mean of the adjacent pulses.
+    /// Values at the samples, just after any jump; None for the mean of the adjacent pulses.
     pub values: Option<Vec<f64>>,
     /// True for a zero-order hold between samples.
     pub is_zero_order_hold: bool,

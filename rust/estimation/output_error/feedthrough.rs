@@ -1,8 +1,8 @@
 //! Direct feedthrough: the instantaneous effect of a term whose order equals that of its equation.
 //!
-//! A sample is taken after its input acts: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without feedthrough. The
-//! mean of the pulses on either side of t contains G times the mean of s on either side. The correction is G δ, with δ
-//! the difference of s(t⁺) and that mean: half a jump of a zero-order hold, a quarter of the second difference of a
+//! A sample is taken just after its input changes: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without feedthrough
+//! and s the input. The mean of the two pulses next to t contains G times their mean of s. The correction is G δ, where
+//! δ is s(t⁺) minus that mean. It is half a jump of a zero-order hold, or a quarter of the second difference of a
 //! linearly interpolated signal.
 
 use super::experiment::Experiment;
@@ -71,7 +71,7 @@ impl Feedthrough {
         Ok(Some(direct))
     }
 
-    /// Add the weighted δ of the feedthrough inputs of each equation.
+    /// Add the weighted deviation δ of the inputs with feedthrough of each equation.
     fn add_inputs<'a>(
         &'a self,
         model: &FreeModel,
@@ -95,7 +95,7 @@ impl Feedthrough {
         }
     }
 
-    /// Multiply the feedthrough inputs of the equations by (I − C)⁻¹.
+    /// Multiply the sums of inputs with feedthrough of the equations by (I − C)⁻¹.
     pub(crate) fn apply_coupling(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
         let Some(between) = &self.coupling_inverse else { return driven };
         let gains = between.chunks_exact(driven.len());
@@ -147,14 +147,14 @@ pub(crate) fn add_feedthrough_derivative(
     column.iter_mut().zip(experiment.weighted_corrections(&direct.apply_coupling(driven))).for_each(|(v, s)| *v += s);
 }
 
-/// Correction of the response to jumps and kinks of the inputs, which pulse means show half a pulse too early.
+/// Correction of the response to jumps and kinks of the inputs, which is half a pulse early in pulse means.
 ///
 /// The mean of the pulses on either side of a sample contains half of the response of the first pulse after it, of
 /// which only the direct gain is present at the sample. Without the correction a first-order equation has an error
 /// proportional to the step. An equation with an input derivative of order 0.6 has one of order step^0.4.
 pub(crate) struct JumpCorrection {
-    /// Half of the effect of the jump or kink of each signal at each compared sample on the mean of the next pulse, and
-    /// its derivative with respect to the free parameter.
+    /// Half of the change of the next pulse mean by the jump or kink of each signal at each compared sample. The second
+    /// list is its derivative with respect to the free parameter of the input.
     jumps: Vec<Option<(Vec<f64>, Vec<f64>)>>,
 }
 

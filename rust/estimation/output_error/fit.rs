@@ -39,7 +39,8 @@ pub struct OutputErrorFit {
     pub status: Status,
 }
 
-/// Evaluation on block pulses, or of exact samples: of integer orders by their states, of others by their transforms.
+/// Evaluation of one of three simulations: block pulses, exact states of integer orders, or exact transforms of other
+/// orders.
 enum Simulation<'a> {
     Pulses(Evaluation<Linearization>),
     Exact(Evaluation<ExactSimulation<'a>>),
@@ -94,15 +95,15 @@ impl Simulation<'_> {
 struct OutputErrorProblem<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
-    /// Initial coefficients, in the unit of time.
+    /// Initial coefficients, converted to the unit of time.
     start: Vec<f64>,
-    /// Unit of time in which the coefficients are stepped.
+    /// Unit of time in which steps of the coefficients are relative.
     time_unit: TimeUnit,
     /// True if a stable model must not become unstable.
     requires_stability: bool,
-    /// True to allow extrapolation along valleys: all coefficients have plain coordinates, as near an optimum.
+    /// True to allow extrapolation along valleys, which requires plain coordinates of all coefficients.
     allows_extrapolation: bool,
-    /// Coefficients that are eliminated at every point.
+    /// Indices of the coefficients that are eliminated at every point.
     linear: Vec<usize>,
     /// Exact simulation, if all orders are integers.
     exact: Option<IntegerOrders>,
@@ -170,7 +171,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         })
     }
 
-    /// Derivatives of the coefficients with respect to an order, at constant values in the unit of time.
+    /// Derivatives of the coefficients with respect to an order, with constant coefficients in the unit of time.
     fn coupled_derivatives(&self, point: &ParameterPoint, parameter: usize) -> Vec<(usize, f64)> {
         if parameter >= point.orders.len() {
             return Vec::new();

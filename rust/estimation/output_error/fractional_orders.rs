@@ -1,10 +1,10 @@
 //! Exact output samples of equations of any orders, and their derivatives.
 //!
-//! With the integration orders η of the terms an equation is y = Σ c s^−η u/D. D = 1 − Σ c s^−η has the terms in y
-//! alone. A zero-order-hold input is a sum of steps, so the starred transform of the samples of y is that of c s^−η/(D
-//! s) times the transform of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D. Derivatives
-//! with respect to orders and coefficients are functions of s as well. A sample at a jump is the mean of both sides;
-//! [`Feedthrough`] corrects it.
+//! In the integration orders η of its terms, an equation is y = Σ c s^−η u/D, where D = 1 − Σ c s^−η sums over the
+//! terms of y. A zero-order-hold input is a sum of steps, so the starred transform of the samples of y is that of c
+//! s^−η/(D s) times the transform of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D.
+//! Derivatives with respect to orders and coefficients are functions of s as well. A sample at a jump is the mean of
+//! both sides; [`Feedthrough`] corrects it.
 
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -22,7 +22,7 @@ use crate::fractional::kernels::digamma;
 use crate::fractional::starred_transform::{integration, StarredTransform};
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 
-/// Fewest pulses of an experiment with exact samples: shorter ones are simulated faster by pulses.
+/// Smallest number of pulses of an experiment with exact samples. Block pulses are faster for shorter experiments.
 pub(crate) const MIN_EXACT_PULSES: usize = 1 << 12;
 
 /// Equations of any orders with zero-order-hold inputs, on experiments with uniform samples.
@@ -41,7 +41,7 @@ struct Run {
 pub(crate) struct SampledSimulation {
     /// Orthonormal basis of the weighted responses to the initial terms.
     pub(crate) basis: Vec<Vec<f64>>,
-    /// Effect per unit of each linear coefficient.
+    /// Change of the weighted samples per unit of each linear coefficient.
     pub(crate) effects: Vec<Vec<f64>>,
 }
 
@@ -58,7 +58,8 @@ struct Terms {
 /// Derivatives of the coefficient and of the integration order of each term with respect to a parameter.
 type Slopes = Vec<(f64, f64)>;
 
-/// Response of an equation from rest to one input, with weights in place of the coefficients of that input's terms.
+/// Response of an equation to one input with zero initial conditions, with weights in place of the coefficients of the
+/// terms of that input.
 struct Column {
     /// Weight of each term of the equation. Weights of other terms are not used.
     weights: Vec<f64>,
@@ -118,7 +119,7 @@ impl Terms {
 
 /// Initial terms c t^e of one equation, which have the Laplace transforms c Γ(e + 1) s^−(e + 1).
 struct InitialTerms {
-    /// e + 1, c Γ(e + 1) and ψ(e + 1) of each term. These are needed at every s.
+    /// e + 1, c Γ(e + 1) and ψ(e + 1) of each term. They are the same at every s.
     terms: Vec<(f64, f64, f64)>,
 }
 
@@ -135,7 +136,7 @@ impl InitialTerms {
         out.iter().sum()
     }
 
-    /// Derivative of the sum of the transforms, with these derivatives of the exponents.
+    /// Derivative of the sum of the transforms, for the derivatives `slopes` of the exponents.
     fn slope(&self, logarithm: Bin, transforms: &[Bin], slopes: &[f64]) -> Bin {
         let parts = self.terms.iter().zip(transforms).zip(slopes).filter(|(_, by)| **by != 0.0);
         parts.map(|((term, transform), by)| transform * (Bin::from(term.2) - logarithm) * by).sum()
@@ -143,8 +144,8 @@ impl InitialTerms {
 }
 
 impl FractionalOrders {
-    /// True if a model has exact samples on every experiment: stable equations without coupling, inputs that are held
-    /// and have no free parameter, and uniform samples without a sensor filter.
+    /// True if a model has exact samples on every experiment: stable equations without coupling, zero-order-hold inputs
+    /// without free parameters, and uniform samples without a sensor filter.
     pub(crate) fn accepts(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> bool {
         let is_suitable = |experiment: &Experiment| {
             experiment.record.m() >= MIN_EXACT_PULSES
@@ -338,8 +339,8 @@ fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: u
 }
 
 impl Run {
-    /// Samples of an equation from rest, once for each list in `weight_sets` of weights that replace its coefficients,
-    /// and samples of its response to each initial term t^e with e in `exponents`.
+    /// Samples of the output of an equation with zero initial conditions, for each list of `weight_sets` in place of
+    /// its coefficients. The second result is its response to each initial term t^e with e in `exponents`.
     fn responses(
         &self,
         experiment: &Experiment,
@@ -378,7 +379,8 @@ impl Run {
         (driven, free)
     }
 
-    /// Derivatives of the samples of an equation, each with the derivatives of its terms and of its initial exponents.
+    /// Derivatives of the samples of an equation. Each request holds the derivatives of its terms and of its initial
+    /// exponents.
     fn sensitivities(
         &self,
         experiment: &Experiment,
@@ -503,7 +505,7 @@ mod tests {
         ParameterPoint { orders: vec![order], coefficients: vec![-0.8, -9.0, 0.5, 7.0, 0.3], inputs: Vec::new() }
     }
 
-    /// Return what these experiments allow, or an error.
+    /// Return the value, or an error if it is None.
     fn require<T>(value: Option<T>) -> Result<T> {
         value.ok_or_else(|| Error::Diverged { what: "experiments without exact samples".into(), index: 0 })
     }

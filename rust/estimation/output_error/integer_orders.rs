@@ -2,9 +2,9 @@
 //!
 //! Let D^n y = Σ a_i D^i y + Σ b_j D^j u, A(s) = s^n − Σ a_i s^i. The samples of s^j/A u are states of one companion
 //! form, advanced from pulse to pulse by its matrix exponential. This is exact for an input that is held or linear over
-//! a pulse, with any delay of a zero-order-hold input. y is linear in b_j, its derivative with respect to a_i is s^i/A
-//! y, a state of two companion forms in series, and its derivative with respect to a delay is −D y. An initial term c
-//! t^e is the response of a chain of integrators to an impulse, a constant or a ramp. Time is scaled by the largest
+//! a pulse, with any delay of a zero-order-hold input. y is linear in b_j. Its derivative with respect to a_i is s^i/A
+//! y, a state of two companion forms in series. Its derivative with respect to a delay is −D y. An initial term c t^e
+//! is the response of a chain of integrators to an impulse, a constant or a ramp. Time is scaled by the largest
 //! coefficient, so that no element of the companion form is above 1.
 
 use std::borrow::Cow;
@@ -26,7 +26,7 @@ const INTEGER_TOLERANCE: f64 = 1e-9;
 /// Largest order of an equation.
 const MAX_ORDER: usize = 12;
 /// Largest magnitude of a pole times the sampling interval, at the Nyquist frequency. The effect of faster poles on the
-/// samples cannot be told from noise.
+/// samples is not distinguishable from noise.
 const MAX_POLE_PHASE_RAD: f64 = std::f64::consts::PI;
 
 /// Equations of integer orders whose inputs are held or linear in every experiment.
@@ -48,8 +48,9 @@ pub(crate) struct SourceInput<'a> {
     /// A value per pulse if held, per edge if linear.
     pub(crate) samples: Cow<'a, [f64]>,
     pub(crate) between: Intersample,
-    /// Delay of a zero-order-hold input in pulses, and the value before the first pulse.
+    /// Delay of a zero-order-hold input in pulses.
     pub(crate) delay: f64,
+    /// Value of the input before the first pulse.
     pub(crate) before: f64,
 }
 
@@ -57,9 +58,9 @@ pub(crate) struct SourceInput<'a> {
 enum SourceKind {
     /// Index of the input in the equation.
     Input(usize),
-    /// Powers of t below the order.
+    /// Impulse, whose responses are the powers of t below the order of the equation.
     Impulse,
-    /// Power of t at the order or one above it: the exponent.
+    /// Exponent of a power of t that equals the order of the equation or the order plus one.
     Power(usize),
 }
 

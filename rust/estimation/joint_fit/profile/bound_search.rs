@@ -4,23 +4,26 @@ use super::likelihood::{ProfileLikelihood, Refit, MAX_REFIT_EVALUATIONS};
 use crate::error::Result;
 use crate::estimation::joint_fit::problem::OptimizationResult;
 
-/// A bound is found if the root of the rise is within [`RISE_TOLERANCE`] of its threshold and Newton's next step is
-/// shorter than [`BOUND_TOLERANCE`] times the distance from the optimum.
+/// Tolerance of a bound: the square root of the rise of the cost is within this of its threshold. Newton's next step
+/// must also be shorter than [`BOUND_TOLERANCE`] times the distance from the optimum.
 const RISE_TOLERANCE: f64 = 0.1;
+/// Largest Newton step at a bound, relative to the distance from the optimum.
 const BOUND_TOLERANCE: f64 = 0.02;
 /// Maximum number of refits for one bound.
 pub(super) const MAX_REFITS_PER_BOUND: usize = 40;
 /// Largest distance of a bound, in half-widths of the Wald interval. Beyond it the interval is unbounded.
 const MAX_BOUND_DISTANCE: f64 = 1e3;
-/// The first step is the Wald half-width or the value itself, but at least this multiple of the former. A bracket is
-/// narrow if its width is [`BOUND_TOLERANCE`] of the value inside it, or of [`BRACKET_SCALE_RATIO`] times the distance.
+/// Smallest first step, relative to the Wald half-width.
 const MIN_FIRST_STEP_RATIO: f64 = 0.01;
+/// A bracket is narrow if its width is [`BOUND_TOLERANCE`] times the value inside it, or times this fraction of the
+/// distance.
 const BRACKET_SCALE_RATIO: f64 = 0.1;
-/// Smallest and largest factor by which the distance from the optimum grows in one step.
+/// Smallest factor by which the distance from the optimum grows in one step.
 const MIN_STEP_FACTOR: f64 = 1.1;
+/// Largest factor by which the distance from the optimum grows in one step.
 const MAX_STEP_FACTOR: f64 = 4.0;
-/// The cost levels off if its root rises by at most this fraction of the last rise and stays this far below the
-/// threshold.
+/// Rise of the root cost in one step, relative to the last step, up to which the cost levels off. The root cost must
+/// also be below this fraction of the threshold.
 const LEVELING_RATIO: f64 = 0.5;
 const LEVELING_MARGIN: f64 = 0.05;
 /// Smallest distance of a step from the ends of its bracket, as a fraction of its width.
@@ -84,12 +87,13 @@ pub struct BoundSearch {
     start: f64,
     first: f64,
     farthest: f64,
-    /// Distance from the optimum: at the next refit, at the last inside, and at the first outside.
+    /// Distance of the next refit from the optimum.
     way: f64,
+    /// Distance of the last refit below the threshold, and of the first refit above it.
     inside: f64,
     outside: f64,
     within: OptimizationResult,
-    /// A refit that the budget interrupted continues from here.
+    /// Result of the refit that the budget interrupted.
     origin: Option<OptimizationResult>,
     refits: usize,
     reached: f64,

@@ -14,16 +14,17 @@ use crate::signal::statistics::inner;
 
 /// Maximum number of evaluations of one refit.
 pub const MAX_REFIT_EVALUATIONS: usize = 120;
-/// The profile uses a grid twice as coarse if that moves the optimum by less than this many standard errors, or by less
-/// than this fraction of each parameter.
+/// The profile uses a grid twice as coarse if that moves the optimum by less than this many standard errors.
 const MAX_OPTIMUM_SHIFT_ERRORS: f64 = 2.0;
+/// The shift must also be less than this fraction of each parameter.
 const MAX_OPTIMUM_SHIFT_RATIO: f64 = 1e-3;
-/// Tolerance of a refit as a fraction of the threshold, and the cost decrease that indicates another optimum.
+/// Tolerance of a refit, as a fraction of the threshold.
 const REFIT_TOLERANCE: f64 = 1e-4;
+/// Decrease of the cost that indicates another optimum, as a fraction of the threshold.
 const LOWER_OPTIMUM_MARGIN: f64 = 0.02;
-/// If a step moves another parameter by more than this fraction, power laws are tried as well, with exponents up to
-/// this.
+/// Relative change of another parameter in one step above which power laws are also tried as initial guesses.
 const POWER_LAW_MOVE_RATIO: f64 = 0.3;
+/// Largest exponent of these power laws.
 const MAX_POWER_LAW_EXPONENT: f64 = 4.0;
 /// Relative singular value below which a direction of the other parameters has no effect.
 const SINGULAR_VALUE_TOLERANCE: f64 = 1e-12;
@@ -63,7 +64,7 @@ impl FitState {
 pub enum Refit {
     /// The optimum of the other parameters.
     Optimum(OptimizationResult),
-    /// An optimum whose cost is below that of the fit.
+    /// An optimum with a lower cost than the fit.
     Lower(OptimizationResult),
     /// No initial guess can be simulated.
     Infeasible,
@@ -77,7 +78,7 @@ pub struct ProfileLikelihood<'a> {
     pub best: OptimizationResult,
     /// Difference between the estimate, extrapolated to step 0, and this optimum.
     pub shift: Vec<f64>,
-    /// Row-major inverse of the Hessian of the cost.
+    /// Inverse of the Hessian of the cost, row-major.
     bread: Vec<f64>,
     /// Standard errors.
     pub errors: Vec<f64>,

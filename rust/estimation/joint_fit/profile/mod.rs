@@ -30,27 +30,27 @@ const MIN_COST_REDUCTION: f64 = 0.1;
 /// Largest number of lower optima from which the search continues.
 const MAX_LOWER_OPTIMA: usize = 5;
 
-/// Which parameters are profiled, how far, and with which resources.
+/// Settings of profile-likelihood intervals: parameters, confidence level and resources.
 #[derive(Debug, Clone)]
 pub struct ProfileSettings {
     /// Parameters; None for those whose Wald interval is inaccurate.
     pub parameters: Option<Vec<usize>>,
     /// Half-width of the interval, in standard deviations.
     pub width: f64,
-    /// Budget of simulations for all bounds, and the least one with which each bound is begun; None for no limit.
+    /// Maximum number of simulations for all bounds, and the smallest initial budget of each bound; None for no limit.
     pub budget: Option<(usize, usize)>,
     /// Threads; results do not depend on it.
     pub threads: usize,
 }
 
-/// Profile-likelihood intervals, and any lower optimum found on the way.
+/// Profile-likelihood intervals, and any lower optimum found during the search.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ProfileResult {
     /// Interval of each profiled parameter.
     pub intervals: Vec<(usize, Interval)>,
     /// Parameters of an optimum with a significantly lower cost than the fit.
     pub lower_optimum: Option<Vec<f64>>,
-    /// True if that optimum is lower on the next finer grid as well.
+    /// True if that optimum also has a lower cost than the fit on the next finer grid.
     pub lower_on_finer_grid: bool,
     /// Parameters whose profile needed more simulations than allowed.
     pub incomplete: Vec<usize>,
@@ -116,7 +116,7 @@ pub fn profile_intervals(
     Ok(result)
 }
 
-/// Bounds that were found, the optimum below that ended the search, and the number of simulations.
+/// Bounds that were found, the lower optimum that ended the search, and the number of simulations.
 struct FoundBounds {
     bounds: Vec<(usize, Option<Interval>)>,
     lower: Option<Vec<f64>>,
