@@ -1,4 +1,4 @@
-//! Expressions of nonlinear terms: checked programs in postfix notation, with derivatives in one pass.
+//! Expressions of non-linear terms as programs in postfix notation, evaluated together with their derivatives.
 //!
 //! A channel is a signal or a derivative of it. A [`DerivedSignal`] is an expression over channels, such as y³ or
 //! |Dy|·Dy. A nonlinear term of an equation is a linear term of a derived signal.
@@ -9,13 +9,13 @@ use crate::fractional::kernels::MAX_ORDER;
 /// Function of one argument.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Function {
-    /// sin.
+    /// Sine.
     Sin,
-    /// cos.
+    /// Cosine.
     Cos,
     /// Exponential function.
     Exp,
-    /// tanh.
+    /// Hyperbolic tangent.
     Tanh,
     /// Absolute value.
     Abs,
@@ -28,7 +28,7 @@ pub enum Function {
 impl Function {
     const ALL: [Self; 7] = [Self::Sin, Self::Cos, Self::Exp, Self::Tanh, Self::Abs, Self::Sqrt, Self::Sign];
 
-    /// Name.
+    /// Name of the function.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -42,7 +42,7 @@ impl Function {
         }
     }
 
-    /// Value and derivative. The infinite slope of a root at 0 is 0.
+    /// Value and derivative at x. The infinite slope of a root at 0 is replaced by 0.
     fn apply(self, x: f64) -> (f64, f64) {
         match self {
             Self::Sin => (libm::sin(x), libm::cos(x)),
@@ -67,7 +67,7 @@ fn sign(x: f64) -> f64 {
     }
 }
 
-/// Value and derivative of x^n. The infinite slope of a power below 1 at 0 is 0.
+/// Value and derivative of x^n. The infinite slope of a power below 1 at 0 is replaced by 0.
 #[allow(clippy::cast_possible_truncation)]
 fn power(x: f64, n: f64) -> (f64, f64) {
     if n == 0.0 {
@@ -145,11 +145,11 @@ pub struct Expression {
 }
 
 impl Expression {
-    /// Expression of a program over so many channels.
+    /// Expression of a program over this number of channels.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a program that lacks a value or leaves several, a channel that does not exist, or a
-    /// number that is not finite.
+    /// [`Error::Structure`] for a program that lacks a value or ends with several values, a channel that does not
+    /// exist, or a number that is not finite.
     pub fn new(program: Vec<Instruction>, channels: usize) -> Result<Self> {
         let mut depth = 0_usize;
         for instruction in &program {
@@ -181,8 +181,8 @@ impl Expression {
         self.channels
     }
 
-    /// Value at these values of the channels. Its derivatives are [`Values::slopes`], a function that has no value here
-    /// is [`Values::fault`]; the value is then not finite.
+    /// Value of the expression at these values of the channels. The derivatives are then in [`Values::slopes`]. If a
+    /// function has no value, it is in [`Values::fault`] and the result is not finite.
     pub fn evaluate(&self, channels: &[f64], values: &mut Values) -> f64 {
         let n = self.channels;
         values.stack.clear();
@@ -265,7 +265,7 @@ impl DerivedSignal {
     /// Signal that is an expression over these channels.
     ///
     /// # Errors
-    /// [`Error::Structure`] for other channels than the expression has, or an order that is negative or above 10.
+    /// [`Error::Structure`] for a wrong number of channels, or an order that is negative or above 10.
     pub fn new(expression: Expression, channels: Vec<(usize, f64)>) -> Result<Self> {
         if expression.channels() != channels.len() {
             return refuse(format!("{} channels for {}", channels.len(), expression.channels()), "give all of them");

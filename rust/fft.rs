@@ -1,7 +1,7 @@
 //! Real fast Fourier transforms: shared plans, fast lengths and scratch memory. The only user of `realfft`.
 //!
 //! Forward transforms are not normalized, inverse transforms are divided by the length. A product of spectra is thus a
-//! cyclic convolution. Plans are shared, scratch belongs to the caller: one [`Workspace`] a thread.
+//! cyclic convolution. Plans are shared. The caller supplies scratch memory: one [`Workspace`] per thread.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -55,8 +55,8 @@ const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
 /// Refining a grid again and again would otherwise leave all its plans in memory. A plan evicted too early costs two
 /// transforms.
 const MAX_CACHED_PLAN_POINTS: usize = 1 << 20;
-/// Long plans among so many recent requests are in use and stay, even above the limit: one evaluation of a large
-/// problem may need more points.
+/// Number of recent requests whose long plans are not evicted, even above the limit. One evaluation of a large problem
+/// may need more points.
 const IN_USE: u64 = 16;
 
 /// Plans by length, each with the number of its last request.
@@ -65,7 +65,7 @@ struct Plans {
     plans: BTreeMap<usize, (Plan, u64)>,
 }
 
-/// Plans of all threads. Each thread copies short ones once, so that no thread waits for a lock.
+/// Plans of all threads. Each thread copies short plans once, so that it does not wait for the lock again.
 static SHARED_PLANS: ForkSafeLock<Plans> = ForkSafeLock::new(Plans::new());
 
 thread_local! {
@@ -87,7 +87,7 @@ impl Plans {
         Some(plan.clone())
     }
 
-    /// Store a plan, unless one of its length exists, and return the stored one with the evicted plans.
+    /// Store a plan, unless one of its length exists. Return the stored plan and the evicted plans.
     ///
     /// The caller drops the evicted plans outside the lock.
     fn keep(&mut self, plan: Plan) -> (Plan, Vec<Plan>) {
@@ -104,7 +104,7 @@ impl Plans {
         (plan, forgotten)
     }
 
-    /// Evict long plans, the least recently used first, until at most this many points are left.
+    /// Evict long plans, the least recently used first, until at most `points` remain.
     fn make_room(&mut self, points: usize) -> Vec<Plan> {
         let mut long: Vec<(u64, usize)> = self
             .plans
@@ -197,7 +197,7 @@ impl Plan {
     /// Transform `time` into `spectrum`. `time` has `len` elements and is overwritten, `spectrum` has `bins`.
     ///
     /// # Panics
-    /// If the lengths differ. That is an error of the caller, whatever the data.
+    /// If the lengths differ, which is a programming error.
     pub fn transform(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
         self.check(time.len(), spectrum.len());
         let scratch = workspace.at_least(self.forward.get_scratch_len());

@@ -12,8 +12,8 @@
 //!    [`expression`], [`nonlinear`]: simulation and output error with friction and nonlinear terms;
 //! 6. [`recording`]: measured runs with gaps, nonuniform times, delays, limits and sensor filters, sampled on any grid;
 //! 7. [`order_search`]: orders by exhaustive search over an order grid;
-//! 8. [`simulate`], [`state_space`], [`output_samples`], [`signal::metrics`]: simulation by pulse means, exactly, and at
-//!    sample times in the limit for zero step; output and equation error, figures of merit;
+//! 8. [`simulate`], [`state_space`], [`output_samples`], [`signal::metrics`]: simulation by pulse means, by exact state
+//!    space, and at sample times in the limit of zero step; output and equation error, figures of merit;
 //!    [`signal::statistics`]: residual analysis.
 //!
 //! ```
@@ -39,13 +39,12 @@
 //! ```
 //!
 //! A [`recording::Recording`] holds samples, a [`regressors::Record`] holds [`signal::block_pulse::PulseMeans`].
-//! Samples in place of means would bias every estimate.
+//! Estimates from samples in place of means would be biased.
 //!
 //! # Features
 //!
 //! No feature is enabled by default. `rig`: [`rig`], the simulated arm and the safety guard of the rigs. `oracles`:
-//! slow computations by definition, against which tests compare the fast ones. `python`: the Python bindings, with both
-//! of these.
+//! slow reference computations for tests. `python`: the Python bindings, with `rig` and `oracles`.
 //!
 //! Numerical code does not access files, clocks (except the timer of the virtual rig) or Python.
 #![forbid(unsafe_op_in_unsafe_fn)]

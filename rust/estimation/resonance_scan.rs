@@ -8,9 +8,10 @@ use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
 use crate::regressors::Record;
 use crate::series::{reciprocal, Buffers, Kernel};
 
-/// Relative norm of the response to an initial term outside the span of the others below which it is dependent.
+/// Relative norm of a response to an initial term outside the span of the other responses, below which it is linearly
+/// dependent.
 const RANK_TOLERANCE: f64 = 1e-12;
-/// Relative norm of a column after projection below which it is solved for together with the initial terms.
+/// Relative norm of a column after projection, below which its coefficient is solved together with the initial terms.
 const MIN_REMAINING_NORM_RATIO: f64 = 1e-6;
 
 /// Best fit of an equation with fixed autoregressive terms.

@@ -1,10 +1,10 @@
 //! Multi-innovation recursion (44) sample by sample, with constant time per sample.
 //!
-//! A new row needs the fractional integrals of every signal at the newest pulse, which depend on the whole past. The
-//! newest two pulses enter by the exact kernel (32). Older pulses enter through a sum of exponentials,
-//! exact to rounding. An order above 1 is a running integral of the order minus one. A row costs
-//! O((signals + terms)·rates + k³), independent of the innovation length and of the length of the run. Earlier rows may be forgotten
-//! exponentially, and a stream that begins in motion has powers of t as more terms.
+//! A new row needs the fractional integrals of every signal at the newest pulse, which depend on all past samples. The
+//! newest two pulses enter by the exact kernel, paper (32). Older pulses enter through a sum of exponentials, exact to
+//! rounding. An integral of an order above 1 is the running integral of an integral of that order minus one. A row
+//! costs O((signals + terms)·rates + k³), independent of the innovation length and of the length of the run. Earlier
+//! rows may be forgotten exponentially. A stream with nonzero initial conditions has powers of t as additional terms.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
@@ -24,10 +24,11 @@ struct SignalHistory {
     last: f64,
 }
 
-/// Weights of the pulses in an integral of order at most 1 at the newest pulse, or in the last step of a higher one.
+/// Weights of the pulses in an integral at the newest pulse, for an order of at most 1. For a higher order they are the
+/// weights in its last increment.
 #[derive(Debug, Clone)]
 struct PulseWeights {
-    /// Of the newest pulse and of the previous one.
+    /// Weights of the newest pulse and of the previous one.
     recent: [f64; 2],
     history: Vec<f64>,
 }
@@ -44,7 +45,7 @@ impl PulseWeights {
 struct RunningIntegral {
     signal: usize,
     local: PulseWeights,
-    /// For orders above 1: the integral of the order minus one, and its running sum.
+    /// Weights of the integral of the order minus one, and its running sum; None for orders up to 1.
     inner: Option<(PulseWeights, f64)>,
     step: f64,
 }
@@ -100,7 +101,7 @@ impl RunningIntegral {
     }
 }
 
-/// Initial term t^e, integrated as often as the equation.
+/// Column of an initial term t^e after the integration that the whole equation needs.
 #[derive(Debug, Clone)]
 struct InitialColumn {
     means: PowerMeans,
@@ -111,28 +112,28 @@ struct InitialColumn {
 #[derive(Debug, Clone)]
 struct EquationRecursion {
     output: usize,
-    /// Integral of the output: of order 0 unless a term is differentiated more often than the output.
+    /// Integral of the output. Its order is 0 unless a term has a higher order than the equation.
     target: RunningIntegral,
     integrals: Vec<RunningIntegral>,
     initial: Vec<InitialColumn>,
     fixed: Vec<Option<f64>>,
     recursion: Recursion,
-    /// The p newest rows.
+    /// Gram matrix of the p newest rows.
     window: SlidingGram,
-    /// Integrals of the output and of the signals of the terms at the newest pulse.
+    /// Values at the newest pulse of the integrals of the output and of the signals of the terms.
     values: Vec<f64>,
     /// Newest row.
     row: Vec<f64>,
 }
 
-/// Options of a stream.
+/// Options of a recursion on a stream of samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreamingOptions {
     /// Innovation length p ≥ 1.
     pub length: usize,
-    /// Prior covariance. A relative one is that of the rows so far.
+    /// Prior covariance. A relative prior uses the sums of squares of the rows so far.
     pub prior: Prior,
-    /// Factor in (0, 1] of all earlier information at every row.
+    /// Forgetting factor in (0, 1] by which the information of all earlier rows is multiplied at every row.
     pub forgetting: f64,
     /// Initial conditions of the stream; the exponents of t must exceed −1.
     pub initial: Initial,
@@ -177,7 +178,7 @@ pub struct Streaming {
 }
 
 impl Streaming {
-    /// Stream of samples with the interval `step` \[s\], for at most `longest` pulses.
+    /// Recursion on samples with the interval `step` \[s\], for at most `longest` pulses.
     ///
     /// `inputs` marks the zero-order-hold inputs; the other signals are outputs.
     ///
@@ -317,7 +318,7 @@ impl Streaming {
 }
 
 impl InitialColumn {
-    /// I^q t^e = Γ(e + 1)/Γ(e + 1 + q) t^(e + q).
+    /// Column of I^q t^e = Γ(e + 1)/Γ(e + 1 + q) t^(e + q), with q = `excess`.
     fn new(exponent: f64, excess: f64, step: f64) -> Result<Self> {
         if exponent <= -1.0 {
             return Err(Error::OutOfRange {
@@ -332,7 +333,7 @@ impl InitialColumn {
     }
 }
 
-/// Kernel that integrates the newest pulse for every equation and then adds it to the histories.
+/// SIMD task that integrates the newest pulse for every equation and then adds it to the histories.
 struct Integration<'a> {
     fits: &'a mut [EquationRecursion],
     pasts: &'a mut [SignalHistory],

@@ -1,16 +1,16 @@
-//! Kernel of I^q as a sum of decaying exponentials: fractional memory in bounded space, with rates for all orders.
+//! Kernel of I^q as a sum of decaying exponentials, so that the history of a signal needs bounded memory.
 //!
 //! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. For such integrands the trapezoidal rule in x
 //! converges like e^{−π²/Δx}. A few dozen rates e^x therefore represent the whole history at any requested accuracy,
 //! and each rate needs one state per signal. Nodes below the lowest rate form a geometric series. Four rates near zero
-//! replace them and match its first four moments. Rates do not depend on q, so all orders of one signal share its
-//! states.
+//! replace these nodes and match the first four moments of the series. Rates do not depend on q, so all orders of one
+//! signal share its states.
 
 use crate::error::{check_finite, check_overflow, Error, Result};
 
-/// Lowest rate of the rule times the longest lag. Below it four moments suffice (1e−3⁴/4! < 1e−13).
+/// Lowest rate of the rule times the longest lag. Below this rate, four moments suffice (1e−3⁴/4! < 1e−13).
 const LOWEST_RATE_TIMES_LAG: f64 = 1e-3;
-/// Rates below those of the rule, relative to its lowest one.
+/// Rates that replace the nodes below the lowest rate of the rule, relative to it.
 const TAIL_RATE_RATIOS: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
 
 /// Decay rates of exponential sums that approximate t^{q−1}/Γ(q) for all 0 < q ≤ 1, at lags between two limits.
@@ -66,7 +66,8 @@ impl Rates {
         &self.rates
     }
 
-    /// Weights w with t^{q−1}/Γ(q) ≈ Σ w_j e^{−rate_j t} for 0 < q ≤ 1; q = 1 is the zero rate alone, exactly.
+    /// Weights w with t^{q−1}/Γ(q) ≈ Σ w_j e^{−rate_j t} for 0 < q ≤ 1; for q = 1 only the zero rate has a weight, and
+    /// the sum is exact.
     #[must_use]
     pub fn weights(&self, q: f64) -> Vec<f64> {
         let mut weights = vec![0.0; self.rates.len()];
@@ -127,7 +128,8 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
     (keep, (1.0 - keep * (1.0 + x)) / square, (x - 1.0 + keep) / square)
 }
 
-/// I^q of a signal that is linear between samples, online by the sum of exponentials, and the number of states.
+/// Fractional integral I^q of a signal that is linear between samples, computed online by the sum of exponentials.
+/// Return it and the number of states.
 ///
 /// O(samples · rates).
 ///

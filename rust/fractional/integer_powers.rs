@@ -1,4 +1,4 @@
-//! Powers and logarithms of the integers up to m at the cost of those of the primes.
+//! Powers and logarithms of the integers up to m, computed for primes and combined for other integers.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -6,8 +6,8 @@ use std::thread::LocalKey;
 
 use crate::parallel::ForkSafeLock;
 
-/// `n^exponent` for n = 0 … m−1. Powers are multiplicative: only primes cost a power, everything else one product, so
-/// the relative error grows by half an ε per prime factor, of which n < 2^20 has at most 19.
+/// `n^exponent` for n = 0 … m−1. Powers are multiplicative: a prime needs one power, any other integer one product. The
+/// relative error grows by ε/2 per prime factor; n < 2^20 has at most 19 factors.
 pub(crate) fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
     let (divisors, power) = (least_divisors(m), powers_of_primes(exponent, m));
     let mut powers = vec![0.0; m];
@@ -75,7 +75,7 @@ fn exact_sum(a: f64, b: f64) -> (f64, f64) {
     (sum, (a - (sum - part)) + (b - part))
 }
 
-/// Table that only grows: one for all threads, and one of a thread if the lock is unavailable.
+/// Growing table shared by all threads; a thread uses its own table if the lock is unavailable.
 struct Table<T: 'static> {
     shared: &'static ForkSafeLock<Values<T>>,
     own: &'static LocalKey<RefCell<Values<T>>>,
@@ -105,7 +105,7 @@ impl<T> Table<T> {
     }
 }
 
-/// Least prime divisor of each n < m, possibly of more.
+/// Least prime divisor of each n < m; the table may be longer.
 #[allow(clippy::cast_possible_truncation)]
 fn least_divisors(m: usize) -> Arc<Vec<u32>> {
     static SHARED: ForkSafeLock<Values<u32>> = ForkSafeLock::new(None);
@@ -128,9 +128,10 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
     Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
-/// Logarithms ln n in double-double precision for n < m, possibly for more. 0 at 0 and 1.
+/// Logarithms ln n in double-double precision for n < m, and 0 for n = 0; the table may be longer.
 ///
-/// For primes p by ln(p − 1) + 2 artanh(1/(2p − 1)), for others by the sum over their divisors.
+/// The logarithm of a prime p is ln(p − 1) + 2 artanh(1/(2p − 1)), that of another integer the sum over its prime
+/// factors.
 #[allow(clippy::cast_precision_loss)]
 fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
     static SHARED: ForkSafeLock<Values<Logarithm>> = ForkSafeLock::new(None);
@@ -164,7 +165,7 @@ fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
     Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
-/// Logarithms ln n for n < m, possibly for more: zip them with a sequence of length m. 0 at n = 0, which is never read.
+/// Logarithms ln n for n < m, and 0 for n = 0. The table may be longer.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
     static SHARED: ForkSafeLock<Values<f64>> = ForkSafeLock::new(None);

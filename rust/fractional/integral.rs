@@ -7,11 +7,11 @@ use crate::series;
 /// Rule of a fractional integral of samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IntegralRule {
-    /// The samples are means over pulses and so is the result: F^η (paper (31), (32)); second order in h.
+    /// Block-pulse matrix F^η (paper (31), (32)): samples and result are means over pulses; second order in h.
     BlockPulse,
-    /// Point samples, exact for the linear interpolant (product trapezoidal rule); second order in h.
+    /// Product trapezoidal rule for point samples, exact for the linear interpolant; second order in h.
     Trapezoidal,
-    /// Point samples, Grünwald–Letnikov sum with −η (paper (2)); first order in h.
+    /// Grünwald–Letnikov sum of order −η (paper (2)) for point samples; first order in h.
     GrunwaldLetnikov,
 }
 
@@ -23,14 +23,15 @@ pub const MAX_DERIVATIVE: f64 = 3.0;
 pub enum Derivative {
     /// Grünwald–Letnikov sum (paper (2)); first order in h for signals that start at zero.
     GrunwaldLetnikov,
-    /// Riemann–Liouville (paper (3)): Caputo's plus the power functions of the initial values; infinite at t = 0
-    /// where an initial value is not zero.
+    /// Riemann–Liouville (paper (3)): Caputo derivative plus power functions of the initial values. It is infinite at t
+    /// = 0 if an initial value is not zero.
     RiemannLiouville,
-    /// Caputo (paper (5)) by the L1 formula on the highest whole derivative; order min(2, 2 − frac α) in h.
+    /// Caputo (paper (5)): L1 formula applied to the highest integer derivative; its error is of order min(2, 2 − frac
+    /// α) in h.
     Caputo,
 }
 
-/// I^η of uniformly sampled `x`, lower limit at the first sample.
+/// Fractional integral I^η of uniformly sampled `x` from its first sample.
 ///
 /// # Errors
 /// An order outside [0, 10], a step that is not positive, a value that is not finite, or an integral that overflows.
@@ -50,10 +51,11 @@ pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -
     Ok(out)
 }
 
-/// I^η of uniformly sampled signals of m samples, one after another, in place. The kernel is computed once.
+/// Integrate several signals of m samples by I^η in place. `signals` contains one signal after another. The kernel is
+/// computed once.
 ///
 /// # Errors
-/// As [`fractional_integral`], and signals that do not end with a whole one.
+/// As [`fractional_integral`]; a length that is not a multiple of m.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -112,10 +114,10 @@ fn first_sample_weight(eta: f64, n: usize) -> f64 {
     libm::pow(n, eta) * ((n - 1.0) * libm::expm1(eta * libm::log1p(-1.0 / n)) + eta)
 }
 
-/// D^α of uniformly sampled `x`, lower limit at the first sample.
+/// Fractional derivative D^α of uniformly sampled `x` from its first sample.
 ///
-/// `initial` gives x(0), x′(0), … where they are known; missing ones are taken from second-order one-sided
-/// differences of the samples.
+/// `initial` holds the known x(0), x′(0), …. Missing values follow from second-order one-sided differences of the
+/// samples.
 ///
 /// # Errors
 /// An order outside [0, 3], a step that is not positive, a value that is not finite, a derivative that overflows, or
@@ -193,7 +195,7 @@ pub fn fractional_derivative(
     Ok(out)
 }
 
-/// L1 formula: exact Caputo derivative, order in (0, 1), of the linear interpolant.
+/// Caputo derivative of an order in (0, 1) by the L1 formula, which is exact for the linear interpolant.
 #[allow(clippy::cast_precision_loss)]
 fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
     let (m, a) = (x.len(), 1.0 - order);
@@ -216,7 +218,8 @@ fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
 /// Derivative of integer order k ≤ 3 by central differences, one-sided towards the ends; second order in h at every
 /// sample. Needs k + 2 samples.
 ///
-/// Each k has its own formula: first differences repeated would lose an order at the ends every time.
+/// Each k has its own formula, because repeated first differences would lose an order of accuracy at the ends each
+/// time.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
 fn difference(x: &[f64], k: usize, step: f64) -> Vec<f64> {
     // Weights at the first samples, counted from the first, and those around every sample further in.

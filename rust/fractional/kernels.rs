@@ -1,16 +1,16 @@
 //! Kernels of the fractional integral I^η: block-pulse kernel, derivative in η, Grünwald–Letnikov weights,
 //! improper terms.
 //!
-//! An improper term has an order above its equation's. D^α y = c D^ν s + … with ν > α is integrated by ν, its highest
-//! order: I^{ν−α} y = c s + …. All operators commute, so dividing by the kernel of I^{ν−α} gives y = c D^{ν−α} s + …
-//! with the reciprocal of that kernel as D^{ν−α}. All terms then have one form of second order in the step, and D^q I^q
-//! is the identity up to rounding.
+//! An improper term has a higher order than its equation. The equation D^α y = c D^ν s + … with ν > α is integrated by
+//! its highest order ν: I^{ν−α} y = c s + …. Division by the kernel of I^{ν−α} gives y = c D^{ν−α} s + …, where the
+//! kernel of D^{ν−α} is the reciprocal of that kernel. All terms then have the same form, of second order in the step,
+//! and D^q I^q is the identity up to rounding.
 
 use crate::error::{Error, Result};
 use crate::fractional::integer_powers::{odd_powers, whole_logarithms, whole_powers};
 use crate::series::{multiply, reciprocal};
 
-/// Highest order of an integral and of an equation: five lightly damped modes.
+/// Highest order of an integral and of an equation, enough for five oscillatory modes.
 ///
 /// Kernels are exact to a few ε up to this order. Rounding errors of a division grow like (ωT)^α/Γ(α+1), so long
 /// records of many modes need lower orders.
@@ -21,16 +21,15 @@ pub const MIN_INPUT_ORDER: f64 = -3.0;
 
 /// Distance in pulses below which the even binomial sum converges slowly and needs [`TERMS_NEAR`] terms.
 const FAR_DISTANCE_PULSES: usize = 8;
-/// Terms for distances 2 … 7: 4^−25 is below the rounding error at distance 2.
+/// Number of terms for distances 2 … 7. At distance 2, 4^−25 is below the rounding error.
 const TERMS_NEAR: usize = 25;
-/// Terms from distance 8 on: 64^−8 is below the rounding error.
+/// Number of terms from distance 8 on: 64^−8 is below the rounding error.
 const TERMS_FAR: usize = 8;
 
 /// Block-pulse kernel of I^η: first row of F^η, `h^η/Γ(η+2)·v_n`, n = 1 … m (paper (32)).
 ///
-/// The printed `v_n` is a second difference of n^{η+1} and cancels catastrophically (relative error 2e−3 at
-/// n = 2^20 for η = 0.15); here it is the even binomial sum, exact to a few ε for every n. η = 0 gives the
-/// identity.
+/// The printed `v_n` is a second difference of n^{η+1} and suffers from cancellation (relative error 2e−3 at n = 2^20
+/// for η = 0.15). Here it is an even binomial sum, exact to a few ε for every n. η = 0 gives the identity.
 ///
 /// Cost O(m).
 ///
@@ -120,7 +119,7 @@ impl SecondDifferences {
         Self { eta, coefficients, slopes }
     }
 
-    /// Σ_k a_k x^k over the terms that matter at this distance, smallest first.
+    /// Sum Σ_k a_k x^k of the terms above rounding error at this distance, smallest first.
     fn sum(coefficients: &[f64; TERMS_NEAR], centre: usize, shrink: f64) -> f64 {
         let terms = if centre < FAR_DISTANCE_PULSES { TERMS_NEAR } else { TERMS_FAR };
         coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink)
@@ -139,7 +138,7 @@ impl SecondDifferences {
         self.near_value_and_slope(n, power, logarithm)
     }
 
-    /// `v_n` from (n−1)^{η+1}.
+    /// Second difference `v_n` from (n−1)^{η+1}.
     #[allow(clippy::cast_precision_loss)]
     fn near_value(&self, n: usize, power: f64) -> f64 {
         match n {
@@ -153,7 +152,7 @@ impl SecondDifferences {
         }
     }
 
-    /// `v_n` and d`v_n`/dη, from (n−1)^{η+1} and ln(n−1).
+    /// Second difference `v_n` and its derivative in η, from (n−1)^{η+1} and ln(n−1).
     #[allow(clippy::cast_precision_loss)]
     fn near_value_and_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let value = self.near_value(n, power);
@@ -169,13 +168,13 @@ impl SecondDifferences {
     }
 }
 
-/// Shortest kernel whose powers come from a sieve instead of single evaluations.
+/// Length of the shortest kernel whose powers are computed by a sieve over primes instead of one by one.
 const MIN_SIEVE_TERMS: usize = 256;
-/// Terms with long binomial sums, before the formula for large distances.
+/// Number of kernel values computed by the long binomial sum. Later values use the formula for large distances.
 const LONG_SUM_TERMS: usize = 64;
 
-/// Terms of the even binomial sum that matter at a distance of at least [`LONG_SUM_TERMS`]: c^{−2K} is below the
-/// rounding error.
+/// Number of terms of the even binomial sum above rounding error at a distance of at least [`LONG_SUM_TERMS`]. The
+/// omitted terms are below c^{−2K}.
 const fn terms_at(centre: usize) -> usize {
     match centre {
         0..1024 => 5,
@@ -185,7 +184,7 @@ const fn terms_at(centre: usize) -> usize {
 }
 
 impl SecondDifferences {
-    /// `v_n` at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1}.
+    /// Second difference `v_n` at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1}.
     #[allow(clippy::cast_precision_loss)]
     fn far_value(&self, centre: usize, power: f64) -> f64 {
         let shrink = 1.0 / (centre as f64 * centre as f64);
@@ -193,7 +192,8 @@ impl SecondDifferences {
         2.0 * power * sum
     }
 
-    /// `v_n` and its derivative at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1} and ln centre.
+    /// Second difference `v_n` and its derivative in η at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1} and ln
+    /// centre.
     #[allow(clippy::cast_precision_loss)]
     fn far_value_and_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let shrink = 1.0 / (centre as f64 * centre as f64);
@@ -294,12 +294,13 @@ pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     out
 }
 
-/// Pulses whose means come from powers of their ends in a long record, and terms of the midpoint series of the pulses
-/// before [`LONG_SUM_TERMS`]: 33^−16 is below the rounding error.
+/// Number of pulses of a long record whose means are computed from powers of their ends. The midpoint series of the
+/// other pulses before [`LONG_SUM_TERMS`] has [`MIDPOINT_SERIES_TERMS`] terms: 33^−16 is below the rounding error.
 const ENDPOINT_PULSES: usize = 16;
 const MIDPOINT_SERIES_TERMS: usize = 8;
 
-/// Number of pulses whose means come from powers of their ends. Other means come from powers of their midpoints.
+/// Number of pulses whose means are computed from powers of their ends. Other means are computed from powers of their
+/// midpoints.
 fn near_pulses(m: usize) -> usize {
     m.min(if m < MIN_SIEVE_TERMS { m } else { ENDPOINT_PULSES })
 }
@@ -307,12 +308,12 @@ fn near_pulses(m: usize) -> usize {
 /// Means of t^e over pulses of length h.
 #[derive(Debug, Clone)]
 pub(crate) struct PowerMeans {
-    /// e + 1.
+    /// Exponent plus one, a = e + 1.
     a: f64,
     scale: f64,
     half: f64,
     ln_step: f64,
-    /// C(a, 2j+1)/a and their derivatives.
+    /// Coefficients C(a, 2j+1)/a of the midpoint series.
     sums: [f64; MIDPOINT_SERIES_TERMS],
     slopes: [f64; MIDPOINT_SERIES_TERMS],
 }
@@ -355,7 +356,7 @@ impl PowerMeans {
         self.endpoint_mean(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
     }
 
-    /// Sum over the terms that matter at the midpoint of pulse k + 1, d/2 with d = 2k + 1.
+    /// Sum of the terms above rounding error at the midpoint d/2 of pulse k + 1, with d = 2k + 1.
     #[allow(clippy::cast_precision_loss)]
     fn sum(sums: &[f64; MIDPOINT_SERIES_TERMS], k: usize) -> f64 {
         let d = (2 * k + 1) as f64;
@@ -378,9 +379,9 @@ impl PowerMeans {
 
 /// Pulse means of t^e as an input, corrected in the first two pulses for −1 < e < 0.
 ///
-/// Without the correction a smooth response is wrong by the order e + 2 of the step, because of the moments of t^e
-/// about the midpoints (correction as in doi:10.1137/0517050, by one step). Σ_j ∫_j (t − t_j) t^e dt over all pulses is
-/// h^{e+2} ζ(−1−e)/(1+e). That much is moved from the first pulse to the second.
+/// Without the correction a smooth response has an error of order e + 2 in the step, because of the moments of t^e
+/// about the pulse midpoints. The sum of the moments Σ_j ∫_j (t − t_j) t^e dt is h^{e+2} ζ(−1−e)/(1+e). This amount is
+/// moved from the first pulse to the second (correction as in doi:10.1137/0517050).
 #[must_use]
 pub fn power_pulses(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let mut pulses = power_means(exponent, m, step);
@@ -451,8 +452,8 @@ pub fn check_order(name: &str, order: f64) -> Result<()> {
     }
 }
 
-/// Excess of a term's order over α must stay below this value. The reciprocal kernel of D^1 is Tustin's rule, which
-/// rings from pulse to pulse without decay.
+/// Excess of the order of a term over α must be below this value. The reciprocal kernel of D^1 is Tustin's rule, which
+/// oscillates from pulse to pulse without decay.
 pub const MAX_EXCESS: f64 = 1.0;
 
 /// Kernel of I^η in pulse means for η > −[`MAX_EXCESS`]. For η < 0 it is the reciprocal of [`block_pulse_kernel`] at
@@ -485,7 +486,7 @@ pub fn kernel_and_slope(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     (kernel, multiply(&square, &slope, m))
 }
 
-/// First coefficient of [`kernel`]: effect of a pulse on its own mean.
+/// First coefficient of [`kernel`], by which a pulse contributes to the integral over that pulse.
 #[must_use]
 pub fn first_coefficient(eta: f64, step: f64) -> f64 {
     let size = eta.abs();

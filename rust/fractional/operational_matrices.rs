@@ -7,10 +7,10 @@ use crate::fractional::kernels::{block_pulse_kernel, check_order};
 #[cfg(feature = "oracles")]
 use crate::linalg::dense;
 
-/// Upper-triangular Toeplitz F^η, row-major m × m (paper (32)); `step` = duration / m.
+/// Block-pulse operational matrix F^η (paper (32)): upper-triangular Toeplitz, row-major m × m; `step` = duration / m.
 ///
 /// # Errors
-/// An order outside [0, 10], a step that is not positive, m = 0 or beyond memory.
+/// An order outside [0, 10], a step that is not positive, m = 0, or an m that needs too much memory.
 pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     check_order("order", eta)?;
     check_step(step)?;
@@ -23,10 +23,10 @@ pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     Ok(f)
 }
 
-/// P^η = Φ F^η Φᵀ (paper (37)), row-major m × m, at little more than the cost of writing it. O(m²).
+/// Haar operational matrix P^η = Φ F^η Φᵀ (paper (37)), row-major m × m. O(m²).
 ///
-/// F is Toeplitz, so an entry depends only on the widths of two wavelets and their distance. Rows of one level are
-/// windows into one table for each other level. All tables together have O(m log m) entries.
+/// F is Toeplitz, so an entry depends only on the widths of two wavelets and their distance. Each row is a contiguous
+/// part of a table of two levels. All tables together have O(m log m) entries.
 ///
 /// # Errors
 /// As [`block_pulse_matrix`], and m must be a power of two.
@@ -83,7 +83,7 @@ impl Wavelet {
         Self { width, constant: level == 0, scale: 1.0 / (width as f64).sqrt() }
     }
 
-    /// Σ_s φ(s) f(n − s) from the running sums of f.
+    /// Convolution Σ_s φ(s) f(n − s) with a wavelet φ, from the running sums of f.
     fn respond(&self, sums: &[Vec<f64>], out: &mut [f64]) {
         let half = self.width / 2;
         if self.constant {
@@ -98,16 +98,17 @@ impl Wavelet {
     }
 }
 
-/// Entries of one level of rows with one level of columns, by distance, such that every row is a window.
+/// Table of the entries of one level of rows and one level of columns, by their distance. Every row is a contiguous
+/// part.
 struct Table {
     values: Vec<f64>,
-    /// Columns of the level.
+    /// Number of columns of the level.
     count: usize,
-    /// If columns are wider than rows: rows to a column, each with its own window range.
+    /// Number of rows per column, if columns are wider than rows. Each such row has its own part of the table.
     phases: usize,
-    /// Otherwise: columns to a row.
+    /// Number of columns per row otherwise.
     stride: usize,
-    /// Rows of the level.
+    /// Number of rows of the level.
     rows: usize,
 }
 
@@ -156,7 +157,7 @@ fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f
     Table { values, count, phases, stride, rows: m / rows.width }
 }
 
-/// P^η by two dense matrix products: the oracle of [`operational_matrix`]. O(m³).
+/// Haar operational matrix P^η by two dense matrix products, a reference for tests of [`operational_matrix`]. O(m³).
 ///
 /// # Errors
 /// As [`operational_matrix`].
@@ -241,7 +242,7 @@ pub fn haar_inverse(c: &mut [f64]) -> Result<()> {
     Ok(())
 }
 
-/// [`haar_transform`] with scratch of the caller, for loops over rows. The length of `f` is a power of two.
+/// Haar transform as [`haar_transform`], with scratch memory of the caller. The length of `f` is a power of two.
 pub(crate) fn haar_transform_with_scratch(f: &mut [f64], scratch: &mut [f64]) {
     let mut len = f.len();
     while len > 1 {

@@ -2,23 +2,24 @@
 //!
 //! Samples f(kh) have the starred transform F*(s) = Σ f(kh) e^{−skh} = 1/h Σ_n F(s + 2πi n/h), in which the sample at a
 //! jump is the mean of both sides. For Re s = σ > 0, F* is the discrete Fourier transform of the samples times
-//! e^{−σkh}, which are periodic up to e^{−σLh} over L samples. So a function of s of any orders has samples, exact to
-//! about 1e−10, without a grid of pulses, and a convolution with zero-order-hold inputs is a product of two transforms.
+//! e^{−σkh}, which are periodic up to e^{−σLh} over L samples. A function of s of any orders thus has samples with an
+//! error of about 1e−10, without a grid of pulses. A convolution with zero-order-hold inputs is a product of two
+//! transforms.
 //!
 //! The alias terms n ≠ 0 are smooth in the base band |Im s| ≤ π/h: they are evaluated at Chebyshev nodes and
-//! interpolated. Those of large |n| are an Euler–Maclaurin integral. The constant that it leaves is given by f(0).
+//! interpolated. The terms of large |n| are summed by an Euler–Maclaurin integral, whose constant follows from f(0).
 
 use std::f64::consts::PI;
 
 use crate::fft::{self, Bin, Plan, Workspace};
 
-/// Damping σ times the duration T: balances the wrap-around e^{−2σT} and the rounding e^{σT} ε, both 4e−11.
+/// Damping σ times the duration T. It balances the wrap-around e^{−2σT} and the rounding error e^{σT} ε, both 4e−11.
 const DAMPING_DURATIONS: f64 = 12.0;
-/// Panels of the base band, and Chebyshev nodes in each: the error is about 34^−8 = 6e−13, by the Bernstein ellipse of
-/// radius 34 of the outermost panel, if no pole is near the Nyquist frequency.
+/// Number of panels of the base band, each with [`PANEL_NODES`] Chebyshev nodes. The error is about 34^−8 = 6e−13 if no
+/// pole is near the Nyquist frequency (Bernstein ellipse of radius 34 of the outermost panel).
 const BAND_PANEL_COUNT: usize = 8;
 const PANEL_NODES: usize = 8;
-/// Number n of the alias term from which on an integral replaces the sum.
+/// Index n of the first alias term that is summed by the integral.
 const DIRECT_ALIAS_COUNT: usize = 32;
 /// Coefficient of the third difference in the midpoint Euler–Maclaurin sum.
 const THIRD_DIFFERENCE: f64 = 17.0 / 5760.0;
@@ -30,13 +31,13 @@ const LEGENDRE_RULE: [(f64, f64); 4] = [
     (0.930_568_155_797_026_3, 0.173_927_422_568_726_93),
 ];
 
-/// Line Re s = σ and FFT plan for a number of uniform samples.
+/// Starred transform on the line Re s = σ for a number of uniform samples.
 pub(crate) struct StarredTransform {
     step: f64,
     plan: Plan,
-    /// e^{−σkh} of each sample.
+    /// Damping factor e^{−σkh} of each sample.
     damping: Vec<f64>,
-    /// ln s of each bin.
+    /// Logarithm ln s of each frequency bin.
     logarithms: Vec<Bin>,
     /// First bin of each panel, then the number of bins.
     panels: Vec<usize>,
@@ -174,7 +175,7 @@ fn chebyshev_node(k: usize) -> f64 {
     libm::cos(node_angle(k))
 }
 
-/// s^−η from ln s.
+/// Power s^−η from ln s.
 pub(crate) fn integration(logarithm: Bin, eta: f64) -> Bin {
     let size = libm::exp(-eta * logarithm.re);
     let (sine, cosine) = libm::sincos(-eta * logarithm.im);
@@ -185,7 +186,7 @@ pub(crate) fn integration(logarithm: Bin, eta: f64) -> Bin {
 mod tests {
     use super::*;
 
-    /// Step response of a function of s, without feedthrough.
+    /// Samples of the step response of a transfer function without direct feedthrough.
     fn step_response(rows: usize, step: f64, function: impl Fn(Bin) -> Bin) -> Vec<f64> {
         let transform = StarredTransform::new(rows, step);
         let spectra = transform.spectra(&[0.0], |logarithm, values| {

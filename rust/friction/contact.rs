@@ -1,38 +1,40 @@
-//! Contact problem of bodies with friction: set-valued law of coupled bodies, solved pulse by pulse.
+//! Friction forces of coupled bodies in one pulse, with a set-valued friction law.
 //!
 //! The friction of a single body is a function of its end velocity without friction ([`FrictionLaw::pulse`]), which the
 //! mean forces on the other bodies change: φ_a = T_a(p_a − Σ_{b≠a} G_ab φ_b), e = p − G φ. With Coulomb friction T_a
 //! rises with its argument by at most 1/G_aa, so that friction and end velocity of a body never change in opposite
 //! directions: two solutions have Δe_a Δφ_a ≥ 0 for every a, while Δe = −G Δφ. If G is a P-matrix (all principal minors
-//! are positive, as for an inverse inertia matrix), some a has Δφ_a (G Δφ)_a > 0 unless Δφ = 0, so the solution is unique:
-//! exactly one combination of sliding and sticking is consistent. Newton steps find it in a few iterations. If one
-//! makes no progress, a Gauss–Seidel sweep over the bodies does. It decreases the error for inertia matrices, which are
-//! symmetric up to scaling.
+//! are positive, as for an inverse inertia matrix), some a has Δφ_a (G Δφ)_a > 0 unless Δφ = 0. The solution is
+//! therefore unique: exactly one combination of sliding and sticking is consistent. Newton steps find it in a few
+//! iterations. A Newton step without progress is replaced by a Gauss–Seidel sweep over the bodies, which decreases the
+//! error for inertia matrices, because these are symmetric up to scaling.
 //!
-//! Stribeck friction falls with speed. In long pulses several combinations may then be consistent. The one found from
-//! the forces of the previous pulse is used.
+//! Stribeck friction falls with speed. In long pulses several combinations may then be consistent. The iteration starts
+//! at the forces of the previous pulse, and its result is used.
 
 use super::law::{FrictionLaw, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
-/// Friction laws of coupled bodies, and gains G_ab: the decrease of end velocity a for a unit of friction on body b.
+/// Friction problem of coupled bodies: their friction laws, and gains G_ab. A gain is the decrease of the end velocity
+/// of body a per unit of friction on body b.
 #[derive(Debug, Clone, PartialEq)]
-pub struct ContactProblem {
+pub struct FrictionProblem {
     laws: Vec<FrictionLaw>,
-    /// Decreases of end velocities per friction, row by row.
+    /// Gains G_ab, row-major.
     gains: Vec<f64>,
 }
 
-/// Most iterations for the frictions of a pulse. Two weakly coupled bodies need two.
+/// Maximum number of iterations for the friction forces of a pulse. Two weakly coupled bodies need two.
 const MAX_CONTACT_ITERATIONS: usize = 200;
-/// Rounding error relative to the largest velocity without friction. A force that equals friction moves nothing.
+/// Rounding error relative to the largest velocity without friction. A body does not move under a force that equals
+/// friction within this error.
 pub(crate) const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
-/// Largest error of a friction, as a change of velocity relative to the velocities.
+/// Largest error of a friction force, as a change of velocity relative to the velocities.
 pub(crate) const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
 
-impl ContactProblem {
-    /// Bodies with these laws.
+impl FrictionProblem {
+    /// Friction problem of bodies with these laws and gains.
     ///
     /// # Errors
     /// [`Error::Diverged`] if the coupling leaves no unique solution of a pulse: the step is too long.
@@ -74,14 +76,15 @@ impl ContactProblem {
         self.laws[body].breakaway()
     }
 
-    /// Decrease of the end velocity of a body by the frictions of the others.
+    /// Decrease of the end velocity of a body by the friction forces on the other bodies.
     fn coupling_velocity(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
         (0..self.count()).filter(|&b| b != body).map(|b| self.gain(body, b) * forces(b)).sum()
     }
 
     /// Solve a pulse that starts at the velocities `v` and would end at `p` without friction.
     ///
-    /// `at` receives each body's end velocity without its own friction, and its pulse. `near` are the initial forces.
+    /// `at` receives the end velocity of each body without its own friction, and its pulse. `near` contains the initial
+    /// friction forces.
     pub fn solve(&self, v: &[f64], p: &[f64], rounding: &[f64], near: &[f64], at: &mut Vec<(f64, Pulse)>) {
         let n = self.count();
         let of = |a: usize, forces: &[f64]| {
@@ -129,7 +132,7 @@ impl ContactProblem {
         }
     }
 
-    /// Derivative of a body's friction with respect to its end velocity without friction.
+    /// Derivative of the friction force of a body with respect to its end velocity without friction.
     #[must_use]
     pub fn force_slope(&self, body: usize, velocity: f64, free: f64, pulse: &Pulse) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
@@ -153,7 +156,7 @@ impl ContactProblem {
     }
 }
 
-/// Whether all principal minors are positive, by recursion over the first pivot and its Schur complement.
+/// True if all principal minors are positive, by recursion over the first pivot and its Schur complement.
 #[must_use]
 pub fn is_p_matrix(matrix: &[f64], n: usize) -> bool {
     if n == 0 {

@@ -1,11 +1,10 @@
 //! Coulomb–Stribeck friction in one pulse: F(v) sgn v with F(v) = fc + fs exp(−(v/vs)²), set-valued at rest.
 //!
-//! Within a pulse the velocity is linear between rests. The friction of the pulse is its mean in closed form: the mean
-//! of the Gaussian is a difference of error functions. A velocity that reaches zero stays there if friction can hold
-//! the body. Otherwise the body reverses at that time, so that the mean is continuous from both ends.
-//!
-//! F falls with speed. For long pulses the equation of the end velocity may therefore have several roots. The first
-//! root on the way from the initial velocity is used.
+//! Within a pulse the velocity is linear in time unless the body is at rest. The friction of the pulse is its mean in
+//! closed form: the mean of the Gaussian is a difference of error functions. A velocity that reaches zero stays zero if
+//! the force is at most the static friction. Otherwise the body reverses at that time, and the mean is continuous
+//! there. F decreases with speed. For long pulses the equation of the end velocity may therefore have several roots.
+//! The root that is closest to the initial velocity is used.
 
 use core::f64::consts::PI;
 
@@ -27,14 +26,14 @@ pub struct FrictionLaw {
     pub coulomb: f64,
     /// Stribeck friction fs at rest in addition to fc, not negative.
     pub stribeck: f64,
-    /// Stribeck speed vs, positive: the additional friction has fallen to fs/e.
+    /// Stribeck velocity vs, positive: at this velocity the additional friction is fs/e.
     pub speed: f64,
 }
 
 /// Friction and motion in one pulse.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pulse {
-    /// Mean friction over the pulse, positive against a positive velocity.
+    /// Mean friction over the pulse, in the unit of D^α y; positive if it opposes a positive velocity.
     pub force: f64,
     /// Velocity at the end, exactly 0 at rest.
     pub end: f64,
@@ -45,28 +44,29 @@ pub struct Pulse {
 /// Derivatives of the quantities of a pulse with respect to a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PulseDerivatives {
-    /// Velocity at the start.
+    /// Derivative of the velocity at the start.
     pub start: f64,
-    /// Velocity at the end without friction in the pulse.
+    /// Derivative of the end velocity without friction in the pulse.
     pub free: f64,
-    /// Change of the end velocity for a unit of force in the pulse.
+    /// Derivative of the change of the end velocity per unit of force in the pulse.
     pub first: f64,
-    /// Friction parameters fc, fs and vs.
+    /// Derivatives of the friction parameters fc, fs and vs.
     pub law: [f64; 3],
 }
 
-/// Mean of F between two speeds, and its derivatives.
+/// Mean of the friction force F between two speeds, and its derivatives.
 struct Mean {
     value: f64,
-    /// With respect to the two speeds.
+    /// Derivative with respect to the first speed.
     from: f64,
+    /// Derivative with respect to the second speed.
     to: f64,
-    /// With respect to fc, fs and vs.
+    /// Derivatives with respect to fc, fs and vs.
     law: [f64; 3],
 }
 
 /// Difference of speeds, relative to vs, below which quadrature replaces a difference of error functions. Five points
-/// are exact there, and the difference would lose digits.
+/// are then exact, while the difference would lose digits.
 const QUADRATURE_SPEED_RATIO: f64 = 0.2;
 /// Gauss–Legendre nodes and weights on [0, 1].
 const GAUSS_LEGENDRE_NODES: [(f64, f64); 5] = [
@@ -76,13 +76,14 @@ const GAUSS_LEGENDRE_NODES: [(f64, f64); 5] = [
     (0.769_234_655_052_841_6, 0.239_314_335_249_683_24),
     (0.953_089_922_969_332, 0.118_463_442_528_094_54),
 ];
-/// Most fixed-point iterations for the end velocity. Each gains a digit or more unless two roots nearly coincide.
+/// Maximum number of fixed-point iterations for the end velocity. Each adds a correct digit or more unless two roots
+/// nearly coincide.
 const MAX_SLIDE_ITERATIONS: usize = 500;
 
 /// Mean sign, end velocity and state of a pulse with Coulomb friction.
 ///
 /// `v` is the initial velocity, `p` the end velocity without friction, `b` the largest velocity change by friction. A
-/// force that exceeds friction by `rounding` still holds.
+/// body stays at rest if the force exceeds friction by at most `rounding`.
 #[must_use]
 pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
     if v == 0.0 {
@@ -116,7 +117,8 @@ impl FrictionLaw {
         self.coulomb + self.stribeck
     }
 
-    /// Mean of the Stribeck term's exponential between two nonnegative speeds of a linear velocity.
+    /// Mean of the exponential of the Stribeck term over a velocity that changes linearly between two nonnegative
+    /// speeds.
     fn share(&self, from: f64, to: f64) -> f64 {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
         if d.abs() < QUADRATURE_SPEED_RATIO {
@@ -152,10 +154,10 @@ impl FrictionLaw {
         }
     }
 
-    /// End velocity of a body that slides at speed v and would end at p without friction, a unit of force taking g.
+    /// End velocity of a body with initial velocity v and end velocity p without friction.
     ///
-    /// None if the body comes to rest. The mean falls as the end velocity rises, so iterates from v are monotone and
-    /// never pass the first root.
+    /// A unit of friction decreases it by g. None if the body comes to rest. The mean friction decreases with the end
+    /// velocity, so iterates from v are monotone and converge to the nearest root.
     fn slide(&self, v: f64, p: f64, g: f64) -> Option<f64> {
         let rounding = 4.0 * f64::EPSILON * (v + p.abs());
         let mut end = v;
@@ -173,9 +175,10 @@ impl FrictionLaw {
         Some(end)
     }
 
-    /// Pulse that starts at v and would end at p without friction, a unit of force taking g from the end velocity.
+    /// Pulse with initial velocity v and end velocity p without friction.
     ///
-    /// A force that exceeds friction by `rounding` still holds.
+    /// A unit of friction decreases the end velocity by g. A body stays at rest if the force exceeds friction by at
+    /// most `rounding`.
     #[must_use]
     pub fn pulse(&self, v: f64, p: f64, g: f64, rounding: f64) -> Pulse {
         if self.stribeck == 0.0 {

@@ -6,13 +6,13 @@ use faer::{Accum, Mat, MatRef, Par};
 use crate::linalg::orthogonal;
 use crate::parallel::{self, Stop};
 
-/// Fewest rows of one part of a product of long columns, and largest number of parts. Neither depends on the number of
-/// threads, so the sums do not either.
+/// Smallest number of rows in one part of a product of long columns. The parts, at most [`MAX_ROW_PARTS`], do not
+/// depend on the number of threads, so neither do the sums.
 const MIN_PART_ROWS: usize = 1 << 14;
 const MAX_ROW_PARTS: usize = 16;
-/// Width of the column tiles in which a Gram matrix is multiplied.
+/// Number of columns in a tile of a Gram matrix product.
 const GRAM_TILE_COLUMNS: usize = 64;
-/// Rows of scattered columns that are gathered for one product. They fit in the cache.
+/// Number of rows of scattered columns that are copied for one product. They fit in the cache.
 const LAID_OUT: usize = 1 << 10;
 
 /// Row-major product of an a×b and a b×c matrix, one thread. O(abc).
@@ -30,7 +30,7 @@ pub fn multiply(left: &[f64], right: &[f64], a: usize, b: usize, c: usize) -> Ve
     out
 }
 
-/// Gram matrix of contiguous columns with a target as last column: row-major, exactly symmetric.
+/// Gram matrix of contiguous columns and, as last column, a target. It is row-major and exactly symmetric.
 ///
 /// O(k²m) on the threads of the current pool. The columns are not copied. The result is invalid after `stop` was set.
 ///
@@ -112,7 +112,7 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
 pub struct SingularValues {
     /// Singular vectors on the left, each as long as the columns.
     pub left: Vec<Vec<f64>>,
-    /// Singular values. There are as many as the smaller of the number and the length of the columns.
+    /// Singular values. Their count is the smaller of the number and the length of the columns.
     pub values: Vec<f64>,
     /// Singular vectors on the right, with one element a column.
     pub right: Vec<Vec<f64>>,

@@ -4,17 +4,19 @@ use crate::error::Result;
 use crate::parallel::{self, Stop};
 use crate::simd::{dispatch_simd, dot, SimdKernel};
 
-/// Rows of one block of a triangular factorization. They fit in the cache.
+/// Number of rows of one block of a triangular factorization. They fit in the cache.
 const QR_BLOCK_ROWS: usize = 1 << 10;
 
-/// Directions that are projected out between two checks for cancellation.
+/// Number of directions that are projected out between two checks for cancellation.
 const AT_ONCE: usize = 16;
 
-/// Range of squared norms in factorizations. Beyond it sums of squares overflow or lose accuracy.
+/// Smallest squared norm in factorizations. Below it, or above [`MAX_SQUARED_NORM`], sums of squares lose accuracy or
+/// overflow.
 const MIN_SQUARED_NORM: f64 = 1e-280;
 const MAX_SQUARED_NORM: f64 = 1e280;
 
-/// Upper triangle R of [R; rows] by Householder reflections, column by column. False if a square is out of range.
+/// SIMD task that reduces [R; rows] to an upper triangle R by Householder reflections. It returns false if a square is
+/// out of range.
 struct Reflections<'a> {
     columns: &'a mut [Vec<f64>],
 }
@@ -83,7 +85,7 @@ pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// Removal of the components along an orthonormal basis from a column, `times` over.
+/// SIMD task that removes the components along an orthonormal basis from a column, repeated `times` times.
 struct Projection<'a> {
     basis: &'a [Vec<f64>],
     column: &'a mut [f64],
@@ -123,7 +125,7 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
     }
 }
 
-/// Orthonormal basis from which every column has a relative distance of at most `share`.
+/// Orthonormal basis of the span of columns, up to a relative distance `share` of every column from the span.
 ///
 /// O(k² m) on the threads of the current pool. Pivoting: the column farthest from the basis comes next, so that
 /// rounding errors are amplified once by 1/`share`, not once a column. Zero columns and columns whose squared norm
@@ -168,7 +170,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
     }
 }
 
-/// √Σ v².
+/// SIMD task that computes the norm √Σ v².
 struct Norm<'a>(&'a [f64]);
 
 impl SimdKernel for Norm<'_> {

@@ -61,12 +61,12 @@ pub fn inverse_with_determinant(matrix: &[f64], n: usize) -> Option<(Vec<f64>, f
     (determinant != 0.0 && inverse.iter().all(|v| v.is_finite())).then_some((inverse, determinant))
 }
 
-/// Most steps of an iteration for eigenvalues, of which a polynomial of degree ten needs about thirty.
+/// Maximum number of steps of an eigenvalue iteration. A polynomial of degree ten needs about thirty.
 const MAX_EIGENVALUE_STEPS: usize = 1000;
 
-/// Magnitude of the largest zero of a polynomial with these coefficients, the constant first.
+/// Largest magnitude of the zeros of a polynomial, whose coefficients start with the constant.
 ///
-/// None without a zero, or for coefficients of which the leading one is 0 or too small beside the others.
+/// None without a zero, or if the leading coefficient is 0 or too small relative to the others.
 ///
 /// ```
 /// // (z + 3)(z − 2)
@@ -78,9 +78,9 @@ pub fn spectral_radius(coefficients: &[f64]) -> Option<f64> {
     Some(roots.iter().map(|(re, im)| re.hypot(*im)).fold(0.0, f64::max)).filter(|_| !roots.is_empty())
 }
 
-/// Real and imaginary part of the zeros of a polynomial with these coefficients, the constant first.
+/// Real and imaginary parts of the zeros of a polynomial, whose coefficients start with the constant.
 ///
-/// None for coefficients of which the leading one is 0 or too small beside the others.
+/// None if the leading coefficient is 0 or too small relative to the others.
 ///
 /// ```
 /// // (s + 1)² + 4
@@ -110,10 +110,11 @@ pub fn polynomial_roots(coefficients: &[f64]) -> Option<Vec<(f64, f64)>> {
 
 /// LU factorization of an equilibrated square matrix, whose rows and columns may differ in scale by any factor.
 pub struct EquilibratedLu {
-    /// Largest element of each row, then of each column.
+    /// Largest magnitude in each row.
     rows: Vec<f64>,
+    /// Largest magnitude in each column.
     columns: Vec<f64>,
-    /// None for a matrix without rows.
+    /// LU factorization; None for a matrix without rows.
     factor: Option<FullPivLU<f64, Dyn, Dyn>>,
 }
 
@@ -200,9 +201,9 @@ pub const fn packed_index(i: usize, j: usize) -> usize {
 
 /// Solve L symmetric positive definite systems of k unknowns side by side, in place, by L D Lᵀ.
 ///
-/// `gram` has the lower rows ([`packed_index`]) of correlation matrices. Their diagonals are 1, or 0 for an absent
-/// column. `rhs` is overwritten with the solutions. The first `needed` unknowns must be independent; the returned flags
-/// mark the lanes in which they are not. Later dependent unknowns are set to 0. O(k³). The operations of a lane depend
+/// `gram` has the lower rows ([`packed_index`]) of correlation matrices. Their diagonals are 1, or 0 for a zero column.
+/// `rhs` is overwritten with the solutions. The first `needed` unknowns must be independent; the returned flags mark
+/// the lanes in which they are not. Later dependent unknowns are set to 0. O(k³). The operations of a lane depend
 /// neither on other lanes nor on L.
 #[inline(always)]
 pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
@@ -342,7 +343,7 @@ pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
     x
 }
 
-/// Replace a packed lower triangle by its Cholesky factor. A row without any information gets the pivot 1.
+/// Replace a packed lower triangle by its Cholesky factor. The pivot of a zero row is set to 1.
 fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
     for i in 0..k {
         for j in 0..=i {
@@ -364,18 +365,20 @@ fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
 
 /// Σ q qᵀ and Σ q m over the newest rows, in amortized O(k²) per row for any length of the window.
 ///
-/// Rows form blocks of the window's length. A window is the end of one block and the beginning of the next, so its sum
-/// is that of a suffix and of a prefix (van Herk, doi:10.1016/0167-8655(92)90069-C). Nothing is subtracted.
+/// Rows form blocks of the length of the window. A window consists of the end of one block and the beginning of the
+/// next, so its sum is a suffix sum plus a prefix sum (van Herk, doi:10.1016/0167-8655(92)90069-C). No sums are
+/// subtracted, so there is no cancellation.
 #[derive(Debug, Clone)]
 pub struct SlidingGram {
     width: usize,
     length: usize,
     /// Products of the rows of the current block: packed rows of q qᵀ, then q m.
     block: Vec<f64>,
-    /// Sums of the previous block from each of its rows on.
+    /// Suffix sums of the previous block: from each of its rows to its end.
     suffixes: Vec<f64>,
-    /// Sums of the current block, and of the rows of the previous one that are still in the window.
+    /// Sum of the rows of the current block.
     prefix: Vec<f64>,
+    /// Sum of the rows of the previous block that are still in the window.
     suffix: Vec<f64>,
 }
 
@@ -395,7 +398,7 @@ impl SlidingGram {
         self.suffix.fill(0.0);
     }
 
-    /// Add a row and its output. The oldest row leaves a full window.
+    /// Add a row and its output. If the window is full, the oldest row is removed.
     ///
     /// # Errors
     /// [`Error::Length`] for a row of another length.
@@ -424,7 +427,7 @@ impl SlidingGram {
         Ok(())
     }
 
-    /// Sum of the products at this place: packed rows of q qᵀ, then q m.
+    /// Sum over the window of the product at index `at` of the packed rows of q qᵀ, then q m.
     #[inline]
     fn sum(&self, at: usize) -> f64 {
         self.suffix[at] + self.prefix[at]
@@ -437,14 +440,14 @@ pub struct Recursion {
     coefficients: Vec<f64>,
     /// Inverse covariance, packed rows of the lower triangle.
     information: Vec<f64>,
-    /// Right-hand side of the next step: products of new prior precisions and coefficients.
+    /// Right-hand side that new prior precisions add to the next step.
     gain: Vec<f64>,
     /// Cholesky factor of the information, packed.
     factor: Vec<f64>,
 }
 
 impl Recursion {
-    /// Recursion from coefficients 0 with an inverse prior covariance of each; 0 for none so far.
+    /// Recursion that starts at coefficients 0 with the inverse prior covariance of each; 0 without a prior.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a precision that is negative or not finite.
@@ -463,12 +466,12 @@ impl Recursion {
         Ok(Self { coefficients: vec![0.0; k], factor: information.clone(), information, gain: vec![0.0; k] })
     }
 
-    /// Multiply all information so far by a factor in (0, 1].
+    /// Multiply the information of all earlier rows by a factor in (0, 1].
     pub fn forget(&mut self, factor: f64) {
         self.information.iter_mut().for_each(|v| *v *= factor);
     }
 
-    /// Add inverse prior covariances of coefficients that are 0 by the prior; the next step accounts for them.
+    /// Add inverse prior covariances of coefficients with prior mean 0. The next step uses them.
     pub fn add_prior(&mut self, precision: impl Iterator<Item = f64>) {
         for (j, more) in precision.take(self.coefficients.len()).enumerate() {
             self.information[packed_index(j, j)] += more;
@@ -478,7 +481,7 @@ impl Recursion {
 
     /// One update of (44) with the rows of a window.
     ///
-    /// A coefficient without any information stays as it is.
+    /// A coefficient without information is unchanged.
     ///
     /// # Errors
     /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for rows of another length.
@@ -529,7 +532,7 @@ impl Recursion {
 mod tests {
     use super::*;
 
-    /// One update of (44) with each row of the window by itself, by a dense solve.
+    /// One update of (44) by a dense solve, with one row of the window after another.
     fn naive_step(information: &mut DMatrix<f64>, x: &mut DVector<f64>, rows: &[(Vec<f64>, f64)]) {
         let mut gain = DVector::zeros(x.len());
         for (row, output) in rows {

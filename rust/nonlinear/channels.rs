@@ -1,4 +1,4 @@
-//! Channels of equations with nonlinear terms, their integral kernels and their forcing.
+//! Channels of equations with non-linear terms, their integral kernels and their forcing.
 
 use super::convolution::{edge_kernel, ConvolutionKernel, MAX_FEEDTHROUGH_ORDER};
 use crate::equation::ORDER_GRAIN;
@@ -72,7 +72,7 @@ impl IntegralKernel {
         ConvolutionKernel::of_integral(self.order, self.values_and_slopes(m, step).0)
     }
 
-    /// Values and their derivatives in the order.
+    /// Kernel values, and their derivatives with respect to the order.
     pub(super) fn values_and_slopes(self, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
         if self.at_ends && !self.is_averaged() {
             edge_kernel(self.order, m, step)
@@ -93,7 +93,8 @@ pub(super) struct ForcingTerms {
 
 /// Derivatives of a system with respect to one parameter.
 pub(super) struct SystemDerivatives {
-    /// Derivatives of coefficient and integration order of each term of each equation, and of its friction.
+    /// Derivatives of the coefficient and of the integration order of each term, by equation; the last pair is that of
+    /// the friction.
     pub(super) terms: Vec<Vec<(f64, f64)>>,
     /// Derivatives of the forcing by initial terms.
     pub(super) forcing: ForcingTerms,
@@ -103,13 +104,13 @@ pub(super) struct SystemDerivatives {
     pub(super) inputs: Vec<(usize, Vec<f64>)>,
 }
 
-/// Why a pulse has no solution.
+/// Reason for which a pulse has no solution.
 pub(super) enum PulseFailure {
-    /// A value left the range of numbers.
+    /// A value overflows.
     Overflow,
     /// A function has no value for this argument.
     Domain(&'static str, f64),
-    /// No friction agrees with the motion.
+    /// No friction forces are consistent with the motion.
     Contact,
     /// No Newton iteration converges.
     Newton(&'static str),

@@ -1,45 +1,47 @@
 //! Dry friction in a simulation: friction force of a pulse, and its derivatives.
 //!
 //! The end velocity of a body is e = p − G φ. p is the end velocity without the friction φ, G the linear response
-//! within the pulse. Nonlinear terms change p little within a pulse, so that the iteration for φ converges in a few
+//! within the pulse. Non-linear terms change p only slightly within a pulse, so the iteration for φ converges in a few
 //! steps.
 
 use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
 use crate::error::Result;
-use crate::friction::contact::{ContactProblem, MAX_FRICTION_ERROR_RATIO, VELOCITY_ROUNDING_RATIO};
+use crate::friction::contact::{FrictionProblem, MAX_FRICTION_ERROR_RATIO, VELOCITY_ROUNDING_RATIO};
 use crate::friction::law::{FrictionLaw, Phase, Pulse as FrictionPulse, PulseDerivatives};
 use crate::linalg::small;
 
-/// Most solutions of the state channels and contacts in turn in a pulse. Three are usual.
+/// Maximum number of iterations in a pulse, each of which solves for the state channels and then for the friction.
+/// Three are usual.
 const MAX_PULSE_ITERATIONS: usize = 60;
-/// Error of a friction, relative to the velocities, that ends the iteration.
+/// Error of a friction force at which the iteration has converged, relative to the velocities.
 const FRICTION_ROUNDING_RATIO: f64 = 64.0 * f64::EPSILON;
 
-/// Equations of a pulse at given friction.
+/// Equations of one pulse with given friction forces.
 pub(super) trait PulseEquations {
-    /// Whether the state channels are linear in the frictions.
+    /// True if the state channels are linear in the friction forces.
     fn is_linear(&self) -> bool;
 
-    /// Solve the equations for the state channels at these frictions.
+    /// Solve the equations for the state channels with these friction forces.
     fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), PulseFailure>;
 
     /// Value of a state channel.
     fn channel(&mut self, state: usize) -> &mut f64;
 
-    /// Give a state channel a value; None lets the equations determine it.
+    /// Fix a state channel at a value; None frees it, so that the equations determine it.
     fn fix(&mut self, state: usize, value: Option<f64>);
 }
 
-/// Bodies with friction.
+/// Friction problem of a simulation, with the state channels of its bodies.
 pub(super) struct ContactOperators {
-    /// Friction laws, and decrease of the end velocities for a unit of each friction without the nonlinear terms.
-    problem: ContactProblem,
-    /// State channels of the output and of the end velocity of each body.
+    /// Friction laws, and decrease of the end velocities per unit of each friction force without the non-linear terms.
+    problem: FrictionProblem,
+    /// State channel of the output of each body.
     outputs: Vec<usize>,
+    /// State channel of the end velocity of each body.
     velocities: Vec<usize>,
     /// Number of state channels.
     states: usize,
-    /// Inverse of the equations of the state channels without nonlinear terms.
+    /// Inverse of the equations of the state channels without non-linear terms.
     inverse: Vec<f64>,
 }
 
@@ -56,12 +58,12 @@ pub struct BodyMotion {
 
 /// Motion and friction of one body in one pulse.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct PulseContact {
+pub(super) struct BodyState {
     /// Velocity at the start.
     start_velocity: f64,
     /// Velocity at the end without the friction of the body.
     free_velocity: f64,
-    /// Whether the body rests in this pulse and in the one before, so that its mean output stays.
+    /// True if the body is at rest in this pulse and in the previous one, so that its mean output is constant.
     is_resting: bool,
     pulse: FrictionPulse,
 }
@@ -70,32 +72,33 @@ pub(super) struct PulseContact {
 pub(super) struct BodyDerivatives {
     /// Initial output and velocity of each body.
     pub(super) starts: Vec<(f64, f64)>,
-    /// Derivative of the own gain of each body.
+    /// Derivative of the gain from the friction of each body to its own end velocity.
     gains: Vec<f64>,
-    /// fc, fs and vs of each body.
+    /// Derivatives of fc, fs and vs of each body.
     laws: Vec<[f64; 3]>,
 }
 
-/// Solution of the contacts of all bodies, pulse by pulse.
+/// Solver of the friction forces of all bodies, pulse by pulse.
 pub(super) struct ContactSolver<'a> {
     contact: &'a ContactOperators,
     /// Velocities at the start of the run.
     initial_velocities: Vec<f64>,
     /// Velocities at the start of the pulse.
     velocities: Vec<f64>,
-    /// Outputs of the last pulse, and whether each body rested in it.
+    /// Output of each body in the last pulse; true if it was at rest.
     last_outputs: Vec<(f64, bool)>,
-    /// Whether each body rests in this pulse and in the one before.
+    /// True if a body is at rest in this pulse and in the previous one.
     is_resting: Vec<bool>,
     forces: Vec<f64>,
     rounding: Vec<f64>,
     at: Vec<(f64, FrictionPulse)>,
-    contacts: Vec<PulseContact>,
+    contacts: Vec<BodyState>,
 }
 
 impl ContactOperators {
-    /// Bodies with these laws. `channels` are the state channels of the output and of the end velocity of each body.
-    /// `gains` are the weights of the sources in each state channel within a pulse; the frictions are the last sources.
+    /// Friction problem of bodies with these laws. `channels` are the state channels of the output and of the end
+    /// velocity of each body. `gains` are the weights of the sources in each state channel within a pulse, row-major.
+    /// The friction forces are the last sources.
     pub(super) fn new(
         laws: Vec<FrictionLaw>,
         channels: &[(usize, usize)],
@@ -114,7 +117,7 @@ impl ContactOperators {
         let response = |a: usize, b: usize| -> f64 {
             (0..states).map(|s| -inverse[velocities[a] * states + s] * gains[s * count + count - n + b]).sum()
         };
-        let problem = ContactProblem::new(laws, (0..n * n).map(|at| response(at / n, at % n)).collect())?;
+        let problem = FrictionProblem::new(laws, (0..n * n).map(|at| response(at / n, at % n)).collect())?;
         Ok(Self { problem, outputs, velocities, states, inverse })
     }
 
@@ -128,8 +131,8 @@ impl ContactOperators {
         &self.outputs
     }
 
-    /// Motion of each body, from its contacts pulse after pulse.
-    pub(super) fn motions(&self, forcing: &ForcingTerms, contacts: &[PulseContact]) -> Vec<BodyMotion> {
+    /// Motion of each body, from its contact states pulse by pulse.
+    pub(super) fn motions(&self, forcing: &ForcingTerms, contacts: &[BodyState]) -> Vec<BodyMotion> {
         let of = |(body, start): (usize, &(f64, f64))| {
             let pulses = || contacts.iter().skip(body).step_by(self.count()).map(|contact| &contact.pulse);
             BodyMotion {
@@ -164,7 +167,7 @@ impl ContactOperators {
         }
     }
 
-    /// Derivatives of the bodies from those of the weights of sources, row by row.
+    /// Derivatives of the bodies, from the derivatives `gain_derivatives` of the weights of the sources.
     pub(super) fn derivatives(
         &self,
         gains: &[f64],
@@ -191,10 +194,11 @@ impl ContactOperators {
         Ok(BodyDerivatives { starts, gains: (0..n).map(of).collect(), laws })
     }
 
-    /// Add the derivatives of the frictions of a pulse to those of the sources; update those of outputs and velocities.
+    /// Add the derivatives of the friction forces of a pulse to the derivatives of the sources. Update the derivatives
+    /// of outputs and velocities.
     pub(super) fn add_friction_derivatives(
         &self,
-        at: &[PulseContact],
+        at: &[BodyState],
         derivatives: &BodyDerivatives,
         motion: &mut [(f64, f64)],
         (gains, inverse): (&[f64], &[f64]),
@@ -211,7 +215,7 @@ impl ContactOperators {
         };
         let responses: Vec<Vec<f64>> = (0..n).map(response).collect();
         let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);
-        for (a, &PulseContact { start_velocity: start, free_velocity: free, pulse, .. }) in at.iter().enumerate() {
+        for (a, &BodyState { start_velocity: start, free_velocity: free, pulse, .. }) in at.iter().enumerate() {
             let own = self.problem.own(a);
             let slope = self.problem.force_slope(a, start, free, &pulse);
             for b in 0..n {
@@ -240,7 +244,7 @@ impl ContactOperators {
     }
 
     /// Set the derivatives of the outputs of bodies at rest to those of the last pulse.
-    pub(super) fn fix_resting_outputs(&self, at: &[PulseContact], motion: &[(f64, f64)], free: &mut [f64]) {
+    pub(super) fn fix_resting_outputs(&self, at: &[BodyState], motion: &[(f64, f64)], free: &mut [f64]) {
         for (a, _) in at.iter().enumerate().filter(|(_, at)| at.is_resting) {
             free[self.outputs[a]] = motion[a].0;
         }
@@ -248,10 +252,10 @@ impl ContactOperators {
 }
 
 impl ContactSolver<'_> {
-    /// Solve a pulse for its state channels and frictions.
+    /// Solve a pulse for its state channels and friction forces.
     ///
-    /// A constant friction cannot balance a force that varies within the pulse, so the mean output of a resting body
-    /// would drift with the square of the step. The solver keeps it fixed from one pulse at rest to the next.
+    /// A constant friction cannot balance a force that varies within the pulse, so the mean output of a body at rest
+    /// would drift with the square of the step. The solver keeps it constant from one pulse at rest to the next.
     pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), PulseFailure> {
         for (rests, (before, now)) in self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities)) {
             *rests = before.1 && *now == 0.0;
@@ -316,12 +320,12 @@ impl ContactSolver<'_> {
         Ok(())
     }
 
-    /// Go on to the next pulse; return the contacts of the solved one, with these state channels.
-    pub(super) fn advance(&mut self, z: &[f64]) -> &[PulseContact] {
+    /// Advance to the next pulse. Return the contact states of the solved pulse, whose state channels are `z`.
+    pub(super) fn advance(&mut self, z: &[f64]) -> &[BodyState] {
         self.contacts.clear();
         for (a, &(free_velocity, pulse)) in self.at.iter().enumerate() {
             let start_velocity = self.velocities[a];
-            self.contacts.push(PulseContact { start_velocity, free_velocity, is_resting: self.is_resting[a], pulse });
+            self.contacts.push(BodyState { start_velocity, free_velocity, is_resting: self.is_resting[a], pulse });
             self.last_outputs[a] = (z[self.contact.outputs[a]], start_velocity == 0.0 && pulse.end == 0.0);
             self.velocities[a] = pulse.end;
         }

@@ -1,13 +1,13 @@
 //! Online convolution, and kernels at the ends of pulses.
 //!
-//! A block of the past is multiplied with the equally long block that follows as soon as it is complete, by one
-//! transform (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6): O(N log² N). Within a short block terms are summed
+//! As soon as a block of the past is complete, one transform adds its contribution to the following block of equal
+//! length (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6). The cost is O(N log² N). Short blocks are summed
 //! directly. Kernels of integer orders are polynomials in the lag, for which running sums of the signal suffice: O(N).
 
 use crate::fractional::kernels::digamma;
 use crate::series::{Buffers, Kernel};
 
-/// Length of a block that is summed directly. Transforms of shorter blocks cost more.
+/// Length of a block that is summed directly. Transforms of shorter blocks are slower.
 const DIRECT_SUM_LENGTH: usize = 64;
 /// Largest integer order whose kernel is summed as a polynomial. Sums of higher ones lose digits on long runs.
 const MAX_POLYNOMIAL_ORDER: usize = 3;
@@ -18,16 +18,16 @@ pub struct ConvolutionKernel {
     memory: Memory,
 }
 
-/// How a kernel sums the past.
+/// Representation of a kernel for the sum over the past.
 enum Memory {
     /// Spectra of the first values of the kernel, each twice as long as the previous one.
     Blocks(Vec<Kernel>),
-    /// Coefficients of the values from lag 1 on in the polynomials 1, n, n(n + 1)/2, … of the lag n.
+    /// Coefficients of the polynomials 1, n, n(n + 1)/2, … of the lag n whose sum is the kernel from lag 1 on.
     Polynomial(Vec<f64>),
 }
 
 impl ConvolutionKernel {
-    /// Kernel with these values from lag 0 on. A signal must not be longer.
+    /// Kernel with these values from lag 0 on. A signal must not be longer than the kernel.
     #[must_use]
     pub fn new(values: Vec<f64>) -> Self {
         let mut spectra = Vec::new();
@@ -40,8 +40,8 @@ impl ConvolutionKernel {
         Self { values, memory: Memory::Blocks(spectra) }
     }
 
-    /// Kernel of an integral of this order, given its values. From lag 1 on it is a polynomial of the lag if the order
-    /// is whole; up to order 3 running sums are used then.
+    /// Kernel of an integral of this order, given its values. For integer orders it is a polynomial in the lag from lag
+    /// 1 on. Up to order 3, running sums then replace the transforms.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn of_integral(order: f64, values: Vec<f64>) -> Self {
@@ -82,7 +82,8 @@ impl ConvolutionKernel {
 /// Online convolution of one signal with a kernel.
 pub struct OnlineConvolution<'a> {
     kernel: &'a ConvolutionKernel,
-    /// Sums over the past of each coming value, or the sums Σ_j C(k − j + i − 1, i) x_j of a polynomial kernel.
+    /// Part of each future value of the convolution that the past determines. For a polynomial kernel, the sums Σ_j C(k
+    /// − j + i − 1, i) x_j.
     sums: Vec<f64>,
     signal: Vec<f64>,
     buffers: Buffers,
@@ -90,7 +91,7 @@ pub struct OnlineConvolution<'a> {
 }
 
 impl<'a> OnlineConvolution<'a> {
-    /// Convolution of a signal without values yet; [`OnlineConvolution::push`] appends them.
+    /// Convolution of an empty signal, to which [`OnlineConvolution::push`] appends values.
     #[must_use]
     pub fn new(kernel: &'a ConvolutionKernel) -> Self {
         let (sums, signal) = match &kernel.memory {
@@ -100,9 +101,9 @@ impl<'a> OnlineConvolution<'a> {
         Self { kernel, sums, signal, buffers: Buffers::default(), block: Vec::new() }
     }
 
-    /// Sum Σ_{j<k} κ_{k−j} x_j over the k values so far.
+    /// Contribution Σ_{j<k} κ_{k−j} x_j of the k past values to the next value of the convolution.
     #[must_use]
-    pub fn history_sum(&self) -> f64 {
+    pub fn past_contribution(&self) -> f64 {
         if let Memory::Polynomial(coefficients) = &self.kernel.memory {
             return coefficients.iter().zip(&self.sums).map(|(c, sum)| c * sum).sum();
         }
@@ -141,7 +142,7 @@ impl<'a> OnlineConvolution<'a> {
     }
 }
 
-/// Response at the ends of pulses to the pulses of a signal integrated by η > 0, and its derivative in η.
+/// Kernel of I^η, η > 0, from pulse means to values at the ends of pulses, and its derivative with respect to η.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
@@ -165,7 +166,7 @@ pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
 /// neighboring pulses.
 pub(crate) const MAX_FEEDTHROUGH_ORDER: f64 = 1e-6;
 
-/// Product with a cached series.
+/// Product of a series with a cached spectrum.
 pub(crate) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; series.len()];
     cached.apply(series, &mut out, &mut Buffers::default());

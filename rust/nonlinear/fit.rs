@@ -1,4 +1,4 @@
-//! Output-error fit of systems with nonlinear terms or friction, by Levenberg–Marquardt.
+//! Output-error fit of systems with non-linear terms or friction, by Levenberg–Marquardt.
 //!
 //! Orders, coefficients, free parameters of inputs, and the initial states of each run are optimized together.
 
@@ -141,7 +141,7 @@ impl LeastSquaresProblem for OutputError<'_> {
     }
 }
 
-/// Estimation of the initial state of one run with all other parameters fixed.
+/// Least-squares problem of the initial state of one run with all other parameters fixed.
 struct InitialStateProblem<'a> {
     model: &'a NonlinearModel,
     experiment: &'a Experiment,
@@ -193,17 +193,17 @@ impl LeastSquaresProblem for InitialStateProblem<'_> {
     }
 }
 
-/// Evaluations and tolerance of the estimate of an initial state.
+/// Termination criteria of the estimation of an initial state.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 30, tolerance: 1e-6 };
 
-/// Shares of a run that are fitted in turn, from its first sample on, before the whole run.
+/// Fractions of a run, from its first sample on, that are fitted one after another before the whole run.
 ///
-/// Over a long run the cost has local minima in the initial state: errors of phase, and other numbers of oscillations
-/// before a body sticks. Over the beginning it has one minimum.
+/// Over a long run the cost has local minima in the initial state, with a wrong phase or a wrong number of oscillations
+/// before a body sticks. Over the first part it has one minimum.
 const BEGINNING_SHARES: [f64; 3] = [0.125, 0.25, 0.5];
 
-/// Initial state of a run at fixed parameters: best result of local optimizations from its first samples, and from
-/// fits of ever longer beginnings of the run.
+/// Initial state of a run at fixed parameters. It is the best result of local optimizations that start from the first
+/// samples, or from fits of first parts of the run of increasing length.
 fn estimate_initial_state(
     model: &NonlinearModel,
     (orders, coefficients, inputs): (&[f64], &[f64], &[f64]),
@@ -245,11 +245,11 @@ fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
     vec![(0..count).map(weight).collect(); experiment.samples.len()]
 }
 
-/// Least-squares fit with weights of the output error from an initial guess.
+/// Weighted least-squares fit of the output error from an initial guess.
 ///
 /// # Errors
-/// An initial guess whose simulation ends ([`Error::Diverged`], [`Error::NoSolution`]), an inconsistent model or
-/// experiments that do not fit it ([`NonlinearModel::check`]); [`Error::Interrupted`].
+/// An initial guess whose simulation fails ([`Error::Diverged`], [`Error::NoSolution`]); an inconsistent model, or
+/// experiments that do not match it ([`NonlinearModel::check`]); [`Error::Interrupted`].
 pub fn fit(
     model: &NonlinearModel,
     experiments: &[Experiment],
@@ -314,5 +314,6 @@ pub fn fit(
     })
 }
 
-/// Relative distance from the span of other responses below which a state is linearly dependent.
+/// Relative distance of the response to an initial state from the span of other responses, below which it is linearly
+/// dependent.
 const DEPENDENCE_TOLERANCE: f64 = 1e-12;

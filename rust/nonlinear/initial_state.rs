@@ -6,7 +6,7 @@ use crate::fractional::kernels::{kernel, power_means};
 use crate::linalg::small;
 use crate::regressors::is_impulse;
 
-/// Term of an equation with a simulated output as signal.
+/// Coupling term: a term of an equation whose signal is a simulated output.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Link {
     /// Equation of the output.
@@ -17,7 +17,8 @@ pub(super) struct Link {
     pub(super) coefficient: f64,
 }
 
-/// Motion of each output at the ends of pulses by initial terms: its start, and the forcing of its velocity.
+/// Effect of initial terms on each output at the ends of pulses: initial output and velocity, and forcing of the
+/// velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct EndVelocityForcing {
     /// Contribution to the velocity at pulse ends, relative to the initial velocity.
@@ -29,10 +30,10 @@ pub(super) struct EndVelocityForcing {
 }
 
 impl EndVelocityForcing {
-    /// Forcing by powers of t at the level of the outputs, (exponent, coefficient) by equation, with coupling terms.
+    /// Forcing by powers of t in the outputs, given as (exponent, coefficient) by equation, with coupling terms.
     ///
-    /// Coupling terms integrate an initial level x₀, and also the jump to it: in the velocity it is c x₀ t^{η−1}/Γ(η).
-    /// An initial velocity v₀ is c v₀ t^η/Γ(η + 1) in the velocities coupled to it.
+    /// A coupling term integrates an initial level x₀ of its signal, including the jump to that level: it adds c x₀
+    /// t^{η−1}/Γ(η) to the velocity. An initial velocity v₀ of the signal adds c v₀ t^η/Γ(η + 1).
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] if the
@@ -99,9 +100,9 @@ impl PowerSum {
     }
 }
 
-/// Powers of t, (exponent, coefficient), of the derivative of an output of this order, from those of all equations.
+/// Powers of t in the derivative D^ρ of an output as (exponent, coefficient), from those in all outputs.
 ///
-/// D^ρ I^η y is I^η D^ρ y, and the powers of t that y(0), y′(0), … add. They cancel those of Caputo's initial terms.
+/// D^ρ I^η y equals I^η D^ρ y plus powers of t from y(0), y′(0), …. These cancel the powers of Caputo's initial terms.
 pub(super) fn derivative_powers(
     equation: usize,
     order: f64,
@@ -148,7 +149,7 @@ pub(super) fn derivative_powers(
     Ok(out)
 }
 
-/// Pulse means of t^e. Negative powers are those of the derivative kernels applied to a step.
+/// Pulse means of t^e. For negative exponents they are derivative kernels applied to a step.
 pub(super) fn power_term_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent >= 0.0 {
         return power_means(exponent, m, step);
@@ -178,7 +179,7 @@ pub(super) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Ve
     Ok((0..n).map(|i| (0..n).map(|j| inverse[i * n + j] * given[j]).sum()).collect())
 }
 
-/// Free initial state of a run: a combination of powers of t in the named equation.
+/// Free initial state of a run: a combination of powers of t in one equation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum InitialTerm {
     /// Initial level of the output.
@@ -199,10 +200,10 @@ pub(super) enum InitialTerm {
 }
 
 impl InitialTerm {
-    /// States of a run.
+    /// Initial states of a run.
     ///
-    /// `free` says whether the integration order of an equation's term depends on a free order. Each filtered output
-    /// (`filtered`, empty if none) also has the transients of the filter.
+    /// `free(i, k)` is true if the integration order of term k of equation i depends on a free order. Each output with
+    /// a filter (`filtered`, empty if none) also has the transients of the filter.
     pub(super) fn all(
         equations: &[Equation],
         initial: &Initial,
@@ -242,12 +243,12 @@ impl InitialTerm {
         all
     }
 
-    /// Whether the state acts on the filter of an output only and not on a body.
+    /// True if the state affects only the filter of an output.
     pub(super) fn is_impulse(&self) -> bool {
         matches!(self, Self::Power(_, e) if is_impulse(*e))
     }
 
-    /// Powers of t of a unit of this state at the level of the outputs: equation, exponent, coefficient.
+    /// Powers of t in the outputs per unit of this state, as (equation, exponent, coefficient).
     pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
         // Caputo derivatives of a constant are 0, so only terms of order 0 respond to a level.
         let unseen = |output: usize, whole: f64| {

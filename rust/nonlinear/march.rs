@@ -1,13 +1,13 @@
-//! Simulation of equations with nonlinear terms, pulse by pulse, and its sensitivities.
+//! Simulation of equations with non-linear terms, pulse by pulse, and its sensitivities.
 //!
-//! A state channel is D^ρ of an output that enters an expression; the outputs themselves are the first. Its pulse means
-//! are z = L + Σ κ_η ∗ (w x): L from inputs and initial terms, κ_η the kernels of I^η, x the channels in linear terms
-//! and the values of the expressions. The terms of the outputs are not inverted, so that no kernel grows exponentially
-//! and an unstable linear part loses no digits. The mean of a pulse enters its own equation; Newton iterations that
-//! start at the last pulse solve it. Sensitivities obey the same sums, linearized at the run, and need no iteration.
+//! A state channel is an output, or a derivative D^ρ of an output that enters an expression. Its pulse means are z = L
+//! + Σ κ_η ∗ (w x). L is the part due to inputs and initial terms, κ_η the kernel of I^η, and x a channel of a linear
+//! term or the value of an expression, with weight w. The autoregressive terms are not inverted, so no kernel grows
+//! exponentially, and an unstable linear part loses no digits. The scheme is implicit; Newton iterations that start at
+//! the last pulse solve it. Sensitivities obey the same sums, linearized at the simulation, and need no iteration.
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
-use super::contact::{BodyDerivatives, BodyMotion, ContactOperators, PulseContact, PulseEquations};
+use super::contact::{BodyDerivatives, BodyMotion, ContactOperators, BodyState, PulseEquations};
 use super::convolution::{average_neighbors, product, ConvolutionKernel, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
 use super::initial_state::{derivative_powers, power_term_means, EndVelocityForcing, Link};
 use super::system::{NonlinearSystem, MIN_INTEGRATION_ORDER};
@@ -20,14 +20,14 @@ use crate::linalg::small;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 
-/// Newton iterations of a pulse. Three are usual.
+/// Maximum number of Newton iterations of a pulse. Three are usual.
 const MAX_NEWTON_ITERATIONS: usize = 50;
-/// Halvings of a Newton step that does not reduce the residual.
+/// Maximum number of halvings of a Newton step that does not reduce the residual.
 const MAX_STEP_HALVINGS: usize = 12;
-/// Newton step, relative to the terms of the channel, that ends the iteration. Convergence is quadratic, so the next
-/// one is below rounding, and the linearization before it is that of the solution to this relative error.
+/// Newton step at which the iteration has converged, relative to the terms of the channel. Convergence is quadratic, so
+/// the next step would be below rounding error. The linearization before this step has this relative error.
 const NEWTON_TOLERANCE: f64 = 1e-8;
-/// Residual of a channel, relative to its terms, that is rounding.
+/// Residual of a channel that is rounding error, relative to its terms.
 const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
 
 /// Channel of an expression: a state channel, or a known signal or derivative.
@@ -37,7 +37,7 @@ enum Place {
     Known(usize),
 }
 
-/// Nonlinear term of an equation.
+/// Non-linear term of an equation.
 struct NonlinearTerm {
     equation: usize,
     term: usize,
@@ -53,7 +53,7 @@ struct Contribution {
     weight: f64,
 }
 
-/// Contributions to one state channel through one kernel: one online convolution.
+/// Contributions to one state channel through one kernel, summed by one online convolution.
 struct Lane {
     state: usize,
     kernel: usize,
@@ -82,24 +82,24 @@ pub(super) struct Operators {
     kernels: Vec<ConvolutionKernel>,
     lanes: Vec<Lane>,
     inputs: Vec<InputLane>,
-    /// Weight of each source in each state channel within a pulse, row by row.
+    /// Weight of each source in each state channel within a pulse, row-major.
     gains: Vec<f64>,
-    /// Whether an expression acts on its own channel without integration.
+    /// True if an expression enters its own channel without integration.
     algebraic: bool,
-    /// Dry friction; None without.
+    /// Dry friction; None without friction.
     contact: Option<ContactOperators>,
 }
 
 /// Simulation with its linearization at every pulse.
 pub(super) struct LinearizedRun {
-    /// State channels, then means of the nonlinear terms, then of the frictions.
+    /// State channels, then means of the non-linear terms, then means of the friction forces.
     pub(super) sources: Vec<Vec<f64>>,
-    /// Derivatives of the nonlinear terms with respect to state channels, then to known channels, pulse after pulse.
+    /// Derivatives of the non-linear terms with respect to state channels, then to known channels, pulse by pulse.
     slopes: Vec<f64>,
     /// Inverse of the linearized equations of each pulse.
     inverses: Vec<f64>,
-    /// Motion and friction of each body, pulse after pulse.
-    contacts: Vec<PulseContact>,
+    /// Motion and friction of each body, pulse by pulse.
+    contacts: Vec<BodyState>,
 }
 
 /// Pulse at which a simulation ends early, and the reason.
@@ -121,7 +121,7 @@ impl End {
     }
 }
 
-/// Index of a kernel in a list, which it joins if it is new.
+/// Index of a kernel in a list; a new kernel is appended.
 fn kernel_index(kernels: &mut Vec<IntegralKernel>, order: f64, at_ends: bool) -> usize {
     let is_same = |known: &IntegralKernel| known.at_ends == at_ends && (known.order - order).abs() < ORDER_GRAIN;
     kernels.iter().position(is_same).unwrap_or_else(|| {
@@ -247,7 +247,7 @@ impl Operators {
         self.states.len() + self.values()
     }
 
-    /// Number of nonlinear terms and frictions.
+    /// Number of non-linear terms and friction forces.
     fn values(&self) -> usize {
         self.terms.len() + self.contact.as_ref().map_or(0, ContactOperators::count)
     }
@@ -299,7 +299,7 @@ impl Operators {
         }
     }
 
-    /// Signal through an integral kernel or its derivative.
+    /// Fractional integral of a signal by a kernel of the list, or its derivative with respect to the order.
     fn integrate(&self, signal: &Kernel, kernel: usize, series: &[f64]) -> Vec<f64> {
         let out = product(signal, series);
         if self.integrals[kernel].is_averaged() {
@@ -325,9 +325,9 @@ impl Operators {
         self.contact.as_ref().map_or_else(Vec::new, |contact| contact.motions(forcing, &run.contacts))
     }
 
-    /// Simulation under a forcing of the state channels, or the pulse and reason of its early end.
+    /// Simulation with a forcing of the state channels.
     ///
-    /// Of a run that ends, the outputs so far are returned, too.
+    /// Second result: pulse and reason if the simulation ends early, with the outputs up to that pulse.
     pub(super) fn run(&self, system: &NonlinearSystem, forcing: &ForcingTerms) -> (LinearizedRun, Option<End>) {
         let (states, count) = (self.states.len(), self.sources());
         let width = states + self.known.len();
@@ -345,7 +345,7 @@ impl Operators {
         for k in 0..self.m {
             pulse.free.iter_mut().zip(&forcing.channels).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
-                pulse.free[lane.state] += convolution.history_sum();
+                pulse.free[lane.state] += convolution.past_contribution();
             }
             pulse.predict(&run.sources);
             pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
@@ -409,25 +409,24 @@ fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
     Ok(product(&Kernel::new(means), &kernel(-order, means.len(), step)))
 }
 
-/// Newton iterations of one pulse.
+/// Workspace of the Newton iterations of one pulse.
 struct Pulse<'a> {
     operators: &'a Operators,
     system: &'a NonlinearSystem,
     free: Vec<f64>,
-    /// Values of state channels that are given.
+    /// Values at which state channels are fixed; None if free.
     fixed: Vec<Option<f64>>,
-    /// Which state channels were given when the inverse was computed; without nonlinear terms it depends on these
-    /// alone.
+    /// State channels that were fixed when the inverse was computed. Without non-linear terms it depends only on these.
     inverted_for: Vec<bool>,
     known: Vec<f64>,
     z: Vec<f64>,
-    /// Nonlinear terms at z, then frictions; derivatives with respect to state channels, then to known channels.
+    /// Values of the non-linear terms at z, then friction forces.
     values: Vec<f64>,
     slopes: Vec<f64>,
     inverse: Vec<f64>,
     determinant: f64,
     residual: Vec<f64>,
-    /// Sums of the sizes of the terms of each state channel.
+    /// Sum of the magnitudes of the terms of each state channel.
     sizes: Vec<f64>,
     matrix: Vec<f64>,
     step: Vec<f64>,
@@ -505,7 +504,7 @@ impl<'a> Pulse<'a> {
         norm
     }
 
-    /// Set z to where the last two pulses lead.
+    /// Set z to the linear extrapolation of the last two pulses.
     fn predict(&mut self, sources: &[Vec<f64>]) {
         for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
             *z = match row.as_slice() {
@@ -545,7 +544,7 @@ impl<'a> Pulse<'a> {
         true
     }
 
-    /// Solve a pulse without nonlinear terms for its state channels, at the present friction forces.
+    /// Solve a pulse without non-linear terms for its state channels, with the current friction forces.
     fn solve_linear(&mut self) -> std::result::Result<(), PulseFailure> {
         if !self.linearize() {
             return Err(PulseFailure::Newton("its linearization is singular"));
@@ -566,7 +565,7 @@ impl<'a> Pulse<'a> {
         }
     }
 
-    /// Solve the pulse from the current z, with the present frictions.
+    /// Solve the pulse by Newton iterations from the current z, with the current friction forces.
     fn solve(&mut self) -> std::result::Result<(), PulseFailure> {
         if self.is_linear() {
             return self.solve_linear();
@@ -644,8 +643,9 @@ impl PulseEquations for Pulse<'_> {
     }
 }
 
-/// Size beyond which a value without a result is an overflow, not outside of a function's domain.
+/// Magnitude of an argument above which a function without a value counts as overflow, not as outside of its domain.
 const OVERFLOW_SIZE: f64 = 1e60;
+/// Reason of failure if no Newton step reduces the residual.
 const NO_DESCENT: PulseFailure = PulseFailure::Newton("no Newton step reduces its residual");
 
 /// Products of sources with kernels and with their derivatives, computed when first needed.
@@ -694,7 +694,7 @@ impl<'a> FrozenProducts<'a> {
 }
 
 impl Operators {
-    /// Derivatives of the outputs' means with respect to one parameter.
+    /// Derivatives of the pulse means of the outputs with respect to one parameter.
     pub(super) fn sensitivity(
         &self,
         system: &NonlinearSystem,
@@ -759,7 +759,7 @@ impl Operators {
         self.linear_run(run, &forcing, &known, bodies)
     }
 
-    /// Derivatives of the weights of sources within a pulse, row by row.
+    /// Derivatives of the weights of the sources within a pulse, row-major.
     fn gain_derivatives(&self, derivatives: &SystemDerivatives, frozen: &mut FrozenProducts<'_>) -> Vec<f64> {
         let count = self.sources();
         let mut out = vec![0.0; self.gains.len()];
@@ -774,7 +774,7 @@ impl Operators {
         out
     }
 
-    /// Run of the linearized equations under a forcing, with these changes of known channels and of the bodies.
+    /// Simulation of the linearized equations with a forcing, and with changes of the known channels and of the bodies.
     fn linear_run(
         &self,
         run: &LinearizedRun,
@@ -792,7 +792,7 @@ impl Operators {
         for k in 0..self.m {
             free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
-                free[lane.state] += convolution.history_sum();
+                free[lane.state] += convolution.past_contribution();
             }
             let slopes = &run.slopes[k * values * width..(k + 1) * values * width];
             let inverse = &run.inverses[k * states * states..(k + 1) * states * states];

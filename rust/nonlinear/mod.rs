@@ -1,10 +1,10 @@
-//! Equations with nonlinear terms and dry friction: simulation pulse by pulse, sensitivities, output error.
+//! Equations with non-linear terms and dry friction: simulation pulse by pulse, sensitivities, output error.
 //!
 //! D^α y = Σ c D^ν s + Σ k D^μ n − F(Dy) sgn(Dy), where n is an expression over signals and derivatives of them
 //! ([`DerivedSignal`](crate::expression::DerivedSignal)) and F a [`FrictionLaw`](crate::friction::FrictionLaw). Orders
 //! of the derivatives of outputs are at most α − μ. The scheme is of second order in the step, and implicit: Newton
-//! iterations solve the nonlinear terms of a pulse, the contact law its friction. The past enters by online
-//! convolutions with the kernels of fractional integrals alone.
+//! iterations solve for the non-linear terms of a pulse, the contact law for its friction. The past enters only through
+//! online convolutions with the kernels of fractional integrals.
 
 mod channels;
 mod contact;
@@ -34,16 +34,18 @@ pub struct FreeRun {
 }
 
 impl NonlinearSystem {
-    /// Simulation with initial terms: (exponent, coefficient) pairs of powers of t by equation. Outputs are NaN from
-    /// the first pulse that overflows. O(d m log² m) for d convolutions of m pulses; O(d m) for integer orders.
+    /// Simulate with initial terms, given as (exponent, coefficient) of powers of t by equation.
+    ///
+    /// Outputs are NaN from the first pulse that overflows. O(d m log² m) for d convolutions of m pulses; O(d m) for
+    /// integer orders.
     ///
     /// The exponents −1, −2, … add an impulse and its derivatives to the output alone; the equations do not contain
     /// them. After the filter of an output they become its initial transient.
     ///
     /// # Errors
-    /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution, although
-    /// the run is finite; [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction
-    /// on this grid; as [`NonlinearSystem::check`].
+    /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution although no
+    /// value overflows; [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction on
+    /// this grid; as [`NonlinearSystem::check`].
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;

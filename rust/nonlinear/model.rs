@@ -1,4 +1,4 @@
-//! Parameters of equations with nonlinear terms: residuals of all experiments and their derivatives.
+//! Output-error problem of equations with non-linear terms: residuals of all experiments and their derivatives.
 
 use super::channels::{ForcingTerms, SystemDerivatives};
 use super::initial_state::{merge_powers, InitialTerm};
@@ -15,11 +15,11 @@ use crate::regressors::{add_impulses, split_impulses, Record};
 /// Friction law with free parameters, each a multiple of one coefficient.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeFrictionLaw {
-    /// fc.
+    /// Coulomb friction fc.
     pub coulomb: Monomial,
-    /// fs.
+    /// Stribeck friction fs.
     pub stribeck: Monomial,
-    /// vs.
+    /// Stribeck velocity vs.
     pub speed: Monomial,
 }
 
@@ -35,7 +35,7 @@ impl FreeFrictionLaw {
         [&self.coulomb, &self.stribeck, &self.speed]
     }
 
-    /// Law at these coefficients.
+    /// Friction law with these values of the coefficients.
     pub(super) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
         let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
         FrictionLaw { coulomb, stribeck, speed }
@@ -52,29 +52,30 @@ impl FreeFrictionLaw {
     }
 }
 
-/// Outputs that pass a filter before the comparison.
+/// Flag of each output: true if it passes a filter before the comparison.
 #[must_use]
 pub fn filtered_outputs(experiments: &[Experiment]) -> Vec<bool> {
     experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
 }
 
-/// Model with free parameters: equations with nonlinear terms, some with friction of their own output's velocity.
+/// Model with free parameters: equations with non-linear terms and dry friction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonlinearModel {
     /// Equations over recorded signals and, after these, derived ones.
     pub model: FreeModel,
     /// Expressions of the derived signals, which follow the recorded ones.
     pub derived: Vec<DerivedSignal>,
-    /// Equations with dry friction, and F of − F(Dy) sgn(Dy).
+    /// Index of each equation with dry friction − F(Dy) sgn(Dy), and its law F.
     pub frictions: Vec<(usize, FreeFrictionLaw)>,
-    /// Outputs that pass the filter of every experiment before the comparison. Empty if none does.
+    /// Flag of each output: true if it passes the filter of every experiment before the comparison. Empty without
+    /// filters.
     pub filtered: Vec<bool>,
 }
 
 /// Step of central differences of initial terms, which are smooth in orders and at most quadratic in coefficients.
 const DIFFERENCE_STEP: f64 = 1e-5;
 
-/// Samples for the initial velocity of a run.
+/// Number of samples for the estimate of the initial velocity of a run.
 const FIRST_SAMPLES: usize = 8;
 
 /// Constant forces tried as initial guesses, relative to each friction. The rest position depends on the sign of the
@@ -106,11 +107,13 @@ impl Evaluation {
     }
 }
 
-/// Parameter of a derivative.
+/// Parameter with respect to which a derivative is taken.
 pub(super) enum Parameter {
-    /// Free order, free coefficient, or state of one run.
+    /// Free order by index.
     Order(usize),
+    /// Free coefficient by index.
     Coefficient(usize),
+    /// Initial state by run and index.
     InitialTerm(usize, usize),
     /// Free parameter of an input.
     Input(usize),
@@ -131,7 +134,7 @@ impl Parameter {
     }
 }
 
-/// Intermediate results of an experiment.
+/// Intermediate results of an experiment for its derivatives.
 pub(super) struct Part {
     system: NonlinearSystem,
     record: Option<Record>,
@@ -260,7 +263,7 @@ impl NonlinearModel {
 }
 
 impl NonlinearModel {
-    /// Return an error for an inconsistent model, or for experiments that do not fit it.
+    /// Return an error for an inconsistent model, or for experiments that do not match it.
     ///
     /// # Errors
     /// [`Error::Structure`], [`Error::Length`]; as [`FreeModel::check`].
@@ -300,8 +303,8 @@ impl NonlinearModel {
         self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
     }
 
-    /// Whether the cost has kinks, so that its gradient need not vanish at a minimum: times at which a body stops or
-    /// reverses move from pulse to pulse with any parameter.
+    /// True if the cost has kinks, so that its gradient need not vanish at a minimum. With friction, the times at which
+    /// a body stops or reverses move from pulse to pulse with any parameter.
     pub(super) fn has_kinks(&self) -> bool {
         !self.frictions.is_empty()
     }
@@ -312,7 +315,7 @@ impl NonlinearModel {
         system.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
     }
 
-    /// Initial guesses of the states of a run from its first samples; the first has the length of all.
+    /// Initial guesses of the states of a run from its first samples; all guesses have the same length.
     pub(super) fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
         let frictions = self.system(orders, coefficients, usize::MAX).frictions;
         state_guesses(&self.states(orders), &frictions, experiment)
@@ -420,8 +423,8 @@ impl NonlinearModel {
     }
 }
 
-/// Guesses of the initial states from the first samples of a run: positions and velocities of the outputs, with several
-/// constant forces within the frictions, all other states 0.
+/// Guesses of the initial states from the first samples of a run: positions and velocities of the outputs, and several
+/// constant forces up to the friction forces. All other states are 0.
 fn state_guesses(
     (states, equations): &(Vec<InitialTerm>, Vec<Equation>),
     frictions: &[(usize, FrictionLaw)],

@@ -1,4 +1,4 @@
-//! Systems of equations with nonlinear terms and dry friction at known orders and coefficients.
+//! Systems of equations with non-linear terms and dry friction at known orders and coefficients.
 
 use super::channels::StateChannel;
 use super::convolution::MAX_FEEDTHROUGH_ORDER;
@@ -10,10 +10,10 @@ use crate::friction::contact::is_p_matrix;
 use crate::friction::FrictionLaw;
 use crate::linalg::small;
 
-/// Smallest integration order of a linear term of the equation's own output, and of a term with an input.
+/// Smallest integration order of a linear term.
 pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
-/// Equations with nonlinear terms at known orders and coefficients.
+/// Equations with non-linear terms at known orders and coefficients.
 ///
 /// The signals from `recorded` on are derived signals.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,7 +26,7 @@ pub struct NonlinearSystem {
     pub recorded: usize,
     /// Whether outputs enter other equations as simulated, not as measured.
     pub coupled: bool,
-    /// Equations with dry friction, and F of − F(Dy) sgn(Dy).
+    /// Index of each equation with dry friction − F(Dy) sgn(Dy), and its law F.
     pub frictions: Vec<(usize, FrictionLaw)>,
 }
 
@@ -70,7 +70,7 @@ impl NonlinearSystem {
         }
     }
 
-    /// Return an error for frictions that no body has, and for orders that this law does not support.
+    /// Return an error for friction in an equation that is not a body, and for orders that friction does not support.
     fn check_frictions(&self) -> Result<()> {
         let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
@@ -131,10 +131,9 @@ impl NonlinearSystem {
         Ok(())
     }
 
-    /// Return an error if coupled accelerations move a body against a force on it, so that friction has no unique
-    /// solution.
+    /// Return an error if the coupling lets a force accelerate a body in the opposite direction.
     ///
-    /// Terms above a body's own order are checked on the grid instead.
+    /// Friction would then have no unique solution. Improper terms are checked on the grid instead.
     fn check_response_to_forces(&self) -> Result<()> {
         let (n, links) = (self.equations.len(), self.links());
         let bodies: Vec<usize> = self.frictions.iter().map(|friction| friction.0).collect();
@@ -177,8 +176,9 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(of).collect()
     }
 
-    /// Whether the end velocity of an equation is computed from the pulse means of another output, as from those of an
-    /// input. True for outputs of an order up to 1, such as those of actuators, which have no velocity at a pulse end.
+    /// True if the end velocity of an equation is computed from the pulse means of another output, as from those of an
+    /// input. This holds for outputs of an order up to 1, such as those of actuators, because they have no velocity at
+    /// a pulse end.
     pub(super) fn couples_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
         let order = self.equations[output].structure.order;
         output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER && integration > 1.0 + MAX_FEEDTHROUGH_ORDER
@@ -223,7 +223,7 @@ impl NonlinearSystem {
     }
 }
 
-/// Error for nonlinear terms in combination with an option that excludes them.
+/// Error for non-linear terms in combination with an option that does not support them.
 pub(crate) fn unsupported_with(what: &str, remedy: &str) -> Error {
     Error::Structure { what: format!("nonlinear terms in combination with {what}"), remedy: remedy.into() }
 }

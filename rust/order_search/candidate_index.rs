@@ -1,6 +1,4 @@
-//! Candidate index of an order grid: from the number of a candidate to its regressor columns.
-//!
-//! Tables replace a look-up per candidate.
+//! Index of the candidates of an order grid: the regressor columns of each candidate, from precomputed tables.
 
 use std::borrow::Cow;
 
@@ -20,7 +18,7 @@ pub(crate) struct CandidateIndex<'a> {
     pub(crate) problem: Problem,
     pub(crate) lattice: Cow<'a, OrderGrid>,
     pub(crate) options: Options,
-    /// Memory that remains of the limit \[bytes\].
+    /// Unused part of the memory limit \[bytes\].
     pub(crate) spare_bytes: u64,
     /// Column of each value of each term, per block of the order grid.
     tables: Vec<Vec<Vec<usize>>>,
@@ -94,7 +92,7 @@ impl<'a> CandidateIndex<'a> {
     }
 }
 
-/// Column of every value of every term, per block. The tables save a look-up per candidate.
+/// Column of every value of every term, per block. The tables replace a search per candidate.
 fn tables(lattice: &OrderGrid, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
     lattice
         .blocks()

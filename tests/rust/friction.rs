@@ -4,7 +4,7 @@ use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimation::output_error::FreeModel;
 use ftlm::estimation::output_error::{Coordinate, Experiment, FreeEquation, MinimizationSettings, Monomial};
-use ftlm::friction::contact::{is_p_matrix, ContactProblem};
+use ftlm::friction::contact::{is_p_matrix, FrictionProblem};
 use ftlm::friction::law::{Phase, PulseDerivatives};
 use ftlm::friction::FrictionLaw;
 use ftlm::nonlinear::convolution::{ConvolutionKernel, OnlineConvolution};
@@ -31,7 +31,7 @@ fn assert_plain_sums(kernel: &ConvolutionKernel, signal: &[f64], tolerance: f64)
     let mut online = OnlineConvolution::new(kernel);
     for (k, &x) in signal.iter().enumerate() {
         let plain: f64 = (0..k).map(|j| kernel.values()[k - j] * signal[j]).sum();
-        assert!((online.history_sum() - plain).abs() < tolerance, "{k}");
+        assert!((online.past_contribution() - plain).abs() < tolerance, "{k}");
         online.push(x);
     }
 }
@@ -314,7 +314,7 @@ fn of_all_combinations_of_bodies_at_rest_exactly_one_is_taken() {
         let all = consistent(&most, &p, &gains);
         assert_eq!(all.len(), 1, "{gains:?} {p:?}");
         let laws = most.iter().map(|f| FrictionLaw::coulomb(*f)).collect();
-        let problem = ContactProblem::new(laws, gains).expect("a P-matrix");
+        let problem = FrictionProblem::new(laws, gains).expect("a P-matrix");
         let mut at = Vec::new();
         problem.solve(&vec![0.0; n], &p, &vec![0.0; n], &vec![0.0; n], &mut at);
         for (body, force) in at.iter().zip(&all[0]) {
@@ -339,7 +339,7 @@ fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
             (0..2).map(|_| FrictionLaw { coulomb: random.uniform(0.1, 2.0), stribeck, speed: 0.5 }).collect();
         let (v, p): (Vec<f64>, Vec<f64>) =
             (0..2).map(|_| (random.uniform(-0.4, 0.4), random.uniform(-0.7, 0.7))).unzip();
-        let problem = ContactProblem::new(laws.clone(), gains.clone()).expect("a P-matrix");
+        let problem = FrictionProblem::new(laws.clone(), gains.clone()).expect("a P-matrix");
         let (mut at, mut other) = (Vec::new(), Vec::new());
         problem.solve(&v, &p, &[0.0; 2], &[0.0; 2], &mut at);
         for begun in [[2.0, 2.0], [-2.0, 2.0], [0.3, -1.0]] {
@@ -356,7 +356,7 @@ fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
     }
     assert_eq!(seen.len(), 9);
     assert!(matches!(
-        ContactProblem::new(vec![FrictionLaw::coulomb(1.0); 2], vec![0.1, 0.2, 0.2, 0.1]),
+        FrictionProblem::new(vec![FrictionLaw::coulomb(1.0); 2], vec![0.1, 0.2, 0.2, 0.1]),
         Err(Error::Diverged { .. })
     ));
 }

@@ -143,7 +143,7 @@ fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
 
 /// Candidate with all autoregressive coefficients negative, and the indices of the changed coefficients.
 ///
-/// It is stable up to order 2.
+/// Equations of an order up to 2 are then stable.
 ///
 /// The changed coefficients are first kept fixed while the others adapt, because the input coefficients still belong to
 /// the unstable optimum.

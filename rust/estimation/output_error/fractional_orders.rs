@@ -423,9 +423,10 @@ impl Run {
         self.columns(experiment, requests.len(), functions.iter().copied().zip(spectra))
     }
 
-    /// Return the compared samples of `count` columns, each the sum of the transforms of `functions` with its index.
+    /// Return the compared samples of `count` columns.
     ///
-    /// A transform with an input is multiplied by the jumps of that input. One without is the response to initial
+    /// Column i is the inverse transform of the sum of the `functions` with index i. A function with an input is
+    /// multiplied by the transform of the jumps of that input. A function without an input is the response to initial
     /// terms.
     fn columns(
         &self,

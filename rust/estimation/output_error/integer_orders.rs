@@ -77,30 +77,31 @@ struct Source<'a> {
 /// Companion form of A(s) in scaled time.
 pub(crate) struct Companion {
     pub(crate) order: usize,
-    /// Unit of frequency.
+    /// Unit of frequency \[rad/s\].
     scale: f64,
     /// Autoregressive coefficients in scaled time, a_i scale^(i − n).
     own: Vec<f64>,
-    /// Pulse width in scaled time, and in seconds.
+    /// Pulse width in scaled time.
     step: f64,
+    /// Pulse width in seconds.
     width: f64,
-    /// Discretizations so far, shared by all experiments of this pulse width.
+    /// Cached discretizations, shared by all experiments of this pulse width.
     known: RefCell<Vec<Rc<Discretization>>>,
 }
 
-/// Inter-sample behavior of the input, None without one; fraction of a pulse in its delay; output row and direct gain
-/// of the series connection.
+/// Key of a discretization: inter-sample behavior of the input (None without an input), fractional part of its delay in
+/// pulses, and output row and direct gain of a series connection.
 type DiscretizationKey = (Option<Intersample>, u64, Option<(Vec<f64>, f64)>);
 
-/// Exact advance of the states by one pulse.
+/// Exact discretization: transition of the states over one pulse.
 struct Discretization {
     key: DiscretizationKey,
-    /// e^M − I, column-major.
+    /// Transition matrix e^M minus I, column-major.
     growth: Vec<f64>,
     gains: Option<InputGains>,
 }
 
-/// Pulses per sample, number of compared samples.
+/// Number of pulses per sample, and number of compared samples.
 type Grid = (usize, usize);
 
 impl Companion {
@@ -115,7 +116,7 @@ impl Companion {
         Self { order, scale, own, step: step * scale, width: step, known: RefCell::default() }
     }
 
-    /// Companion form for this pulse width, from a list of those so far.
+    /// Companion form for this pulse width, from the cache or added to it.
     pub(crate) fn of_width(cache: &mut Vec<Rc<Self>>, own: &[f64], step: f64) -> Rc<Self> {
         if let Some(cached) = cache.iter().find(|c| c.width.to_bits() == step.to_bits()) {
             return cached.clone();
@@ -124,7 +125,7 @@ impl Companion {
         cache[cache.len() - 1].clone()
     }
 
-    /// scale^power.
+    /// Power of the unit of frequency, scale^power.
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     fn power(&self, power: isize) -> f64 {
         self.scale.powi(power as i32)
@@ -145,16 +146,17 @@ impl Companion {
         (row, direct)
     }
 
-    /// Samples of s^j/A of an input or impulse with this response, j up to the order.
+    /// Samples of s^j/A applied to an input or impulse, from the response of its states; j is at most the order.
     pub(crate) fn derivative(&self, (states, values): &(Vec<f64>, Vec<f64>), j: usize) -> Vec<f64> {
         let (read, direct) = self.output(std::iter::once((j, 1.0)));
         let of = |(row, u): (&[f64], &f64)| row.iter().zip(&read).map(|(x, c)| x * c).sum::<f64>() + direct * u;
         states.chunks_exact(self.order.max(1)).zip(values).map(of).collect()
     }
 
-    /// States of 1/A driven by an input or an impulse; with an output row, the output of that row drives a second 1/A.
+    /// States of 1/A with an input, or with an impulse if `input` is None.
     ///
-    /// The states come at the compared samples, with the input just after each. None on overflow.
+    /// If `behind` has an output row, that output is the input of a second 1/A in series. Return the states at the
+    /// compared samples, and the input just after each; None on overflow.
     pub(crate) fn respond(
         &self,
         input: Option<&SourceInput<'_>>,
@@ -172,7 +174,7 @@ impl Companion {
         discretization.advance(start, input, grid)
     }
 
-    /// Discretization of 1/A, or of 1/A behind an output row of it.
+    /// Discretization of 1/A, or of two 1/A in series if `behind` has an output row of the first.
     fn discretization(
         &self,
         between: Option<Intersample>,
@@ -268,11 +270,11 @@ pub(crate) struct ExactSimulation<'a> {
     equations: Vec<EquationSimulation<'a>>,
     /// Orthonormal basis of the weighted responses to the initial terms.
     basis: Vec<Vec<f64>>,
-    /// Effect on the weighted samples per unit of each linear coefficient.
+    /// Change of the weighted samples per unit of each linear coefficient.
     effects: Vec<Vec<f64>>,
 }
 
-/// Integer from an order or exponent, if it is one from 0.
+/// Convert an order or exponent to an integer; None if it is not a nonnegative integer.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn integer(order: f64) -> Option<usize> {
     let nearest = order.round();
@@ -514,8 +516,8 @@ impl IntegerOrders {
     }
 }
 
-/// Signal after its delay, saturation or dead zone, as it drives a companion form: means per pulse if held, values per
-/// edge if linear.
+/// Signal after its delay, saturation or dead zone, as the input of a companion form. It has one mean per pulse if
+/// held, and one value per pulse edge if linear.
 pub(crate) fn source_input<'a>(
     model: &FreeModel,
     experiment: &'a Experiment,
@@ -547,7 +549,7 @@ pub(crate) fn source_input<'a>(
 }
 
 impl Source<'_> {
-    /// Add the output of a row over the states, and of a direct gain, to samples.
+    /// Add the output of a row `read` of the states and of a direct gain to samples.
     fn add_output(&self, read: &[f64], direct: f64, samples: &mut [f64]) {
         let rows = self.states.chunks_exact(read.len().max(1));
         for ((y, row), u) in samples.iter_mut().zip(rows).zip(&self.values) {
@@ -583,7 +585,7 @@ impl ExactSimulation<'_> {
         &self.basis
     }
 
-    /// Output row and direct gain of one input, with the given coefficient per term.
+    /// Output row and direct gain of input q of equation i, with the given coefficient per term.
     fn input_output(
         &self,
         orders: &IntegerOrders,
@@ -595,7 +597,7 @@ impl ExactSimulation<'_> {
         self.equations[i].companion.output(terms.map(|&(k, nu)| (nu + shift, coefficient(k))))
     }
 
-    /// Samples of an equation from rest, without weights.
+    /// Samples of the output of equation i with zero initial conditions, without weights.
     fn response(&self, orders: &IntegerOrders, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
         let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
         let mut samples = vec![0.0; self.equations[i].sources.first().map_or(0, |s| s.values.len())];
@@ -608,7 +610,7 @@ impl ExactSimulation<'_> {
         samples
     }
 
-    /// Effect on the weighted samples per unit of a coefficient, through the input terms.
+    /// Change of the weighted samples per unit of a coefficient of input terms.
     fn input_effect(
         &self,
         orders: &IntegerOrders,
@@ -668,7 +670,7 @@ impl ExactSimulation<'_> {
         Some(total)
     }
 
-    /// Add the effect of a coefficient through the autoregressive terms to weighted samples.
+    /// Add the derivative with respect to a coefficient of autoregressive terms to weighted samples.
     #[allow(clippy::cast_possible_wrap)]
     fn add_autoregressive_effect(
         &self,
@@ -694,7 +696,7 @@ impl ExactSimulation<'_> {
         }
     }
 
-    /// Effect on the weighted samples per unit of the free parameter of an input.
+    /// Derivative of the weighted samples with respect to the free parameter of an input.
     fn law_effect(
         &self,
         orders: &IntegerOrders,

@@ -1,4 +1,5 @@
-//! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse FFT per parameter and output.
+//! Derivatives of the residuals of A y = b with respect to parameters. Each derivative A⁻¹(∂b − ∂A y) is a product of
+//! three spectra, with one inverse FFT per parameter and output.
 
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -120,8 +121,8 @@ impl FreeModel {
 
     /// Weight of term k of equation i in the derivative of the right-hand side with respect to a parameter.
     ///
-    /// It multiplies the operator for a coefficient, its derivative for an order, and the derivative of the input for
-    /// an input parameter.
+    /// The weight multiplies the operator for a coefficient, the derivative of the operator for an order, and the
+    /// derivative of the input for an input parameter.
     fn right_hand_side_weight(&self, (i, k): (usize, usize), point: &ParameterPoint, parameter: usize) -> f64 {
         let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
         let (signal, order, monomial) = &equation.terms[k];
@@ -141,7 +142,7 @@ impl FreeModel {
 
 /// Derivatives of the initial exponents of equation i with respect to a free order.
 ///
-/// None if they do not depend on the order, or if the set of `count` exponents changes here.
+/// None if they do not depend on the order, or if the number `count` of exponents changes at this order.
 pub(crate) fn initial_exponent_slopes(
     model: &FreeModel,
     (i, parameter): (usize, usize),

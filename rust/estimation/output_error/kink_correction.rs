@@ -1,8 +1,8 @@
 //! Kink correction: slope discontinuities of the output near input jumps, at nonuniform sample times.
 //!
 //! Block-pulse means smooth out the kinks after jumps of zero-order-hold inputs. The leading kinks of an output come
-//! from the input terms of its equation, Σ c I^{α−ν} s, and from these passed once through the autoregressive terms.
-//! Higher repetitions are smoother, and their error decreases with the step.
+//! from the input terms of its equation, Σ c I^{α−ν} s, and from these terms passed once through the autoregressive
+//! terms. Terms passed through several times are smoother, and their error decreases with the step.
 
 use super::experiment::{Experiment, NonuniformSamples};
 use super::feedthrough::{Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
@@ -15,8 +15,8 @@ const ORDER_DIFFERENCE_STEP: f64 = 1e-5;
 /// Integration order above which block pulses represent a kink accurately.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
 
-/// Kink of one input term, alone or passed through an autoregressive term: correction of the samples for coefficients
-/// of 1, and its derivative with respect to the integration order.
+/// Kink of one input term, alone or passed through an autoregressive term. It holds the correction of the samples for
+/// coefficients of 1, and the derivative of this correction with respect to the integration order.
 struct Kink {
     equation: usize,
     terms: Vec<usize>,

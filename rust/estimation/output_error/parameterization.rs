@@ -2,9 +2,9 @@
 //! time scaling.
 //!
 //! A coefficient of D^ν y in an equation for D^α y has the unit time^−(α − ν), which changes with free orders. Without
-//! scaling, an optimization along a flat valley would end elsewhere in seconds than in minutes. The optimization
-//! therefore uses a unit between the sampling interval and the duration. In this unit the resonances of a record are
-//! near 1, and orders and coefficients are least correlated.
+//! scaling, the result of an optimization along a flat valley would depend on the unit of time. The optimization
+//! therefore uses a unit between the sampling interval and the duration. In this unit the resonance frequencies of a
+//! record are near 1, and orders and coefficients are least correlated.
 
 use super::experiment::Experiment;
 use super::stability::is_unstable;
@@ -14,14 +14,14 @@ use crate::regressors::Record;
 use crate::signal::block_pulse::delay_samples;
 use crate::simulate::nyquist_margin;
 
-/// Coordinate in which a coefficient is stepped; its scaling affects convergence.
+/// Coordinate of a coefficient in an optimization. It affects the convergence, not the optimum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Coordinate {
     /// The coefficient itself.
     Plain,
-    /// ln|c|, with the sign of the initial guess.
+    /// Logarithm ln|c|, with the sign of the initial guess.
     Logarithm,
-    /// ln(c − 1), for a ratio that exceeds 1.
+    /// Logarithm ln(c − 1), for a ratio above 1.
     ExcessLogarithm,
     /// No coordinate: fixed at the initial value, like an order between equal bounds.
     Fixed,
@@ -54,7 +54,7 @@ impl Coordinate {
 
     /// Distance of a coefficient from its lower bound in its coordinate.
     ///
-    /// Below the bound its terms have no effect, and an optimization would never terminate.
+    /// Below the bound the terms of the coefficient have no effect, and an optimization would not terminate.
     pub(crate) fn distance_to_bound(self, value: f64, start: f64) -> f64 {
         match self {
             Self::Logarithm => libm::log(value / start) + MAX_LOG_DECREASE,
@@ -78,7 +78,7 @@ impl Coordinate {
 pub struct Monomial {
     /// Factor that is fixed.
     pub factor: f64,
-    /// Free coefficients and their powers.
+    /// Indices of the free coefficients and their powers.
     pub powers: Vec<(usize, i32)>,
 }
 
@@ -87,7 +87,7 @@ impl Monomial {
         self.powers.iter().fold(self.factor, |product, &(i, n)| product * coefficients[i].powi(n))
     }
 
-    /// Derivative with respect to coefficient i.
+    /// Derivative of the monomial with respect to coefficient i.
     pub(crate) fn slope(&self, coefficients: &[f64], i: usize) -> f64 {
         let Some(&(_, n)) = self.powers.iter().find(|&&(j, _)| j == i) else { return 0.0 };
         let rest = self.powers.iter().filter(|&&(j, _)| j != i);
@@ -101,7 +101,7 @@ impl Monomial {
 pub struct FreeEquation {
     /// Index of the output in the record.
     pub output: usize,
-    /// α.
+    /// Highest order α.
     pub order: AffineOrder,
     /// Signal, order and coefficient of each term.
     pub terms: Vec<(usize, AffineOrder, Monomial)>,
@@ -114,7 +114,7 @@ pub struct ParameterPoint {
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free input parameters: delays, limits.
+    /// Free input parameters: delays \[s\], and limits in the unit of the input.
     pub inputs: Vec<f64>,
 }
 
@@ -135,16 +135,17 @@ pub struct FreeModel {
     pub initial: Initial,
 }
 
-/// Smallest response of the divisor at the Nyquist frequency, relative to its leading coefficient, of an admissible
-/// point.
+/// Smallest response of the denominator of an admissible point at the Nyquist frequency, relative to its leading
+/// coefficient.
 const MIN_NYQUIST_RESPONSE_RATIO: f64 = 0.02;
 
 impl FreeModel {
     /// Check that the model matches the experiments.
     ///
     /// # Errors
-    /// [`Error::Structure`] for an unknown signal or coefficient, a nonlinearity of a signal that is no input, or
-    /// crossed bounds; [`Error::Length`] for experiments or weights of wrong lengths; as [`AffineOrder::check`].
+    /// [`Error::Structure`] for an unknown signal or coefficient, a non-linearity of a signal that is not an input, or
+    /// a lower bound above the upper bound; [`Error::Length`] for experiments or weights of wrong lengths; as
+    /// [`AffineOrder::check`].
     pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
         let Some(signals) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
@@ -154,7 +155,7 @@ impl FreeModel {
         self.initial.check()
     }
 
-    /// Check signals, coefficients and bounds on records of as many signals, followed by derived ones.
+    /// Check signals, coefficients and bounds for records of `signals` recorded and `derived` derived signals.
     pub(crate) fn check_structure(&self, signals: usize, derived: usize) -> Result<()> {
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
         let coefficients = self.coordinates.len();
@@ -241,7 +242,7 @@ impl FreeModel {
         })
     }
 
-    /// Index of the simulated output that a signal of equation i is; None for an input.
+    /// Index of the output that equals a signal of equation i, if the signal is simulated; None for an input.
     pub(crate) fn output_index(&self, i: usize, signal: usize) -> Option<usize> {
         if self.coupled {
             self.equations.iter().position(|e| e.output == signal)
@@ -268,9 +269,9 @@ impl FreeModel {
 
     /// True if every grid resolves the autoregressive terms of each equation; true for coupled equations.
     ///
-    /// The ratio of the divisor at the Nyquist frequency ([`nyquist_margin`]) to its leading coefficient is checked. If
-    /// it is negative, the scheme has a mode that is unstable from pulse to pulse, near 0 one that hardly decays. A fit
-    /// would use such a mode to follow noise.
+    /// The check compares the denominator at the Nyquist frequency ([`nyquist_margin`]) with its leading coefficient.
+    /// If their ratio is negative, the discretization has an unstable mode that alternates from pulse to pulse. If it
+    /// is near 0, such a mode hardly decays. A fit would use this mode to follow noise.
     pub(crate) fn is_resolved(&self, experiments: &[Experiment], point: &ParameterPoint) -> bool {
         if self.coupled && self.equations.len() > 1 {
             return true;
@@ -287,7 +288,7 @@ impl FreeModel {
     }
 }
 
-/// Value of an affine order without rounding, so that it is continuous.
+/// Value of an affine order without rounding, which is continuous in the free orders.
 fn unrounded_order(law: &AffineOrder, free: &[f64]) -> f64 {
     law.constant + law.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>()
 }
@@ -318,8 +319,8 @@ impl InputLaw {
     /// Apply the nonlinearity to pulse means; return them and their derivative with respect to the parameter.
     ///
     /// A delay is exact for a zero-order hold, and of second order in the step for linear interpolation. At an integer
-    /// number of steps its derivative is the one towards longer delays. Limits act on every pulse separately, which is
-    /// exact for a zero-order hold.
+    /// number of steps the derivative is one-sided, towards longer delays. Limits act on every pulse separately, which
+    /// is exact for a zero-order hold.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a limit that is negative, or a parameter that is not finite.
@@ -364,15 +365,15 @@ impl InputLaw {
     }
 }
 
-/// Largest logarithm of a scaling factor; larger ones are clipped.
+/// Largest logarithm of a scaling factor; larger logarithms are clipped.
 const MAX_LOG_FACTOR: f64 = 300.0;
 /// Difference below which two exponents of time are equal.
 const EXPONENT_TOLERANCE: f64 = 1e-9;
 
-/// Exponent of time: its constant, and the weights of the free orders.
+/// Exponent of time in the unit of a coefficient: constant, and weights of the free orders.
 type TimePower = (f64, Vec<f64>);
 
-/// Unit of time (its logarithm), and the exponent of time of each coefficient; None for unscaled coefficients.
+/// Logarithm of the unit of time, and the exponent of time of each coefficient; None for unscaled coefficients.
 #[derive(Debug, Clone)]
 pub(crate) struct TimeUnit {
     unit: f64,
@@ -398,7 +399,7 @@ impl TimeUnit {
         self.unit
     }
 
-    /// Factor of a coefficient for its value in the unit, at the given orders.
+    /// Factor that converts a coefficient to the unit of time, at the given orders.
     pub(crate) fn factor(&self, coefficient: usize, orders: &[f64]) -> f64 {
         self.powers[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
             let power = constant + weights.iter().zip(orders).map(|(w, o)| w * o).sum::<f64>();
@@ -407,7 +408,7 @@ impl TimeUnit {
         })
     }
 
-    /// Relative decrease of a coefficient per unit of a free order, at a constant value in the unit.
+    /// Relative decrease of a coefficient per unit of a free order, if its value in the unit of time is constant.
     pub(crate) fn relative_decrease(&self, coefficient: usize, order: usize) -> f64 {
         let weight = |(_, weights): &TimePower| weights.get(order).copied().unwrap_or(0.0);
         self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
@@ -448,7 +449,7 @@ fn time_power(model: &FreeModel, coefficient: usize) -> Option<TimePower> {
     })
 }
 
-/// Difference α − ν: the constant, then the weights of the free orders.
+/// Difference α − ν of two affine orders: the constant, then the weights of the free orders.
 fn order_difference(highest: &AffineOrder, order: &AffineOrder) -> Vec<f64> {
     let weights = highest.weights.iter().zip(&order.weights).map(|(a, b)| a - b);
     std::iter::once(highest.constant - order.constant).chain(weights).collect()

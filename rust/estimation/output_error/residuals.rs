@@ -22,13 +22,13 @@ use crate::linalg::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, RunningSumSystem, SumOfProducts};
 
-/// Smallest difference of α and the order of an autoregressive term; at 0 the equation would be an identity.
+/// Smallest difference of α and the order of an autoregressive term. At 0 the equation would not depend on the input.
 pub(crate) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
 /// Response of an experiment to an initial term: equation, weighted samples, pulse means.
 ///
-/// The pulse means are empty for a term that affects only the sensor filter, and for a level of the output, which no
-/// term of the equation sees. Of the latter the equation is None.
+/// The pulse means are empty for a term that affects only the sensor filter, and for a level of the output, which is in
+/// no equation. The equation of a level is None.
 struct InitialTermResponse {
     equation: Option<usize>,
     samples: Vec<f64>,
@@ -414,7 +414,7 @@ impl FreeModel {
     }
 }
 
-/// Intermediates of one experiment for its sensitivities.
+/// Intermediate results of one experiment for its sensitivities.
 pub(crate) struct Linearization {
     /// Inverse of the equations.
     pub(crate) system: Rc<SystemInverse>,
@@ -458,7 +458,7 @@ impl Linearization {
     }
 }
 
-/// Effect of a unit change of a parameter on an experiment.
+/// Effect on an experiment of a change of a parameter by 1.
 pub(crate) struct ParameterEffect {
     /// Change of the weighted samples.
     pub(crate) samples: Vec<f64>,
@@ -467,7 +467,7 @@ pub(crate) struct ParameterEffect {
 }
 
 impl ParameterEffect {
-    /// Apply a change of the coefficient to residuals and pulse means.
+    /// Apply a change of the parameter to residuals and pulse means.
     pub(crate) fn apply(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
         if by != 0.0 {
             residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);

@@ -2,16 +2,17 @@
 
 use std::f64::consts::PI;
 
-/// Ratio by which one power of s exceeds the sum of all others outside the range of frequencies.
+/// Ratio of one power of s to the sum of all others, above which the range of frequencies ends.
 const DOMINANCE_RATIO: f64 = 1e3;
-/// Largest step in ln ω; a pole closer to the axis than [`MIN_LOG_FREQUENCY_STEP`] lies on it.
+/// Largest step in ln ω. A pole closer to the imaginary axis than [`MIN_LOG_FREQUENCY_STEP`] counts as on the axis.
 const MAX_LOG_FREQUENCY_STEP: f64 = 0.25;
 const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
 /// Largest change of the angle of the curve \[rad\] between two points.
 const MAX_ANGLE_STEP_RAD: f64 = 0.5;
 /// Difference below which two exponents of s are merged: they are distinguishable only beyond ω = e^1000.
 const EXPONENT_TOLERANCE: f64 = 1e-3;
-/// Count of zeros in the right half-plane, by the argument, above which there is one; a zero on the axis counts half.
+/// Computed number of zeros in the right half-plane above which the equation is unstable; a zero on the axis counts
+/// 1/2.
 const MIN_UNSTABLE_ZERO_COUNT: f64 = 0.25;
 
 /// Return true if an equation of order α with autoregressive terms (c, ν) is unstable.
@@ -53,7 +54,8 @@ pub fn is_unstable(alpha: f64, own: &[(f64, f64)]) -> bool {
     0.5 * (high.1 - low.1) - turned / PI > MIN_UNSTABLE_ZERO_COUNT
 }
 
-/// Merge powers with exponents closer than [`EXPONENT_TOLERANCE`], which no measurable frequency distinguishes.
+/// Merge powers with exponents closer than [`EXPONENT_TOLERANCE`], which cannot be distinguished at any measurable
+/// frequency.
 fn merge_close_powers(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     powers.sort_by(|a, b| a.1.total_cmp(&b.1));
     let mut out: Vec<(f64, f64)> = Vec::with_capacity(powers.len());

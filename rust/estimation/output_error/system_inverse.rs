@@ -19,7 +19,7 @@ use crate::series::{
 pub(crate) enum Inverse {
     /// Spectra of the entries, and their length for products.
     Spectra { rows: Vec<Vec<Kernel>>, total: usize },
-    /// Running sums, one solution per right-hand side.
+    /// Running sums, solved once per right-hand side.
     Sums(RunningSumSystem),
 }
 
@@ -72,7 +72,7 @@ impl<'a> RightHandSides<'a> {
         self.is_nonzero().then(|| rows.iter().map(of_row).collect())
     }
 
-    /// Summands in the form of the running sums.
+    /// Summands in the form that the running sums need.
     fn sources(&self) -> Vec<Source<'_>> {
         let Self::Sums(sources) = self else { return Vec::new() };
         (sources.iter())
@@ -111,7 +111,7 @@ impl<'a> RightHandSides<'a> {
         }
     }
 
-    /// Add a series; only the form that is needed is computed.
+    /// Add a series. Only the form that is needed, series or spectrum, is computed.
     pub(crate) fn add_series(
         &mut self,
         equation: usize,
@@ -278,7 +278,7 @@ pub(crate) struct Operator {
     free: bool,
     m: usize,
     step: f64,
-    /// Lazily computed kernel and, for orders of at least 0, its derivative.
+    /// Kernel and, for orders of at least 0, its derivative; computed when first needed.
     series: OnceCell<(Vec<f64>, Vec<f64>)>,
     spectra: [OnceCell<Rc<Kernel>>; 2],
 }
@@ -296,7 +296,7 @@ impl Operator {
         })
     }
 
-    /// Spectrum of the derivative of the kernel; below order 0 a product of three series.
+    /// Spectrum of the derivative of the kernel. Below order 0 it is a product of three series.
     fn slope(&self) -> Kernel {
         let total = SPECTRUM_FACTORS * self.m;
         if self.eta >= 0.0 || !self.free {

@@ -16,17 +16,19 @@ use crate::parallel::PerThread;
 
 /// Pulses simulated between two checkpoints, about 0.1 s on one core.
 const CHECKPOINT_PULSES: usize = 1 << 21;
-/// Candidates that a task screens. Ranking by the Gram matrix alone costs about one nanosecond per candidate.
+/// Number of candidates that a task screens by bounds.
 const BOUND_CHUNK_CANDIDATES: u64 = 512;
+/// Number of candidates that a task ranks by the Gram matrix alone, which costs about 1 ns per candidate.
 const GRAM_CHUNK_CANDIDATES: u64 = 1 << 13;
-/// Slices on which boxes are tried if candidates are hard to exclude. Boxes are worthwhile if they exclude at least one
-/// in so many candidates. Useless boxes make a search half as long again.
+/// Number of slices on which boxes are tried if candidates are hard to exclude. Boxes must exclude at least one in
+/// [`MAX_CANDIDATES_PER_EXCLUSION`] candidates. Boxes that exclude nothing make a search 50 % longer.
 const TRIAL_SLICES: u64 = 32;
+/// Largest number of candidates per excluded candidate for which boxes are worthwhile.
 const MAX_CANDIDATES_PER_EXCLUSION: u64 = 8;
-/// First and largest number of candidates simulated between two updates of the limit.
+/// Initial and largest number of candidates simulated between two updates of the limit.
 const SIMULATION_CHUNK_RANGE: (u64, u64) = (256, 16_384);
-/// First and largest number of refined candidates between two updates of the limit. Each takes about one millisecond,
-/// and a lower score excludes many.
+/// Initial and largest number of candidates with refined coefficients between two updates of the limit. One refinement
+/// takes about 1 ms, so frequent updates are worthwhile.
 const REFINEMENT_CHUNK_RANGE: (u64, u64) = (32, 1024);
 
 /// Evaluation of a range of batches.
@@ -38,7 +40,7 @@ pub(super) struct BatchEvaluation<'a> {
     scratches: PerThread<Scratch>,
     /// Result of the completed batches, and of the candidates evaluated in the current batch, without its rows.
     pub(super) result: Part,
-    /// Whether the next checkpoint is the first one since the range was started.
+    /// True if the next checkpoint is the first one of this evaluation of the range.
     pub(super) replaces_previous: bool,
 }
 
@@ -68,8 +70,8 @@ impl<'a> BatchEvaluation<'a> {
         self.control.check_stop()
     }
 
-    /// Screen a batch and simulate its open candidates, starting at a position. Return `false` if the position belongs
-    /// to another evaluation order, as on another kind of processor.
+    /// Screen a batch and simulate the candidates that no bound excludes, starting at a position. Return `false` if the
+    /// position belongs to another evaluation order, as on another kind of processor.
     pub(super) fn evaluate_batch(
         &mut self,
         bounds: (u64, u64),
@@ -177,8 +179,8 @@ impl<'a> BatchEvaluation<'a> {
         chunks
     }
 
-    /// Simulate open candidates in this order, starting at a position. Rows are added to `top_rows`, and counts and
-    /// checkpoints are updated if `counted`.
+    /// Simulate candidates that no bound excludes in this order, starting at a position. Rows are added to `top_rows`.
+    /// If `counted`, counts and checkpoints are updated.
     pub(super) fn simulate_open(
         &mut self,
         open: &[OpenCandidate],

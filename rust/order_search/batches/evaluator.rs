@@ -1,14 +1,15 @@
-//! Evaluator of an order search: parallel, reproducible, stoppable, with every candidate counted.
+//! Evaluator of an order search. It is parallel, reproducible and interruptible, and counts the outcome of every
+//! candidate.
 //!
-//! Candidates are processed in batches. All candidates of a batch get coefficients in parallel lanes, and a lower
-//! bound excludes most of them. The others are simulated in the order of their score estimates. Each simulation stops
-//! once its partial sum exceeds the worst score in the table. An excluded candidate cannot enter the table, so the
-//! table equals that of brute force, ties by index.
+//! Candidates are processed in batches. All candidates of a batch get coefficients in parallel lanes, and a lower bound
+//! excludes most of them. The remaining candidates are simulated in the order of their score estimates. Each simulation
+//! stops once its partial sum exceeds the worst score in the table. An excluded candidate cannot enter the table, so
+//! the table equals that of brute force, ties by index.
 //!
-//! Generations hold 1, 2, 4, … batches. A batch depends only on the rows found before its generation and on its own.
-//! Its result and counts are therefore bitwise reproducible on processors of one kind: with any number of threads, on
-//! another machine with the same vector instructions, or after resuming from a checkpoint. On another kind of
-//! processor the last digits may differ, because dense products and transforms select their kernels by instruction
+//! Generations hold 1, 2, 4, … batches. The result of a batch depends only on the batch and on the rows found before
+//! its generation. Result and counts are therefore bitwise reproducible on processors of one kind: with any number of
+//! threads, on another machine with the same vector instructions, or after resuming from a checkpoint. On another kind
+//! of processor the last digits may differ, because dense products and transforms select their kernels by instruction
 //! set.
 
 use std::borrow::Cow;
@@ -34,9 +35,8 @@ use crate::regressors::Record;
 /// number of threads.
 ///
 /// # Errors
-/// An option out of range, records without the signals of the equation, a number of fixed coefficients unlike the
-/// number of terms, regressors beyond the memory limit, threads that do not start,
-/// [`crate::error::Error::Interrupted`].
+/// An option out of range, records without the signals of the equation, a wrong number of fixed coefficients,
+/// regressors beyond the memory limit, threads that cannot be started, [`crate::error::Error::Interrupted`].
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -269,7 +269,7 @@ impl<'a> BatchEvaluator<'a> {
         Ok(hunt.result)
     }
 
-    /// Raise an error for a partial result of another search.
+    /// Return an error for a partial result of another search.
     fn check(&self, part: &Part) -> Result<()> {
         let (count, width) = (self.catalogue.lattice.count(), self.catalogue.lattice.width());
         let other = |row: &Row| row.coefficients.len() != width || row.index >= count || is_invalid_score(row.score);
@@ -297,19 +297,22 @@ fn is_invalid_score(score: f64) -> bool {
     score.is_nan() || score < 0.0
 }
 
-/// Candidates per batch: ranked by the Gram matrix alone (16 ns each), screened by bounds (about 1 µs), all simulated.
-/// A batch is long enough to be sent to another machine, and short enough to be lost.
+/// Number of candidates per batch if they are ranked by the Gram matrix alone (16 ns per candidate). A batch takes long
+/// enough to be sent to another machine, and so short that its loss is acceptable.
 const BATCH_SIZE_GRAM: u64 = 1 << 18;
+/// Number of candidates per batch if bounds screen them (about 1 µs per candidate).
 const BATCH_SIZE_BOUNDED: u64 = 1 << 16;
+/// Number of candidates per batch if all are simulated.
 const BATCH_SIZE_SIMULATED: u64 = 1 << 12;
-/// Minimum candidates for branch and bound, and maximum batch size. Batches grow with the grid because the tables of
-/// boxes shared by two batches are computed twice.
+/// Minimum number of candidates for branch and bound. Batches then grow with the grid up to [`MAX_BATCH_SIZE`], because
+/// tables of boxes shared by two batches are computed twice.
 pub(super) const MIN_BOX_CANDIDATES: u64 = 1 << 25;
+/// Largest number of candidates per batch.
 const MAX_BATCH_SIZE: u64 = 1 << 22;
-/// Minimum candidates for close bounds if simulation ranks: unstable zeros and linearized test vectors. A smaller
-/// search ends before these are built.
+/// Minimum number of candidates for the close bounds (unstable zeros and linearized test vectors), if candidates are
+/// ranked by simulation. A smaller search ends before these bounds are built.
 const MIN_CLOSE_BOUND_CANDIDATES: u64 = 1 << 18;
-/// Maximum refined candidates that are evaluated without an initial sample, one batch.
+/// Maximum number of candidates with refined coefficients that are evaluated without an initial sample: one batch.
 pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 
 /// Version of the algorithm that divides and evaluates a search over this many candidates.

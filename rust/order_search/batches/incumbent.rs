@@ -16,23 +16,22 @@ use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor};
 use crate::order_search::result::TopRows;
 use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 
-/// Candidates of the initial sample, distributed over the grid. They select the test vectors and give the first
-/// incumbent.
+/// Number of candidates of the initial sample, distributed over the grid. They select the test vectors and give the
+/// first incumbent.
 const INITIAL_SAMPLE_CANDIDATES: u64 = 2048;
-/// Maximum test vectors used in a search.
+/// Maximum number of test vectors used in a search.
 const MAX_SEARCH_VECTORS: usize = 16;
-/// Candidates among which the most promising are refined first. Estimates are cheap, and rows from a large part of the
-/// grid exclude most of it.
+/// Number of candidates whose score is estimated to find those whose coefficients are refined first. Estimates are
+/// cheap, and low scores from a large part of the grid exclude most of it.
 const RANKED_CANDIDATES: u64 = 1 << 18;
 
-/// Inverse of the minimum open fraction of the sample for close bounds. Below it they are not worthwhile. Measured: 0.3
-/// to 2 % open (9 % at twice the noise) near a true equation, 53 to 100 % in searches that take seconds because there
-/// is none.
+/// Inverse of the smallest fraction of the sample that must remain open, so that close bounds are worthwhile. Measured:
+/// 0.3 to 2 % open (9 % at twice the noise) if the grid contains a true equation, and 53 to 100 % otherwise.
 const HARD_SEARCH_OPEN_RATIO: usize = 8;
 
 /// Incumbent found by the initial sample.
 pub(super) struct InitialIncumbent {
-    /// Rows that give the initial limit, and the candidates evaluated for them.
+    /// Rows that give the initial limit.
     pub(super) top_rows: TopRows,
     pub(super) evaluated: HashSet<u64>,
     /// Whether so many candidates remain open at this limit that close bounds are worthwhile.
@@ -119,7 +118,7 @@ impl BatchEvaluation<'_> {
     }
 }
 
-/// Select the test vectors that together exclude most of a sample, in greedy order.
+/// Select the test vectors that together exclude most of a sample, by greedy selection.
 fn select_test_vectors(each: &[Vec<f64>], most: usize, limit: f64) -> Vec<usize> {
     let mut open: Vec<bool> = vec![true; each.len()];
     let mut selection: Vec<usize> = Vec::new();
@@ -141,15 +140,15 @@ fn select_test_vectors(each: &[Vec<f64>], most: usize, limit: f64) -> Vec<usize>
     selection
 }
 
-/// Rows whose neighbors are evaluated.
+/// Number of rows whose neighbors are evaluated.
 const LOCAL_SEARCH_ROWS: usize = 64;
-/// Maximum neighbors evaluated around the best rows.
+/// Maximum number of neighbors evaluated around the best rows.
 const MAX_NEIGHBOR_EVALUATIONS: usize = 1 << 14;
-/// Maximum directions of neighbors: all combinations of up to five orders, else pairs of orders.
+/// Maximum number of directions of neighbors: all combinations of up to five orders, or pairs of more orders.
 const MAX_NEIGHBOR_DIRECTIONS: usize = 243;
 /// Number of sampled blocks of candidates, and their length.
 const SAMPLE_BLOCKS_AND_LENGTH: (u64, u64) = (2048, 64);
-/// Maximum open candidates that are evaluated.
+/// Maximum number of candidates not excluded by bounds that are evaluated.
 const MAX_OPEN_EVALUATIONS: usize = 512;
 
 impl BatchEvaluation<'_> {

@@ -1,6 +1,6 @@
-//! Generation of tailored and linearized test vectors while they are worthwhile.
+//! Generation of tailored and linearized test vectors, as long as they exclude enough candidates.
 //!
-//! Vectors are built for candidates that no other vector excludes, in a sample of the grid.
+//! Vectors are built for the candidates in a sample of the grid that no other vector excludes.
 
 use std::collections::BTreeMap;
 
@@ -14,23 +14,26 @@ use crate::order_search::dual_bound::tailored_vectors::TailoredVector;
 use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor};
 use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 
-/// Sample in which open candidates are searched, and its block length. Candidates of one block are open together or not
-/// at all. The first pass takes the minimum sample. Later passes take a fraction of a large grid, since few candidates
-/// remain open.
+/// Minimum size of the sample in which open candidates are searched. The first pass uses this size. Later passes use a
+/// fraction of a large grid, since few candidates remain open. The sample consists of blocks, because all candidates of
+/// a block are usually open, or none.
 const MIN_TAILORED_SAMPLE: u64 = 1 << 17;
+/// Number of candidates of a large grid per sampled candidate.
 const TAILORED_SAMPLE_RATIO: u64 = 512;
+/// Number of candidates in a block of this sample.
 const TAILORED_SAMPLE_BLOCK: u64 = 16;
 const BLOCKS_PER_SCREENING: u64 = 1 << 11;
 /// Number of open candidates at which sampling stops.
 const OPEN_SAMPLE_CANDIDATES: usize = 512;
-/// Maximum vectors tried per pass, and maximum vectors selected from them.
+/// Maximum number of vectors tried per pass.
 const MAX_TRIAL_VECTORS: usize = 32;
+/// Maximum number of vectors selected from those tried in a pass.
 const MAX_SELECTED_VECTORS: usize = 12;
-/// Maximum passes.
+/// Maximum number of passes.
 const MAX_GENERATION_PASSES: u64 = 4;
-/// Open candidates that make another pass worthwhile, and exclusions that make a vector worthwhile. One pass costs as
-/// much as simulating so many candidates.
+/// Smallest number of open candidates for another pass. One pass costs as much as simulating this many candidates.
 const MIN_OPEN_CANDIDATES: f64 = 16_384.0;
+/// Smallest number of exclusions that make a vector worthwhile.
 const MIN_VECTOR_EXCLUSIONS: f64 = 512.0;
 const SELECTION_BIAS_FACTOR: usize = 4;
 /// Maximum memory of test vectors, including those on trial \[bytes\].
@@ -42,7 +45,7 @@ pub(super) struct GeneratedVectors {
     pub(super) vectors: Vec<TailoredVector>,
     /// Candidates of the sample that the vectors leave open.
     pub(super) open: Vec<OpenCandidate>,
-    /// Whether another pass may be worthwhile.
+    /// True if another pass may be worthwhile.
     pub(super) is_worth_repeating: bool,
 }
 
@@ -151,22 +154,25 @@ pub(super) fn subsample(all: &[OpenCandidate], most: usize) -> Vec<OpenCandidate
     (0..count).map(|i| all[i * all.len() / count]).collect()
 }
 
-/// Maximum candidates of the sample, and its block length. A small grid is sampled by one in eight.
+/// Maximum size of the sample for linearized vectors. Of a small grid one candidate in eight is sampled.
 const MAX_LINEARIZED_SAMPLE: u64 = 1 << 19;
+/// Number of candidates of a small grid per sampled candidate.
 const LINEARIZED_SAMPLE_RATIO: u64 = 8;
+/// Number of candidates in a block of this sample.
 const LINEARIZED_SAMPLE_BLOCK: u64 = 8;
-/// Minimum exclusions per vector, and minimum open candidates for another vector. Building one costs as much as ten to
-/// twenty simulations.
+/// Minimum number of exclusions per vector, and of open candidates for another vector. Building a vector costs as much
+/// as ten to twenty simulations.
 const MIN_LINEARIZED_EXCLUSIONS: f64 = 32.0;
-/// Maximum vectors for the same own orders, and maximum unsuccessful trials.
+/// Maximum number of vectors for the same orders of the output terms.
 const MAX_LINEARIZED_VECTORS: usize = 24;
+/// Maximum number of vectors in sequence that exclude too few candidates.
 const MAX_FAILED_VECTORS: usize = 6;
 /// Maximum memory of all vectors \[bytes\].
 const MAX_LINEARIZED_BYTES: u64 = 1 << 30;
 
 impl BatchEvaluation<'_> {
-    /// Generate vectors for each tuple of own orders that exclude the open candidates of a sample. `None` if no vector
-    /// is worthwhile or memory is lacking.
+    /// Generate vectors for each combination of orders of the output terms, which exclude the open candidates of a
+    /// sample. `None` if no vector is worthwhile or memory is lacking.
     pub(super) fn generate_linearized_vectors(&self, limit: f64) -> Result<Option<LinearizedVectors>> {
         let problem = &self.catalogue.problem;
         let mut tangents = problem.empty_linearized_vectors();
@@ -210,7 +216,8 @@ impl BatchEvaluation<'_> {
         Ok((tangents.len() > 0).then_some(tangents))
     }
 
-    /// Open candidates in a sample of the grid at this limit, and the number of candidates that each represents.
+    /// Candidates in a sample of the grid that no bound excludes at this limit, and the number of candidates that each
+    /// represents.
     #[allow(clippy::cast_precision_loss)]
     fn sample_grid(&self, limit: f64) -> Result<(Vec<SolvedCandidate>, f64)> {
         let catalogue = self.catalogue;
@@ -245,8 +252,8 @@ impl BatchEvaluation<'_> {
         Ok((open, count as f64 / (sample_count * LINEARIZED_SAMPLE_BLOCK) as f64))
     }
 
-    /// Generate vectors for candidates with the same own columns. The first is built at the median of the first
-    /// coefficient, then both halves are processed likewise.
+    /// Generate vectors for candidates with the same columns of the output. The first vector is built at the median of
+    /// the first coefficient. Then both halves of the candidates are processed likewise.
     fn generate_for_own_columns(
         &self,
         tangents: &LinearizedVectors,

@@ -1,41 +1,41 @@
 //! Axis tables of one order of a slice: projections, coefficients and deviations from linearity.
 //!
-//! û is the column x of a value after projection on the slice's remaining columns, scaled to unit norm. Over an
-//! interval any quantity deviates from linear interpolation between the ends by at most one eighth of the squared
-//! length times the largest second difference: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi −
-//! i)/2.
+//! For each value of the order, û is its column x, orthogonal to the remaining columns of the slice and scaled to unit
+//! norm. Over an interval any quantity deviates from linear interpolation between the ends by at most one eighth of the
+//! squared length times the largest second difference: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i −
+//! lo)(hi − i)/2.
 
 use crate::order_search::candidate::normal_equations::Normal;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, NO_INDEX};
 use crate::simd::LANE_COUNT;
 
-/// One value for each of [`LANE_COUNT`] test vectors.
+/// Vector of one value for each of [`LANE_COUNT`] test vectors.
 pub(super) type Wide = [f64; LANE_COUNT];
 pub(super) const ZERO_LANES: Wide = [0.0; LANE_COUNT];
 
-/// ⟨t, x⟩ and g‖t‖, real and imaginary parts.
+/// Products of a column x with test vectors t: ⟨t, x⟩ and g‖t‖, each as real and imaginary part.
 pub(super) type VectorProducts = [Wide; 4];
 
-/// Second differences and largest values over an interval of 2^l values.
+/// Largest values and second differences over an interval of 2^l values of an order.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
-    /// Largest second differences of ⟨t, û⟩ and g‖t‖, largest ‖Fᵀt − g t‖, and its distance from that of the partner.
+    /// Largest second differences of ⟨t, û⟩ and g‖t‖.
     pub(super) second_differences: [Wide; 4],
 }
 
-/// Largest sums of coefficients over an interval, independent of the test vectors.
+/// Largest sums of coefficients over an interval of values.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CoefficientSums {
-    /// Largest sum of the moduli of û's coefficients.
+    /// Largest sum of the moduli of the coefficients of û.
     pub(super) sum: f64,
 }
 
-/// Intervals of one length.
+/// Intervals of one length along an order.
 pub(super) struct Level {
     pub(super) coefficient_sums: Vec<CoefficientSums>,
-    /// Largest second differences of û's coefficients on the remaining columns, k per interval.
+    /// Largest second differences of the coefficients of û on the remaining columns, k per interval.
     pub(super) mixed: Vec<f64>,
-    /// Groups of test vectors within intervals.
+    /// Nodes by interval, then by group of test vectors.
     pub(super) nodes: Vec<Node>,
 }
 
@@ -43,14 +43,15 @@ pub(super) struct Level {
 pub(super) struct RemainingColumns<'a> {
     pub(super) normal: &'a Normal,
     pub(super) test_vectors: &'a [TestVectors],
-    /// Remaining columns and the inverse of their correlation matrix.
+    /// Positions of the remaining columns.
     pub(super) columns: &'a [usize],
     pub(super) inverse: &'a [f64],
     /// Trace of that inverse.
     pub(super) trace: f64,
     /// Rounding-error bound of a product of unit columns.
     pub(super) rounding: f64,
-    /// Remaining column of the output itself. Its coefficient may cancel that of an own column of the sides.
+    /// Remaining column of the output itself, if any. Its coefficient may cancel that of a varying column of the
+    /// output.
     pub(super) partner: Option<usize>,
 }
 
@@ -63,8 +64,8 @@ impl RemainingColumns<'_> {
         }
     }
 
-    /// Upper bound of the distance of an own column's Fᵀt − g t from the partner's. Zero for any other column or
-    /// without a partner.
+    /// Upper bound of the distance of Fᵀt − g t of a column of the output from that of the partner. It is zero for
+    /// other columns, and without a partner.
     #[inline(always)]
     fn distance_to_partner(&self, record: usize, group: usize, column: usize) -> Wide {
         let probes = &self.test_vectors[record];
@@ -79,7 +80,7 @@ impl RemainingColumns<'_> {
         way
     }
 
-    /// ⟨t, x⟩ and g‖t‖ of a unit column, and its ‖Fᵀt − g t‖.
+    /// Products ⟨t, x⟩ and g‖t‖ of a unit column x with a group of test vectors t, and ‖Fᵀt − g t‖.
     #[inline(always)]
     pub(super) fn vector_products(&self, record: usize, group: usize, column: usize) -> (VectorProducts, Wide) {
         let probes = &self.test_vectors[record];
@@ -106,16 +107,15 @@ impl RemainingColumns<'_> {
 /// Tables along one order of a slice.
 pub(super) struct AxisTable {
     pub(super) columns: Vec<usize>,
-    /// 1/‖x − its projection on the remaining columns‖, and û·y.
+    /// Inverse norm of each column x after projection, which scales it to û.
     pub(super) scale: Vec<f64>,
     pub(super) target: Vec<f64>,
-    /// Products with the remaining columns, and û's coefficients on them (to be subtracted), k per value.
+    /// Products of each column with the remaining columns, k per value.
     pub(super) shared: Vec<f64>,
     pub(super) mixed: Vec<f64>,
-    /// Coefficient of û on the partner plus that on the own column, as if both were the partner. Empty without a
-    /// partner.
+    /// Sum of the coefficients of û on the partner and on its own column. Empty without a partner.
     pub(super) paired: Vec<f64>,
-    /// Groups of test vectors within values.
+    /// Products with test vectors, by value, then by group of test vectors.
     pub(super) vector_products: Vec<VectorProducts>,
     pub(super) levels: Vec<Level>,
 }
@@ -201,7 +201,7 @@ impl AxisTable {
         Some(side)
     }
 
-    /// Build the levels with intervals of 1, 2, 4, … values.
+    /// Build the levels of intervals with 1, 2, 4, … values, for `k` remaining columns.
     #[inline(always)]
     fn build(&mut self, k: usize, groups: usize, rests: &[[Wide; 2]]) {
         let n = self.columns.len();
@@ -299,7 +299,7 @@ impl AxisTable {
     }
 }
 
-/// All groups of test vectors: record and group number.
+/// All groups of test vectors as (record, group number).
 pub(super) fn vector_groups(probes: &[TestVectors]) -> impl Iterator<Item = (usize, usize)> + '_ {
     probes.iter().enumerate().flat_map(|(r, probes)| (0..probes.groups).map(move |g| (r, g)))
 }

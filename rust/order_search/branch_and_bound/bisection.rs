@@ -21,11 +21,11 @@ use crate::parallel::{pool, Stop};
 use crate::regressors::Record;
 use crate::simd::{self, LANE_COUNT};
 
-/// Minimum number of candidates of a slice for which its tables are worthwhile.
+/// Minimum number of candidates of a slice for which axis tables are worthwhile.
 pub(crate) const MIN_SLICE_CANDIDATES: u64 = 4096;
 /// Initial level of a box: intervals of 32 values.
 const INITIAL_BOX_LEVEL: usize = 5;
-/// Sum of both levels at or below which candidates are screened individually.
+/// Sum of the two levels of a box at or below which its candidates are screened one by one.
 const SCREENING_LEVEL_SUM: usize = 4;
 
 /// Constants of branch and bound, shared by all boxes of a search.
@@ -35,8 +35,9 @@ pub(crate) struct BranchAndBound {
 }
 
 impl BranchAndBound {
-    /// Whether branch and bound applies to a search and is worthwhile. It needs ranking by simulation with zero initial
-    /// conditions or by squared equation error, coefficients from the normal equations, and a large slice.
+    /// True if branch and bound applies to a search and is worthwhile. It requires zero initial conditions with ranking
+    /// by simulation, or ranking by squared equation error. It also requires coefficients from the normal equations,
+    /// and a large slice.
     pub(crate) fn is_worthwhile(catalogue: &CandidateIndex<'_>) -> bool {
         let (options, lattice) = (&catalogue.options, &*catalogue.lattice);
         options.pruning
@@ -93,7 +94,7 @@ impl BranchAndBound {
     }
 }
 
-/// Test vectors of a search. Empty if squared equation errors rank, `None` if no bound exists.
+/// Test vectors of a search. Empty if candidates are ranked by squared equation error, `None` if no bound exists.
 fn test_vectors_of(problem: &Problem) -> Option<&[TestVectors]> {
     match (&problem.residual_sums, &problem.bound) {
         (Some(_), _) => Some(&[]),
@@ -101,8 +102,9 @@ fn test_vectors_of(problem: &Problem) -> Option<&[TestVectors]> {
     }
 }
 
-/// Screen candidates `lo … hi − 1` of a slice against a limit. Return the candidates not excluded, the singular ones
-/// outside excluded boxes, and the number of candidates in excluded boxes. `None` if boxes prove nothing in this slice.
+/// Screen candidates `lo … hi − 1` of a slice against a limit. Return the candidates that are not excluded, the number
+/// of singular candidates outside excluded boxes, and the number of candidates in excluded boxes. `None` if no box of
+/// this slice has a bound.
 pub(crate) fn screen_slice(
     catalogue: &CandidateIndex<'_>,
     boxes: &BranchAndBound,
@@ -113,7 +115,7 @@ pub(crate) fn screen_slice(
     simd::dispatch_simd(SliceScreening { catalogue, boxes, slab, lo, hi, limit })
 }
 
-/// Kernel form of [`screen_slice`].
+/// SIMD task of [`screen_slice`].
 struct SliceScreening<'a> {
     catalogue: &'a CandidateIndex<'a>,
     boxes: &'a BranchAndBound,
@@ -248,7 +250,8 @@ fn inverse_correlation(columns: &[usize], product: impl Fn(usize, usize) -> f64)
 /// Lower bound of the errors of all candidates of a box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoxBound {
-    /// The candidates `first + i·stride + j`, i below `rows` and j below `values`.
+    /// First candidate. The box contains the candidates `first + i·stride + j` with i below `rows` and j below
+    /// `values`.
     pub first: u64,
     /// Number of rows i.
     pub rows: u64,
@@ -263,8 +266,8 @@ pub struct BoxBound {
 /// Lower bound of every box of the slice that contains a candidate. Boxes of all sizes down to single candidates are
 /// returned, for output errors in either norm or for squared equation errors.
 ///
-/// Empty if the grid has no slices, which is so if its fastest signal has several terms or no other order varies. Also
-/// empty if nothing is proved of this slice.
+/// Empty if no box of the slice has a bound, or if the grid has no slices: the fastest signal has several terms, or no
+/// other order varies.
 ///
 /// # Errors
 /// As [`crate::order_search::batches::search`].
@@ -335,7 +338,8 @@ pub fn open_candidates(
     })
 }
 
-/// Apply a function to the slice that contains a candidate, with all test vectors. Empty if the slice has no boxes.
+/// Apply a function to the slice that contains a candidate, with all test vectors built. Empty if the slice has no
+/// boxes.
 fn with_slice<T>(
     records: &[Record],
     lattice: &OrderGrid,
@@ -401,8 +405,8 @@ mod tests {
         corners.iter().zip(shares).map(|(c, share)| 0.25 * c * share).sum()
     }
 
-    /// Deviations of a candidate's ⟨t, w⟩ and divisor from the box values, relative to their bounds. One value for each
-    /// of [`LANE_COUNT`] test vectors.
+    /// Deviations of ⟨t, w⟩ and the denominator of a candidate from their bilinear approximations over the box,
+    /// relative to the proved bounds. One value for each of [`LANE_COUNT`] test vectors.
     fn relative_deviations(whole: &CornerValues, one: &CornerValues, place: (f64, f64)) -> [Wide; 2] {
         let corners = |of: &dyn Fn(usize) -> f64| interpolate_bilinear(std::array::from_fn(of), place);
         let apart = |part: usize, n: usize| one.values[0][part][n] - corners(&|c| whole.values[c][part][n]);

@@ -1,12 +1,13 @@
 //! Lower bound of the errors of all candidates in a box of two orders.
 //!
-//! û and v̂ are the two varying columns after projection on the remaining ones, scaled to unit norm. The coefficients
-//! on them solve p + B q = û·y, B p + q = v̂·y with B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)). They are
-//! computed for all candidates, and their deviation from bilinear functions over a box is exact. Over a box, −1 ≤ s,
-//! t ≤ 1, every other quantity is a linear interpolation between the ends plus a remainder. ⟨t, w⟩, 1 − Σ c g and the
-//! coefficients are then bilinear in s and t up to remainders of second order. A bound of bilinear functions at the
-//! corners holds over the box: |⟨t, w⟩| is at least its projection on one direction, which is bilinear. Subtracting λ
-//! times moduli of bilinear functions gives a function that is concave in s and in t, with its minimum at a corner.
+//! û and v̂ are the two varying columns, orthogonal to the remaining columns and scaled to unit norm. The coefficients
+//! on them solve p + B q = û·y, B p + q = v̂·y with B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)). They are computed
+//! for all candidates, so their deviation from bilinear functions over a box is known exactly. Over a box, −1 ≤ s, t ≤
+//! 1, every other quantity is a linear interpolation between the ends plus a bounded remainder. The test-vector
+//! products ⟨t, w⟩, the denominator 1 − Σ c g and the coefficients are then bilinear in s and t up to remainders of
+//! second order. A bound of bilinear functions at the corners holds over the box: |⟨t, w⟩| is at least its projection
+//! on one direction, which is bilinear. Subtracting λ times moduli of bilinear functions gives a function that is
+//! concave in s and in t, with its minimum at a corner.
 
 use std::ops::Range;
 
@@ -17,26 +18,26 @@ use crate::order_search::dual_bound::test_vectors::NO_INDEX;
 use crate::order_search::options::Norm;
 use crate::simd::LANE_COUNT;
 
-/// Rounding error of coefficients, in units of the trace of an inverse correlation matrix. It is sixteen times ε and
-/// the square of the number of terms, far above the error of the elimination.
+/// Rounding-error bound of coefficients per unit of the trace of an inverse correlation matrix and of the squared
+/// number of terms. It is far above the error of the elimination.
 const ELIMINATION_ERROR: f64 = 16.0 * f64::EPSILON;
 
 /// Value of 1 − B² at or below which û and v̂ are numerically collinear.
 const COLLINEARITY_TOLERANCE: f64 = 1e-12;
 
-/// Maximum remaining columns of a slice.
+/// Maximum number of remaining columns of a slice.
 pub(super) const MAX_REMAINING_COLUMNS: usize = 16;
 
 /// Constants shared by the boxes of all slices.
 pub(super) struct SearchConstants {
     pub(super) norm: Norm,
-    /// Whether candidates are ranked by their squared equation error.
+    /// True if candidates are ranked by their squared equation error.
     pub(super) ranks_equation_error: bool,
     /// Largest moduli of ⟨t, x⟩ and g‖t‖ over all unit columns, by group of test vectors.
     pub(super) max_moduli: Vec<[Wide; 2]>,
     /// Largest rounding-error bound of a unit column, by record.
     pub(super) rounding: Vec<f64>,
-    /// Norm of the output over all records, and its largest norm with the weights of the normal equations.
+    /// Norm of the output over all records.
     pub(super) size: f64,
     pub(super) weighted_size: f64,
     /// Ratio of the largest to the smallest inverse norm of the columns.
@@ -115,7 +116,7 @@ impl LinearApproximation {
     }
 }
 
-/// Coefficients of 1, s, t, st from the values at (−1, −1), (1, −1), (−1, 1), (1, 1).
+/// Coefficients of 1, s, t, st of the bilinear function with these values at (−1, −1), (1, −1), (−1, 1), (1, 1).
 #[inline(always)]
 fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
     [(a + b + c + d) / 4.0, ((b + d) - (a + c)) / 4.0, ((c + d) - (a + b)) / 4.0, ((a + d) - (b + c)) / 4.0]
@@ -125,26 +126,27 @@ fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
 pub(super) struct BoxQuantities {
     /// Row and value index of the corners.
     pub(super) at: [(usize, usize); 4],
-    /// One eighth of the squared side lengths.
+    /// One eighth of the squared length of each side.
     pub(super) wide: [f64; 2],
-    /// p and q at the corners, and their largest moduli over the box.
+    /// Coefficient p at the corners.
     pub(super) ps: [f64; 4],
     pub(super) qs: [f64; 4],
     pub(super) most: [f64; 2],
     /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions.
     pub(super) bilinear_deviation: [f64; 2],
-    /// Moduli of the coefficients of s and st in p, and of t and st in q. They bound the curvature of a product with a
-    /// linear function of s or t.
+    /// Sums of the moduli of the coefficients of s and st in p, and of t and st in q. They bound the curvature of a
+    /// product with a linear function of s or t.
     pub(super) mixed_slopes: [f64; 2],
-    /// Largest part of ‖y‖² explained by û and v̂, if the equation error ranks.
+    /// Largest part of ‖y‖² explained by û and v̂, if candidates are ranked by equation error.
     pub(super) explained: f64,
-    /// Sum of the moduli of output and coefficients, and the rounding-error bound of one coefficient.
+    /// Sum of the moduli of output and coefficients.
     pub(super) all: f64,
     pub(super) rounding: f64,
 }
 
 impl BoxQuantities {
-    /// Deviation from bilinear of p times the first plus q times the second quantity, both linear along their sides.
+    /// Deviation from a bilinear function of p times the first quantity plus q times the second, each linear along its
+    /// side.
     #[inline(always)]
     pub(super) fn remainder(&self, [a, b]: [LinearApproximation; 2]) -> f64 {
         let bent = self.mixed_slopes[0] * a.slope.abs() + self.mixed_slopes[1] * b.slope.abs();
@@ -157,22 +159,23 @@ impl BoxQuantities {
     }
 }
 
-/// Moduli of the remaining columns' coefficients at the corners of a box, and their deviation from bilinear.
+/// Moduli of the coefficients of the remaining columns at the corners of a box, and their deviation from bilinear
+/// functions.
 pub(super) struct Moduli {
     others: [[f64; 4]; MAX_REMAINING_COLUMNS],
     rests: [f64; MAX_REMAINING_COLUMNS],
-    /// Sum of the coefficients on the partner and on the own column of a side. Their moduli may cancel.
+    /// Sum at the corners of the coefficients on the partner and on the varying column of the output, which may cancel.
     sums: [f64; 4],
     sums_rest: f64,
 }
 
-/// Products of a group of test vectors at the corners of a box, with remainders.
+/// Products of a group of test vectors at the corners of a box, and their deviations from bilinear functions.
 pub(super) struct CornerValues {
-    /// ⟨t, w⟩ and the divisor ‖t‖(1 − Σ c g) at the corners: real and imaginary part of each.
+    /// Products ⟨t, w⟩ and denominators ‖t‖(1 − Σ c g) at the corners: real and imaginary part of each.
     pub(super) values: [[Wide; 4]; 4],
-    /// Slack of the divisor at the corners: Σ|c|‖Fᵀt − g t‖.
+    /// Slack Σ|c|‖Fᵀt − g t‖ of the denominator at the corners.
     pub(super) slack: [Wide; 4],
-    /// Deviation from bilinear of ⟨t, w⟩, and of divisor and slack together.
+    /// Deviations from bilinear functions of ⟨t, w⟩, and of denominator and slack together.
     pub(super) remainders: [Wide; 2],
 }
 
@@ -182,15 +185,15 @@ pub(super) struct SliceTables<'a> {
     pub(super) common: &'a SearchConstants,
     /// The order that changes from row to row, and the order along a row.
     pub(super) sides: [AxisTable; 2],
-    /// Index of the side that belongs to the output's own signal.
+    /// Index of the side whose order is that of an output term, if any.
     own: Option<usize>,
     /// Coefficients of the output on the remaining columns.
     pub(super) base_coefficients: Vec<f64>,
     /// Sum of squares of the output's residual after projection on the remaining columns.
     unexplained: f64,
-    /// ⟨t, y⟩ and ‖t‖ of that residual, by group.
+    /// Products ⟨t, y⟩ and ‖t‖ of that residual y, by group.
     base: Vec<VectorProducts>,
-    /// ‖Fᵀt − g t‖ of the remaining columns, k per group.
+    /// Norms ‖Fᵀt − g t‖ of the remaining columns, k per group.
     rests: Vec<Wide>,
 }
 
@@ -276,7 +279,7 @@ impl<'a> SliceTables<'a> {
         }
     }
 
-    /// Quantities shared by all candidates of a box. `None` if no bound can be proved.
+    /// Quantities shared by all candidates of a box. `None` if the box has no bound.
     #[inline(always)]
     pub(super) fn box_quantities(&self, strip: &RowCoefficients, [su, sv]: [Interval; 2]) -> Option<BoxQuantities> {
         let [u, v] = &self.sides;
@@ -402,7 +405,7 @@ impl<'a> SliceTables<'a> {
         sum
     }
 
-    /// Moduli of the remaining columns' coefficients over a box.
+    /// Moduli of the coefficients of the remaining columns over a box.
     #[inline(always)]
     pub(super) fn moduli(&self, [su, sv]: [Interval; 2], cell: &BoxQuantities) -> Moduli {
         let k = self.others.columns.len();
@@ -437,13 +440,14 @@ impl<'a> SliceTables<'a> {
         Moduli { others, rests, sums, sums_rest }
     }
 
-    /// The remaining column whose coefficient may cancel that of a side's own column.
+    /// Remaining column of the output, whose coefficient may cancel that of the varying column of the output.
     #[inline(always)]
     fn partner(&self) -> Option<usize> {
         self.others.partner.filter(|_| self.own.is_some())
     }
 
-    /// The partner, if its column and the own column together give a group of test vectors a tighter bound.
+    /// Remaining column of the output, if treating it together with the varying column gives a group of test vectors a
+    /// tighter bound.
     #[inline(always)]
     pub(super) fn joint_partner(
         &self,
@@ -570,7 +574,7 @@ fn eighth_of_square(length: usize) -> f64 {
     let length = to_f64(length);
     length * length / 8.0
 }
-/// Candidates of a row that are processed in parallel lanes.
+/// Number of candidates of a row that are processed in parallel lanes.
 const ROW_LANES: usize = 4;
 const LANE_OFFSETS: [f64; ROW_LANES] = [0.0, 1.0, 2.0, 3.0];
 
@@ -581,11 +585,11 @@ pub(super) struct RowCoefficients {
     pub(super) start: usize,
     /// Number of values in a row.
     pub(super) len: usize,
-    /// (p + q)/2, (p − q)/2 and 1 − B². All are 0 if 1 − B² is negligible or NaN.
+    /// Half sum (p + q)/2; 0 if 1 − B² is negligible or NaN, as are the next two.
     pub(super) plus: Vec<f64>,
     pub(super) minus: Vec<f64>,
     pub(super) independence: Vec<f64>,
-    /// B, and products with the remaining columns one after the other, of a row.
+    /// Product B = û·v̂ of the candidates of a row.
     pub(super) product: Vec<f64>,
 }
 
@@ -661,7 +665,7 @@ impl RowCoefficients {
     }
 }
 
-/// A count as a floating-point number.
+/// Convert a count to a floating-point number.
 #[inline(always)]
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn to_f64(n: usize) -> f64 {

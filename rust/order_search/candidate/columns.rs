@@ -1,4 +1,4 @@
-//! Regressors required by the candidates of a search, and columns that several candidates share in parallel lanes.
+//! Regressors that the candidates of a search require, and the columns of several candidates in parallel lanes.
 
 use std::collections::HashSet;
 
@@ -19,7 +19,7 @@ impl<'a> RequiredRegressors<'a> {
         Self { initial, index: Index::default(), alphas: HashSet::new(), orders: HashSet::new() }
     }
 
-    /// Add the initial terms that every structure of this α requires.
+    /// Add the initial terms that every structure with the highest order α requires.
     pub(crate) fn add_alpha(&mut self, alpha: f64) {
         if !self.alphas.insert(grains(alpha)) {
             return;
@@ -36,7 +36,7 @@ impl<'a> RequiredRegressors<'a> {
         }
     }
 
-    /// Add all regressors that a term of this order requires under this α.
+    /// Add all regressors that a term of this order requires in an equation of order α.
     pub(crate) fn add_term(&mut self, alpha: f64, signal: usize, order: f64) {
         if self.orders.insert((grains(alpha), signal, grains(order))) {
             self.index.insert(Key::integral(signal, alpha - order));
@@ -66,7 +66,7 @@ impl<'a> RequiredRegressors<'a> {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Columns<const L: usize> {
     pub(crate) at: [usize; L],
-    /// Whether all columns are equal, and whether they are consecutive.
+    /// True if all columns are equal.
     same: bool,
     consecutive: bool,
 }

@@ -14,7 +14,7 @@ use crate::series::Kernel;
 /// Cutoff of the low-pass filter for the initial coefficients, relative to the output's bandwidth.
 const START_BAND: f64 = 2.0;
 
-/// Spectra of one record that the refinement of every candidate reads.
+/// Spectra of one record for the refinement of all candidates.
 struct RecordSpectra {
     /// Spectrum of each column of the bank.
     columns: Vec<Kernel>,
@@ -30,8 +30,8 @@ pub(crate) struct Refiner {
 }
 
 impl Refiner {
-    /// Compute the spectra of the columns of `banks`, which belong to the records' noise-free signals. Unusable after a
-    /// stop request.
+    /// Compute the spectra of the columns of `banks`, which contain the noise-free signals of the records. The result
+    /// is invalid after a stop request.
     pub(crate) fn new(
         records: &[Record],
         output: usize,
@@ -60,7 +60,7 @@ impl Refiner {
     }
 
     /// Refine coefficients in place: those of the terms, then those of the initial terms by record. The result is
-    /// unusable after a stop request.
+    /// invalid after a stop request.
     pub(crate) fn refine(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),

@@ -1,4 +1,4 @@
-//! Coefficients and error of a single candidate.
+//! Computation of coefficients and error of one candidate.
 
 pub(crate) mod columns;
 mod instrumental_variables;

@@ -12,13 +12,13 @@ use crate::parallel::Stop;
 use crate::regressors::Bank;
 use crate::simd::Lanes;
 
-/// Normal equations over a bank's columns, weighted by the estimator and scaled to a unit diagonal.
+/// Normal equations of the columns of a bank, weighted by the estimator and scaled to a unit diagonal.
 pub(crate) struct Normal {
     width: usize,
-    /// Correlation matrix, row-major width × width; rows of columns that vanish are 0.
+    /// Correlation matrix, row-major width × width; rows of zero columns are 0.
     correlation: Vec<f64>,
     rhs: Vec<f64>,
-    /// Norm of each column, and its inverse or 0.
+    /// Norm of each column.
     size: Vec<f64>,
     inverse: Vec<f64>,
 }
@@ -69,7 +69,7 @@ impl Normal {
 /// Workspace for solving L candidates in parallel lanes.
 pub(crate) struct Solve<const L: usize> {
     gram: Vec<Lanes<L>>,
-    /// Right-hand side, then the scaled solution.
+    /// Right-hand side; after the solve, the scaled solution.
     rhs: Vec<Lanes<L>>,
     pub(crate) coefficients: Vec<Lanes<L>>,
     /// Coefficients of the initial terms, record by record.
@@ -82,12 +82,12 @@ impl<const L: usize> Solve<L> {
     }
 }
 
-/// Normal equations of all candidates: over all records for their terms, over each record for its initial terms.
+/// Normal equations of all candidates, summed over all records for the terms, and of each record for its initial terms.
 pub(crate) struct NormalEquations {
     terms: Normal,
     /// Equations of each record for its initial terms. Empty for zero initial conditions.
     record_equations: Vec<Normal>,
-    /// Coefficients by term, `None` for a free one, and the indices of the free terms.
+    /// Coefficients by term, `None` for a free coefficient.
     fixed: Vec<Option<f64>>,
     free: Vec<usize>,
 }
@@ -99,12 +99,12 @@ impl NormalEquations {
         Self { terms, record_equations, fixed: fixed.to_vec(), free }
     }
 
-    /// Equations over all records if no coefficient is fixed and there are no initial terms.
+    /// Normal equations over all records; None if a coefficient is fixed or there are initial terms.
     pub(crate) fn unconstrained_equations(&self) -> Option<&Normal> {
         (self.record_equations.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
     }
 
-    /// Coefficients by term, `None` for a free one.
+    /// Fixed coefficients by term, `None` for a free coefficient.
     pub(super) fn fixed_coefficients(&self) -> &[Option<f64>] {
         &self.fixed
     }
@@ -193,12 +193,12 @@ impl NormalEquations {
     }
 }
 
-/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major. Unusable after a stop request.
+/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major. Invalid after a stop request.
 pub(super) fn plain_gram(bank: &Bank, target: &[f64], stop: &Stop) -> Vec<f64> {
     dense::gram(bank.columns(), target, stop)
 }
 
-/// Apply multi-innovation weights to a Gram matrix: min(p, m − j) for row j of m.
+/// Apply multi-innovation weights to a Gram matrix: row j of m rows has the weight min(p, m − j).
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn apply_innovation_weights(
     gram: &mut [f64],
@@ -240,10 +240,9 @@ pub(crate) struct ResidualSumOfSquares {
     /// Diagonal of the Gram matrix, and its square roots.
     diagonal: Vec<f64>,
     norms: Vec<f64>,
-    /// Rounding-error bound of a squared sum, per unit of the squared sum of norms.
+    /// Rounding-error bound of a residual sum of squares, per unit of the squared sum of the norms of its columns.
     unit: f64,
-    /// Rounding-error bound of the minimum over all coefficients, and the smallest eigenvalue for which it holds. The
-    /// eigenvalue is that of the terms' correlation matrix (docs/mathematics.md).
+    /// Rounding-error bound of the minimal residual sum of squares over all coefficients.
     slack: f64,
     min_eigenvalue: f64,
 }
@@ -278,7 +277,7 @@ impl ResidualSumOfSquares {
         &self.gram[column * self.stride..(column + 1) * self.stride]
     }
 
-    /// One product.
+    /// Inner product of two columns.
     #[inline(always)]
     pub(super) fn product(&self, a: usize, b: usize) -> f64 {
         self.gram[a * self.stride + b]
@@ -296,7 +295,8 @@ impl ResidualSumOfSquares {
         &self.norms
     }
 
-    /// Rounding-error bound of a minimal squared sum, per unit of the squared sum of norms.
+    /// Rounding-error bound of a minimal residual sum of squares, per unit of the squared sum of the norms of its
+    /// columns.
     #[inline(always)]
     pub(super) fn slack(&self) -> f64 {
         self.slack
@@ -308,7 +308,7 @@ impl ResidualSumOfSquares {
         self.min_eigenvalue
     }
 
-    /// Lower bounds of the squared equation error of L candidates, including rounding, and its computed values.
+    /// Lower bounds, including rounding errors, and computed values of the squared equation error of L candidates.
     #[inline(always)]
     pub(crate) fn error<const L: usize>(
         &self,

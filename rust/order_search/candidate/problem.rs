@@ -22,9 +22,11 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::{self, LANE_COUNT};
 
-/// Cost of one simulation, in transforms. Building test vectors must cost a small fraction of all simulations.
+/// Cost of one simulation, in Fourier transforms. Test vectors are built only while they cost a small fraction of all
+/// simulations.
 const SIMULATION_COST_TRANSFORMS: u64 = 6;
-/// Cost of one refinement, in transforms: a few division steps and a dozen transforms each.
+/// Cost of one refinement of coefficients, in Fourier transforms: a few steps with a division and a dozen transforms
+/// each.
 const REFINEMENT_COST_TRANSFORMS: u64 = 100;
 
 /// Columns and coefficients of a candidate.
@@ -36,24 +38,25 @@ pub(crate) struct Problem {
     banks: Vec<Bank>,
     targets: Vec<Vec<f64>>,
     pub(crate) equations: NormalEquations,
-    /// Gram matrix without weights and prior, if the squared equation error ranks.
+    /// Gram matrix without weights and prior, if candidates are ranked by squared equation error.
     pub(crate) residual_sums: Option<ResidualSumOfSquares>,
-    /// Normal equations without weights and prior, if the squared equation error ranks coefficients that have them.
+    /// Normal equations without weights and prior. Present if the coefficients have weights or a prior and candidates
+    /// are ranked by squared equation error.
     least_squares: Option<Normal>,
     pub(crate) bound: Option<Bound>,
     /// Test vectors tailored to candidates of the search, if they are worthwhile.
     pub(crate) tailored_vectors: Option<TailoredVectors>,
-    /// Test for unstable zeros, and linearized test vectors, if candidates are bounded closely.
+    /// Test for unstable zeros, if close bounds are used.
     pub(crate) unstable_zeros: Option<UnstableZeros>,
     pub(crate) linearized_vectors: Option<LinearizedVectors>,
     refiner: Option<Refiner>,
-    /// Banks for the dual bound until it is built, if coefficients are refined.
+    /// Regressor banks for the dual bound if coefficients are refined; empty after the bound is built.
     bound_banks: Vec<Bank>,
     options: Options,
     samples: usize,
 }
 
-/// Kernel form of [`Bound::evaluate`].
+/// SIMD task of [`Bound::evaluate`].
 struct BoundKernel<'a, F> {
     bound: &'a Bound,
     limit: f64,
@@ -72,7 +75,7 @@ where
     }
 }
 
-/// Kernel form of [`Bound::proves_infeasible`].
+/// SIMD task of [`Bound::proves_infeasible`].
 struct InfeasibilityKernel<'a> {
     bound: &'a Bound,
     limit: f64,
@@ -92,7 +95,7 @@ impl simd::SimdKernel for InfeasibilityKernel<'_> {
     }
 }
 
-/// Kernel form of the exclusion by tailored test vectors.
+/// SIMD task of the exclusion by tailored test vectors.
 struct TailoredVectorKernel<'a> {
     adapted: &'a TailoredVectors,
     limit: f64,
@@ -110,7 +113,7 @@ impl simd::SimdKernel for TailoredVectorKernel<'_> {
     }
 }
 
-/// Kernel form of the exclusion by linearized test vectors.
+/// SIMD task of the exclusion by linearized test vectors.
 struct LinearizedVectorKernel<'a> {
     tangents: &'a LinearizedVectors,
     limit: f64,
@@ -128,7 +131,7 @@ impl simd::SimdKernel for LinearizedVectorKernel<'_> {
     }
 }
 
-/// Workspace of one thread.
+/// Workspace of one thread for the evaluation of candidates.
 pub(crate) struct Scratch {
     norm_cache: NormCache,
     lookup: VectorLookup,
@@ -136,10 +139,10 @@ pub(crate) struct Scratch {
     start: Vec<f64>,
     one: Solve<1>,
     simulation: BlockSimulation,
-    /// Coefficients of the last candidate's terms, and of its initial terms by record.
+    /// Coefficients of the terms of the last candidate.
     coefficients: Vec<f64>,
     weights: Vec<f64>,
-    /// Columns of the current candidate.
+    /// Columns of the terms of the current candidate.
     pub(crate) positions: Vec<usize>,
     pub(crate) initial: Vec<usize>,
 }
@@ -162,7 +165,7 @@ impl Default for Scratch {
 }
 
 impl Problem {
-    /// Build banks and Gram matrices for the regressors in `index`, whose memory has been budgeted.
+    /// Build banks and Gram matrices for the regressors in `index`. The caller has checked that the memory suffices.
     pub(crate) fn new(
         records: &[Record],
         output: usize,
@@ -265,8 +268,7 @@ impl Problem {
         })
     }
 
-    /// Build test vectors for about this many candidates, as far as they are worthwhile. Runs on the current thread
-    /// pool.
+    /// Build the test vectors that are worthwhile for about this many candidates. Runs on the current thread pool.
     pub(crate) fn with_bound(mut self, candidates: u64, stop: &Stop) -> Self {
         let banks = std::mem::take(&mut self.bound_banks);
         let (banks, transforms) = if self.refines() {
@@ -290,7 +292,7 @@ impl Problem {
         self
     }
 
-    /// Whether coefficients are refined after a first estimate.
+    /// True if coefficients are refined by instrumental variables after a first estimate.
     pub(crate) fn refines(&self) -> bool {
         self.refiner.is_some()
     }
@@ -306,7 +308,7 @@ impl Problem {
         adapted.fit(&self.banks, &self.targets, positions, &coefficients)
     }
 
-    /// Whether these test vectors exclude that candidate.
+    /// True if these test vectors exclude the candidate with these columns at this limit.
     pub(crate) fn excluded_by_tailored(&self, adapted: &TailoredVectors, positions: &[usize], limit: f64) -> bool {
         let Some(coefficients) = self.coefficients(positions) else { return false };
         let mut memory = NormCache::default();
@@ -358,9 +360,9 @@ impl Problem {
         bytes
     }
 
-    /// Normal equations whose solution bounds the errors of a box: those of the candidates' coefficients if simulation
-    /// ranks, and those of the smallest squared equation error if it ranks. `None` with fixed coefficients or initial
-    /// terms.
+    /// Normal equations for the error bound of a box. If candidates are ranked by simulation, they are the equations of
+    /// the coefficients of the candidates, otherwise those of the smallest squared equation error. `None` with fixed
+    /// coefficients or initial terms.
     pub(crate) fn box_equations(&self) -> Option<&Normal> {
         let own = self.equations.unconstrained_equations()?;
         Some(self.least_squares.as_ref().unwrap_or(own))
@@ -403,9 +405,9 @@ impl Problem {
         );
     }
 
-    /// Evaluate a structure given the positions of its terms. Its coefficients are stored in the scratch.
+    /// Evaluate a structure given the positions of its terms.
     ///
-    /// The flag `bounded` selects whether the dual bound, if there is one, is tried first.
+    /// Its coefficients are stored in `scratch`. If `bounded`, the dual bound is tried before the simulation.
     pub(crate) fn evaluate(
         &self,
         positions: &[usize],
@@ -493,7 +495,7 @@ impl Problem {
         Verdict::Score(raw)
     }
 
-    /// Score of a raw sum in the selected norm.
+    /// Score from a sum of absolute or squared errors, by the selected norm.
     pub(crate) fn score(&self, raw: f64) -> f64 {
         self.options.norm.score(raw, self.samples)
     }
@@ -508,7 +510,7 @@ impl Problem {
         }
     }
 
-    /// Evaluate a structure separately and return its verdict and row.
+    /// Evaluate a single structure; return its outcome and its table row.
     pub(crate) fn evaluate_structure(
         &self,
         structure: &Structure,

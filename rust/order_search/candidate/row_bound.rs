@@ -6,7 +6,7 @@ use crate::order_search::candidate::columns::{part_of, Columns};
 use crate::order_search::candidate::normal_equations::ResidualSumOfSquares;
 use crate::simd::Lanes;
 
-/// Maximum number of common terms, without the term that changes.
+/// Maximum number of common terms of a row, not counting the varying term.
 const MAX_COMMON_TERMS: usize = 7;
 
 /// Factor L D Lᵀ of the products of all common terms, and the target's residual after them.
@@ -14,22 +14,22 @@ pub(crate) struct CommonFactor<'a> {
     squares: &'a ResidualSumOfSquares,
     count: usize,
     columns: [usize; MAX_COMMON_TERMS],
-    /// Rows of L below its diagonal of ones, and D⁻¹.
+    /// Rows of L below its unit diagonal.
     lower: [[f64; MAX_COMMON_TERMS]; MAX_COMMON_TERMS],
     inverse: [f64; MAX_COMMON_TERMS],
-    /// Products with the target after L⁻¹, and the coefficients of the common terms alone.
+    /// Products of the terms with the target, multiplied by L⁻¹.
     values: [f64; MAX_COMMON_TERMS],
     common_coefficients: [f64; MAX_COMMON_TERMS],
     norms: [f64; MAX_COMMON_TERMS],
-    /// Sum of squares of the target's residual after the common terms.
+    /// Residual sum of squares of the target after the common terms.
     residual: f64,
-    /// Trace of the inverse of their correlation matrix, an upper bound of every inverse eigenvalue.
+    /// Trace of the inverse of the correlation matrix of the common terms, an upper bound of every inverse eigenvalue.
     trace: f64,
 }
 
 impl<'a> CommonFactor<'a> {
-    /// Factor the terms with these columns except one. `None` if they are too many, or so nearly dependent that nothing
-    /// can be proved.
+    /// Factor the terms with these columns except column number `but`. `None` if there are too many terms, or if they
+    /// are so nearly dependent that no bound holds.
     #[inline(always)]
     pub(crate) fn new(squares: &'a ResidualSumOfSquares, columns: &[usize], but: usize) -> Option<Self> {
         let count = columns.len().checked_sub(1).filter(|count| *count <= MAX_COMMON_TERMS)?;
@@ -92,8 +92,8 @@ impl<'a> CommonFactor<'a> {
         self.trace += sum * self.inverse[i];
     }
 
-    /// Append the positions in `columns` (ascending) whose candidates this bound does not exclude. Each column stands
-    /// for the term that changes.
+    /// Append the positions in `columns` (ascending) whose candidates this bound does not exclude. Each column is a
+    /// value of the varying term.
     #[inline(always)]
     pub(crate) fn append_open<const L: usize>(&self, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
         // Common sizes get loops of constant length.
@@ -125,7 +125,7 @@ impl<'a> CommonFactor<'a> {
         }
     }
 
-    /// Append the lanes, from this position on, that are not excluded.
+    /// Append the lanes from position `from` on whose candidates are not excluded.
     #[inline(always)]
     fn append_open_lanes<const L: usize>(
         &self,
@@ -142,7 +142,7 @@ impl<'a> CommonFactor<'a> {
         open.extend((from..from + lanes).zip(excluded).filter(|(_, excluded)| !excluded).map(|(at, _)| at));
     }
 
-    /// Whether no coefficients reduce the squared error of each of L candidates to the limit.
+    /// Flag of each of L candidates: true if no coefficients reduce its squared equation error to the limit.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangles of lanes, whose elements are told by their places
     fn exclusion_flags<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {

@@ -24,8 +24,8 @@ impl Default for BlockSimulation {
 impl BlockSimulation {
     /// Add the error of a simulation to a raw sum. Stops once the sum exceeds the limit or the caller requests a stop.
     ///
-    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`. A kernel is read only as far as
-    /// the division has advanced.
+    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`. Only the part of a kernel up to
+    /// the current block is read.
     #[allow(clippy::too_many_arguments)]
     pub(crate) fn accumulate_error<'a>(
         &mut self,
@@ -106,7 +106,7 @@ impl BlockSimulation {
     }
 }
 
-/// Σ c x over one block that starts at `lo`.
+/// Sum Σ c x of the weighted columns over the block that starts at `lo`.
 #[inline]
 fn combine<'a>(block: &mut [f64], lo: usize, columns: impl Iterator<Item = Weighted<'a>>) {
     block.fill(0.0);

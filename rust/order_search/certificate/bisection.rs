@@ -1,4 +1,4 @@
-//! Bisection of the cells of a region until no cell can contain an error far below the best one found.
+//! Bisection of the cells of a region until no cell can contain an error far below the smallest error found.
 
 use std::sync::atomic::Ordering;
 
@@ -12,15 +12,15 @@ use crate::order_search::control::Control;
 use crate::parallel::pool;
 use crate::regressors::Record;
 
-/// Cells that a task bounds, and cells whose bounds are held in memory at a time.
+/// Number of cells that a task bounds.
 const CELLS_PER_TASK: usize = 256;
 const CELLS_PER_PASS: usize = 1 << 16;
 /// Memory per cell while cells are bisected \[bytes\].
 const CELL_MEMORY_BYTES: u64 = 4 * size_of::<Cell>() as u64;
 
-/// Maximum evaluations of the local search from the best orders.
+/// Maximum number of evaluations of the local search from the best orders.
 const MAX_POLISH_EVALUATIONS: usize = 400;
-/// Midpoints per pass that are tried as new best orders.
+/// Number of midpoints per pass that are tried as new best orders.
 const MIDPOINTS_PER_PASS: usize = 4;
 
 /// Options of a certificate.
@@ -30,7 +30,7 @@ pub struct CertificateOptions {
     pub tolerance: f64,
     /// Largest sum of the terms' norms relative to the output: Σ ‖c x‖ ≤ `max_coefficient`·‖y‖.
     pub max_coefficient: f64,
-    /// Maximum number of cells. The bisection ends there with the bound proved so far.
+    /// Maximum number of cells. If it is reached, the bisection ends with the bound proved up to then.
     pub max_cells: u64,
     /// Number of threads.
     pub threads: usize,
@@ -41,8 +41,8 @@ pub struct CertificateOptions {
 /// Lower bound of the equation error over all orders of a region.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Certificate {
-    /// Lower bound of the root mean squared equation error, 0 if nothing is proved. It holds for all orders of the
-    /// region and all admissible coefficients.
+    /// Lower bound of the root mean squared equation error; 0 without a proof. It holds for all orders of the region
+    /// and all admissible coefficients.
     pub lower_bound: f64,
     /// Smallest root mean squared equation error found; infinite if none was found.
     pub best: f64,
@@ -62,8 +62,8 @@ pub struct Certificate {
 /// The result is bitwise identical for any number of threads.
 ///
 /// # Errors
-/// No region or one without orders, records without its signals, an option out of range, too many cells, too little
-/// memory, [`Error::Interrupted`].
+/// A region without orders, records without the signals of the region, an option out of range, too many cells, too
+/// little memory, [`Error::Interrupted`].
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -119,7 +119,7 @@ pub fn certify(
     })
 }
 
-/// Running bisection of the cells of a region.
+/// State of the bisection of the cells of a region.
 struct CellBisection<'a> {
     tables: GramTables,
     region: &'a Region,
@@ -198,7 +198,7 @@ impl CellBisection<'_> {
         Ok(cell_bounds)
     }
 
-    /// Update the best orders from those near the best midpoints of some cells.
+    /// Update the best orders by a local evaluation near the best midpoints of some cells.
     fn update_best(
         &self,
         records: &[Record],
@@ -218,7 +218,7 @@ impl CellBisection<'_> {
         Ok(())
     }
 
-    /// Bound of one cell. The subspace bound is added if the first one misses the goal.
+    /// Bound of one cell. The subspace bound is also computed if the first bound is below the goal.
     fn bound(&self, cell: &Cell, goal: f64) -> CellBound {
         let mut cell_bound = self.tables.local(cell).bound();
         if cell_bound.lower_bound.max(cell.inherited_bound) < goal {

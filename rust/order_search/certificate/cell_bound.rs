@@ -1,7 +1,7 @@
 //! Lower bound of the least squared equation error over a cell of orders.
 //!
-//! With X the columns at the midpoint, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the
-//! cell the columns are X + U. The part of U in the span of X is XA, the rest P is orthogonal to X. For any
+//! With X the columns at the midpoint, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the cell
+//! the columns are X + U. The part of U in the span of X is XA, and the remaining part P is orthogonal to X. For any
 //! coefficients c, with h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
 //!
 //!   ‖y − (X + U)c‖² = ‖e − Xh − Pc‖² ≥ ‖e‖² − 2τᵀh − 2(γ − Aᵀτ)ᵀc + ‖Xh‖².
@@ -20,7 +20,7 @@ use crate::regressors::Record;
 
 type Row = [f64; MAX_TERMS];
 
-/// Relative margin of B, and of the inverse matrices. It is far above their rounding error.
+/// Relative margin of B, far above its rounding error.
 const BOUND_MARGIN: f64 = 1e-6;
 const INVERSE_TOLERANCE: f64 = 1.0 / 16.0;
 
@@ -28,12 +28,12 @@ const INVERSE_TOLERANCE: f64 = 1.0 / 16.0;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellProducts {
     pub(super) k: usize,
-    /// x_i·x_j⁽ᵐ⁾, by m, then i, then j.
+    /// Products x_i·x_j⁽ᵐ⁾ of columns with derivatives of order m of columns, by m, then i, then j.
     pub(super) products: [[Row; MAX_TERMS]; EXPANSION_COLUMNS],
-    /// x_j⁽ᵐ⁾·y and ‖x_j⁽ᵐ⁾‖.
+    /// Products x_j⁽ᵐ⁾·y with the target.
     pub(super) target: [Row; EXPANSION_COLUMNS],
     pub(super) sizes: [Row; EXPANSION_COLUMNS],
-    /// Remainders of the expansions, and half widths of the cell.
+    /// Remainders of the expansions of the columns.
     pub(super) rests: Row,
     pub(super) halves: Row,
     /// Rounding-error bound of a product of two unit columns.
@@ -58,11 +58,11 @@ impl CellProducts {
 /// Bound of a cell, relative to the squared norm of the target.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellBound {
-    /// Lower bound of the relative squared residual of all orders in the cell, 0 if nothing is proved.
+    /// Lower bound of the relative squared residual of all orders in the cell; 0 without a proof.
     pub(super) lower_bound: f64,
     /// Relative squared residual at the midpoint, infinite if it cannot be computed.
     pub(super) midpoint_residual: f64,
-    /// Loss of the bound caused by the width of each order.
+    /// Decrease of the bound due to the width of the cell in each order.
     pub(super) costs: Row,
 }
 
@@ -164,7 +164,7 @@ fn inverse(mut matrix: [Row; MAX_TERMS], k: usize) -> Option<[Row; MAX_TERMS]> {
     Some(out)
 }
 
-/// A vector B with B > γ + Aᵀ(τ + B), which proves that I + A is regular. `None` if none is found.
+/// Vector B with B > γ + Aᵀ(τ + B), which proves that I + A is nonsingular. `None` if no such vector is found.
 fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
     let (mut matrix, mut right) = ([[0.0; MAX_TERMS]; MAX_TERMS], [0.0; MAX_TERMS]);
     for i in 0..k {
@@ -197,7 +197,7 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
     (0..k).all(proved).then_some(b)
 }
 
-/// Lower bounds of Σε² over a cell of orders, 0 if nothing is proved. ε is the equation error with zero initial
+/// Two lower bounds of Σε² over a cell of orders, 0 without a proof. ε is the equation error with zero initial
 /// conditions. `terms` lists (signal, midpoint, half width) of the orders of integration, one entry per term.
 ///
 /// The first bound holds for any coefficients. The second, optimized for `goal`, holds for coefficients whose terms sum
@@ -276,7 +276,7 @@ pub(super) fn expand_cell(
     Ok((local, span, square))
 }
 
-/// Raise an error for records and signals that cannot be certified.
+/// Return an error for records or signals to which certificates do not apply.
 pub(super) fn check_records(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
     let Some(first) = records.first() else {
         return Err(Error::Structure { what: "no record is given".into(), remedy: "give at least one run".into() });

@@ -1,6 +1,5 @@
-//! Gram tables of a certificate: region of orders, its cells, and the inner products at their midpoints.
-//!
-//! The products are computed once for all cells.
+//! Inner products for a certificate, computed once for the midpoints of all cells; also the region of orders and its
+//! cells.
 
 use std::collections::BTreeMap;
 
@@ -15,13 +14,14 @@ use crate::regressors::Record;
 
 /// Width of the largest cells. A bound over wider cells rarely proves anything.
 const MAX_CELL_WIDTH: f64 = 0.1;
-/// Maximum bisection levels of an interval: with tables, and in all. Deeper cells use the expansions of the tables.
+/// Maximum bisection level of an interval with tables of its own. Deeper cells, up to [`MAX_CELL_LEVEL`], use
+/// expansions about the midpoints of the tables.
 const MAX_TABLE_LEVEL: u8 = 3;
 pub(super) const MAX_CELL_LEVEL: u8 = 10;
 /// Pairs of derivatives with tabulated products, in the order of [`pair_position`].
 const DERIVATIVE_PAIRS: [(usize, usize); EXPANSION_COLUMNS * (EXPANSION_COLUMNS + 1) / 2] =
     [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)];
-/// Columns per task whose products with all others are computed.
+/// Number of columns per task whose products with all others are computed.
 const COLUMNS_PER_TASK: usize = 64;
 
 /// Cell of the bisection: level and position of each term's interval.
@@ -33,10 +33,11 @@ pub(super) struct Cell {
     pub(super) inherited_bound: f64,
 }
 
-/// Intervals of one signal's orders of integration by level: number of the first, and its node.
+/// Intervals of the integration orders of one signal, by level: number of the first interval, and index of its
+/// midpoint.
 type LevelIntervals = Vec<(usize, usize)>;
 
-/// Tables from which cells are bounded.
+/// Tables of inner products for the bounds of cells. A node is the midpoint of an interval of orders of one signal.
 pub(super) struct GramTables {
     /// Intervals and node of each term. A term of fixed order has a node and no intervals.
     terms: Vec<(Option<LevelIntervals>, usize)>,
@@ -46,14 +47,14 @@ pub(super) struct GramTables {
     pub(super) bytes: u64,
     nodes: usize,
     samples: usize,
-    /// x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ by [`DERIVATIVE_PAIRS`] of n and m, then j, then i, and x_j⁽ᵐ⁾·y by m, then j.
+    /// Products x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ of derivatives of columns, by [`DERIVATIVE_PAIRS`] of n and m, then j, then i.
     products: [Vec<f64>; DERIVATIVE_PAIRS.len()],
     target: [Vec<f64>; EXPANSION_COLUMNS],
     sizes: Vec<[f64; EXPANSION_COLUMNS]>,
     rests: Vec<f64>,
 }
 
-/// Relative distance at which orders touch an interval, above the rounding error.
+/// Relative distance from an interval up to which orders belong to it, above the rounding error.
 const TOUCHING_TOLERANCE: f64 = 1e-6;
 
 /// Position of n and m in [`DERIVATIVE_PAIRS`], n ≤ m.
@@ -65,7 +66,7 @@ fn pair_position(n: usize, m: usize) -> usize {
 #[derive(Debug, Clone, Copy, Default)]
 struct Middle {
     node: usize,
-    /// Powers of the distance divided by factorials.
+    /// Powers of the distance from the node, divided by factorials.
     off: [f64; EXPANSION_COLUMNS],
     half: f64,
 }
@@ -193,7 +194,7 @@ impl GramTables {
         self.terms[term].0.is_none()
     }
 
-    /// Interval of a term's order of integration in a cell.
+    /// Interval of the integration order of a term in a cell.
     pub(super) fn order_interval(&self, region: &Region, cell: &Cell, term: usize) -> (f64, f64) {
         if self.has_fixed_order(term) {
             let (_, fixed_order) = region.integrations(term);
@@ -234,7 +235,7 @@ impl GramTables {
         out
     }
 
-    /// Product of the nth derivative of one column with the mth of another, at nodes.
+    /// Product of the nth derivative of one column and the mth derivative of another column, at nodes.
     fn raw(&self, (i, n): (usize, usize), (j, m): (usize, usize)) -> f64 {
         if n <= m {
             self.products[pair_position(n, m)][j * self.nodes + i]
@@ -243,7 +244,7 @@ impl GramTables {
         }
     }
 
-    /// Same product at midpoints, from cubic expansions about the nodes.
+    /// Product of the nth and mth derivative of two columns at midpoints, from cubic expansions about the nodes.
     fn product(&self, a: &Middle, n: usize, b: &Middle, m: usize) -> f64 {
         let mut sum = 0.0;
         for p in n..EXPANSION_COLUMNS {
@@ -283,7 +284,7 @@ impl GramTables {
         local
     }
 
-    /// Subspace spanned by a cell's columns and their first derivatives.
+    /// Subspace spanned by the columns of a cell and their first derivatives.
     pub(super) fn span(&self, cell: &Cell) -> DerivativeSubspace {
         let middles = self.middle(cell);
         let mut span = DerivativeSubspace::new(self.samples);
@@ -311,7 +312,7 @@ pub struct Range {
     pub highest: f64,
 }
 
-/// Orders of one equation within given intervals.
+/// Region of orders of one equation: an interval for each order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Region {
     /// Output of the equation.
@@ -320,8 +321,8 @@ pub struct Region {
     pub alpha: (f64, f64),
     /// Intervals of the terms' orders, none above the order of the equation.
     pub terms: Vec<Range>,
-    /// Minimum distance of the output's orders from the equation's order, and of two orders of one signal. At distance
-    /// 0 every equation is satisfied, or two terms coincide.
+    /// Minimum distance of the orders of the output terms from the order of the equation, and of two orders of one
+    /// signal. At distance 0 the equation would be an identity, or two terms would coincide.
     pub min_separation: f64,
 }
 
