@@ -3,7 +3,7 @@
 //! A global thread pool hangs after a fork, so work runs on the pool of the current search, or serially if there
 //! is none.
 //!
-//! After a fork the child has one thread, and a lock that another thread held stays locked for good. Locks here are
+//! After a fork the child has one thread, and a lock that another thread held stays locked for good. These locks are
 //! tried for some microseconds, far longer than any thread holds them. Then the caller continues without the value.
 
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 
 /// Map `work` over the items, in parallel if a thread pool is installed.
 ///
-/// Results keep the order of the items. Each thread reuses its scratch. `work` must give the same result for any
+/// Results keep the order of the items. Each thread reuses its scratch memory. `work` must give the same result for any
 /// scratch, so that results do not depend on the number of threads.
 pub(crate) fn map<T, S, R>(
     items: Vec<T>,
@@ -65,7 +65,7 @@ pub fn pool(threads: usize) -> Result<rayon::ThreadPool> {
         .map_err(|e| Error::Threads { threads, why: e.to_string() })
 }
 
-/// One workspace per thread.
+/// Set of workspaces, one per thread.
 pub(crate) struct PerThread<T>(Vec<Mutex<T>>);
 
 impl<T: Default> PerThread<T> {
@@ -86,7 +86,7 @@ impl<T: Default> PerThread<T> {
     }
 }
 
-/// Attempts to take a lock, and how many of them spin before the thread yields.
+/// Maximum number of attempts to take a lock.
 const MAX_LOCK_ATTEMPTS: usize = 128;
 const SPIN_LOCK_ATTEMPTS: usize = 64;
 

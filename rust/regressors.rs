@@ -1,9 +1,9 @@
 //! Regressors of records: a bank of distinct columns I^η s, shared by all candidates, with filter transients as
 //! impulses.
 //!
-//! Filter transients are written as initial terms with the exponents −1, −2, …. They act on the sensor only, so they
-//! are added to the output of the equation. If the whole equation is filtered afterwards and its output is not measured
-//! through the filter, they enter the equation as inputs instead.
+//! Filter transients are written as initial terms with the exponents −1, −2, …. They affect only the sensor, so they
+//! are added to the output of the equation. If the whole equation is filtered and its output was not measured through
+//! the filter, they enter the equation as inputs instead.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -24,11 +24,11 @@ pub struct Record {
     signals: Vec<Vec<f64>>,
     filter: Option<Vec<f64>>,
     clean: Option<Vec<Vec<f64>>>,
-    /// Signals whose own sensor filter may have an initial transient. Empty if none has.
+    /// Signals whose own sensor filter may have an initial transient. Empty if there is no transient.
     filter_transients: Vec<bool>,
     /// Signals minus their initial level, if it is not zero. Empty if all levels are zero.
     deviations: Vec<Option<Vec<f64>>>,
-    /// Filter responses to an impulse and to its derivatives, if known more accurately than by pulses.
+    /// Filter responses to an impulse and its derivatives, if known more accurately than from the pulse grid.
     impulse_responses: Vec<Vec<f64>>,
 }
 
@@ -70,7 +70,7 @@ impl Record {
         })
     }
 
-    /// Record of the pulse means of sampled signals, one pulse a sampling interval.
+    /// Record of the pulse means of sampled signals, one pulse per sampling interval.
     ///
     /// # Errors
     /// As [`Record::new`] and [`pulse_means`].
@@ -93,7 +93,7 @@ impl Record {
     /// Add a low-noise substitute of every signal, for instrumental variables.
     ///
     /// # Errors
-    /// [`Error::Length`] for another number of substitutes than signals, and as [`Record::new`].
+    /// [`Error::Length`] for a wrong number of substitutes, and as [`Record::new`].
     pub fn with_clean(mut self, clean: Vec<PulseMeans>) -> Result<Self> {
         let clean: Vec<_> = clean.into_iter().map(PulseMeans::into_vec).collect();
         check_length("clean signals", self.signals.len(), clean.len())?;
@@ -159,16 +159,15 @@ impl Record {
 
     /// Record with nonzero initial conditions.
     ///
-    /// `transients` marks signals whose sensor filter may have an initial transient. `levels` are the initial levels of the
-    /// signals. `answers` are pulse means of the filter's responses to an impulse and to its derivatives, as far as
-    /// they are known.
+    /// `transients` marks signals whose sensor filter may have an initial transient. `levels` are the initial levels of
+    /// the signals. `answers` are pulse means of the known responses of the filter to an impulse and its derivatives.
     ///
-    /// An improper term differentiates the deviation of a signal from its level, so that the start of the record is not
-    /// seen as a jump. Initial terms describe the effect of earlier inputs.
+    /// An improper term differentiates the deviation of a signal from its level, so that the start of the record does
+    /// not act as a jump. Initial terms describe the effect of earlier inputs.
     ///
     /// # Errors
-    /// [`Error::Length`] for other numbers of flags or levels than signals, or responses of other lengths;
-    /// [`Error::NotFinite`] for a level or a response.
+    /// [`Error::Length`] for a wrong number of flags or levels, or responses of other lengths; [`Error::NotFinite`] for
+    /// a level or a response.
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -204,7 +203,8 @@ impl Record {
         self.deviations.get(index).and_then(Option::as_ref).unwrap_or(&self.signals[index])
     }
 
-    /// Signal of a term that is integrated by `eta`: its deviation from the initial level for `eta` below 0.
+    /// Pulse means of the signal of a term that is integrated by `eta`. For `eta` below 0 they are deviations from the
+    /// initial level.
     pub(crate) fn term_signal(&self, index: usize, eta: f64) -> &[f64] {
         if eta < 0.0 {
             self.deviation_signal(index)
@@ -263,7 +263,8 @@ impl Record {
         &self.signals[index]
     }
 
-    /// I^η of a signal, as [`Record::m`] pulse means; η in (−1, 10], below 0 its derivative. O(m log m).
+    /// Fractional integral I^η of a signal as [`Record::m`] pulse means, η in (−1, 10]. Below 0 it is a derivative. O(m
+    /// log m).
     ///
     /// # Panics
     /// If the signal does not exist.
@@ -309,7 +310,7 @@ impl Record {
         self.impulse_responses.get((-1.0 - exponent) as usize).cloned()
     }
 
-    /// Initial term as an input of a simulation ([`power_pulses`] if a filter smooths it).
+    /// Pulse means of an initial term as an input of a simulation ([`power_pulses`], or filtered means).
     pub(crate) fn forcing_term(&self, exponent: f64) -> Vec<f64> {
         match &self.filter {
             None => self.initial_term(exponent),
@@ -335,10 +336,10 @@ impl Record {
     }
 }
 
-/// Key of a column of a bank.
+/// Key of a column of a bank: a regressor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Key {
-    /// I^η of a signal, η as an integer multiple of the order resolution.
+    /// Integral I^η of a signal, η as an integer multiple of the order resolution.
     Integral {
         /// Signal of the record.
         signal: usize,
@@ -383,7 +384,7 @@ impl Index {
         })
     }
 
-    /// Position of a key.
+    /// Position of a key; None if it is absent.
     #[must_use]
     pub fn get(&self, key: Key) -> Option<usize> {
         self.positions.get(&key).copied()
@@ -407,12 +408,12 @@ pub struct Bank {
     m: usize,
     /// All columns, contiguous.
     columns: Vec<f64>,
-    /// Kernels of the output's own regressors, contiguous, and their index by column.
+    /// Kernels of the output columns, contiguous.
     kernels: Vec<f64>,
     own: Vec<Option<usize>>,
 }
 
-/// Columns of all signals at one order, and the kernel if the output is among them.
+/// Columns of all signals at one integration order, and the kernel if the output is among them.
 struct OrderColumns<'a> {
     order: i64,
     columns: Vec<(usize, &'a mut [f64])>,
@@ -443,8 +444,8 @@ impl OrderColumns<'_> {
 impl Bank {
     /// Compute every column. `output` is the signal whose kernels a simulation needs.
     ///
-    /// One transform a column, one more for each order and signal. O(columns · m log m) on the threads of the current
-    /// pool. Memory is 8·m bytes a column, twice that for the output's own.
+    /// O(columns · m log m) on the threads of the current pool: one transform per column, one more for each order and
+    /// signal. Memory is 8·m bytes per column, twice that for columns of the output.
     ///
     /// # Errors
     /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record does not have.
@@ -548,7 +549,7 @@ impl Bank {
         &self.columns[position * self.m..(position + 1) * self.m]
     }
 
-    /// Kernel of an own-output column, one value per pulse. Empty for any other column.
+    /// Kernel of an output column, one value per pulse. Empty for any other column.
     ///
     /// # Panics
     /// If the column does not exist.
@@ -575,7 +576,7 @@ pub(crate) fn is_impulse(exponent: f64) -> bool {
     exponent <= -1.0 && exponent.fract() == 0.0
 }
 
-/// Initial terms of the equations and impulses of the sensors, by equation.
+/// Split initial terms into terms of the equations and impulses of the sensors, each by equation.
 #[allow(clippy::type_complexity)]
 pub(crate) fn split_impulses(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
     powers.iter().map(|own| own.iter().partition(|(e, _)| !is_impulse(*e))).unzip()

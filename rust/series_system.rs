@@ -8,7 +8,7 @@ use crate::series::{self, Buffers, Kernel, SumOfProducts};
 
 /// Series system A y = b of equations. Their outputs are unknown, all other signals come from the record.
 ///
-/// Coefficients are not checked here, because an estimator's iterates may have any size. User input is checked before.
+/// Coefficients are not checked here, because iterates of an estimator may have any size.
 pub(crate) struct System<'a> {
     record: &'a Record,
     /// Whether the sensor filter of each output may have an initial transient.
@@ -116,11 +116,10 @@ impl<'a> System<'a> {
         (rhs, beside)
     }
 
-    /// Outputs if `bounded` accepts them, else those of the first damped copy that it accepts.
+    /// Outputs if `bounded` accepts them, else outputs of the first damped copy that it accepts.
     ///
-    /// The flag says whether the copy is damped ([`crate::simulate::respond_damped`] with decays of 4, 8, 16, … a
-    /// record). The damped inverse is the series of the inverse at ρz while it is finite. It is computed once, so a
-    /// copy costs only products.
+    /// The flag is true for a damped copy ([`crate::simulate::respond_damped`] with decays of 4, 8, 16, … a record). As
+    /// long as the inverse is finite, the damped inverse is its series at ρz, so a copy costs only products.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn respond_stabilized(
         &self,
@@ -210,9 +209,9 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Inverse of the matrix for unit responses by products.
+    /// Inverse of the matrix, from which unit responses follow by products.
     ///
-    /// None without units, or if the inverse grows so much that products would lose the digits of its first terms.
+    /// None without units, or if the inverse grows so much that products would lose digits of its first terms.
     fn invert_for_units(
         &self,
         solver: &mut series::Solver<'_>,
@@ -260,12 +259,12 @@ impl<'a> System<'a> {
     }
 }
 
-/// Inverse of a system's matrix, with and without the record's filter. Each right-hand side costs one product.
+/// Inverse of a system's matrix, with and without the filter of the record. Each right-hand side costs one product.
 struct InverseKernels<'s, 'a> {
     system: &'s System<'a>,
     inverse: Vec<Vec<Vec<f64>>>,
     kernels: Vec<Vec<Kernel>>,
-    /// By equation, response of every output to its error behind the record's filter, computed on demand.
+    /// Filtered response of every output to the error of each equation, by equation; computed when first needed.
     behind: Vec<Option<Vec<Kernel>>>,
     buffers: Buffers,
 }
@@ -313,10 +312,10 @@ fn damp_series(decay: f64, series: &[f64]) -> Vec<f64> {
     series.iter().enumerate().map(|(k, a)| a * libm::exp(-decay * k as f64)).collect()
 }
 
-/// Most pulses of a signal that a product sums directly. Longer signals are transformed.
+/// Maximum number of pulses of a signal that a product sums directly. Longer signals are transformed.
 const MAX_DIRECT_PULSES: usize = 64;
 
-/// Whether the second half of a series is so large that a transform loses the digits of the first half.
+/// True if the second half of a series is so large that a transform loses the digits of the first half.
 fn exceeds_growth_limit(series: &[f64]) -> bool {
     let largest = |part: &[f64]| part.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     let (first, second) = series.split_at(series.len() / 2);
@@ -324,6 +323,6 @@ fn exceeds_growth_limit(series: &[f64]) -> bool {
     !(second <= MAX_SERIES_GROWTH * first && first.is_finite())
 }
 
-/// Largest ratio of the second half to the first. A transform's rounding, 1e−12 of its largest value, then costs half
-/// of the digits.
+/// Largest ratio of the second half to the first. The rounding error of a transform, 1e−12 of its largest value, then
+/// affects half of the digits.
 const MAX_SERIES_GROWTH: f64 = 1e3;

@@ -1,7 +1,7 @@
 //! SIMD kernels with instructions chosen at run time. The only user of `pulp`.
 //!
-//! Kernels are plain loops over arrays of [`LANE_COUNT`] values that are inlined into [`dispatch_simd`], where
-//! the compiler may use the widest instructions of this machine. Multiply-adds are not fused and sums are not
+//! Kernels are loops over arrays of [`LANE_COUNT`] values. They are inlined into [`dispatch_simd`], so that the
+//! compiler uses the widest vector instructions of this processor. Multiply-adds are not fused and sums are not
 //! reordered, so a kernel gives the same bits inside and outside [`dispatch_simd`].
 
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,10 +11,10 @@ use pulp::{Arch, Simd, WithSimd};
 /// Number of values that a kernel processes side by side.
 pub const LANE_COUNT: usize = 8;
 
-/// One value of each of several computations that run side by side.
+/// Vector of one value for each of L parallel computations.
 pub type Lanes<const L: usize> = [f64; L];
 
-/// SimdKernel for [`dispatch_simd`].
+/// Task that [`dispatch_simd`] runs with vector instructions.
 ///
 /// `run` and the functions in its inner loops must be `#[inline(always)]`: code that is not inlined is compiled for the
 /// oldest machine.

@@ -25,17 +25,17 @@ pub struct Response {
 pub struct OutputFilter<'a> {
     /// The filter as a series.
     pub series: &'a [f64],
-    /// Flag of each equation.
+    /// Flag of each equation: true if the filter applies to its output.
     pub applies: &'a [bool],
 }
 
 /// Simulation (free run: only inputs and initial conditions are used): pulse means of the outputs.
 ///
-/// A single equation takes other outputs from the record (measured coupling). All equations of a joint together take
-/// only the currents. `initial` has (exponent, coefficient) pairs per equation, empty for zero initial conditions.
-/// Integer exponents below 0 are impulses. They are added to the output if only its sensor receives them: if the record
-/// is not filtered, or if the output has a filter transient ([`Record::with_initial_state`]). An unstable model may
-/// overflow, so that values are not finite. O(n² m log² m).
+/// Signals that are not outputs of `equations` are taken from the record: a single equation uses other measured outputs
+/// (measured coupling), a complete system only the inputs. `initial` has (exponent, coefficient) pairs per equation,
+/// empty for zero initial conditions. Integer exponents below 0 are impulses. They are added to the output if they act
+/// on its sensor only: if the record is not filtered, or if the output has a filter transient
+/// ([`Record::with_initial_state`]). An unstable model may overflow, so that values are not finite. O(n² m log² m).
 ///
 /// # Errors
 /// Invalid orders or signals, missing or nonfinite coefficients, [`Error::LeadingZero`] if the outputs cannot be solved
@@ -59,7 +59,7 @@ pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64
     build_system(equations, record, initial)?.respond(initial)
 }
 
-/// System of user-defined equations. Return an error for invalid ones.
+/// Build the system of given equations. Return an error for invalid equations.
 fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, f64)>]) -> Result<System<'a>> {
     for equation in equations {
         equation.check(record.len())?;
@@ -80,7 +80,7 @@ fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(
 
 /// Response of a damped copy of the equations: output series at ρz, ρ = e^{−decay}.
 ///
-/// A large enough decay [1/pulse] makes every model stable. Instruments must be free of noise, not exact.
+/// A large enough decay [1/pulse] makes every model stable. Instruments need to be free of noise, but not exact.
 ///
 /// # Errors
 /// As [`respond`].
@@ -104,9 +104,9 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 
 /// Response of every output to a unit of each initial term, all other inputs zero.
 ///
-/// `[k][j]` are the pulse means of output j for the k-th pair of an equation and an exponent of t. One division serves
-/// all, O(n³ m log² m), then a product each. Strongly growing responses are divided one by one, which preserves the
-/// digits of their first terms.
+/// `[k][j]` are the pulse means of output j for the k-th pair of an equation and an exponent of t. All responses need
+/// one division, O(n³ m log² m), and one product each. Strongly growing responses are divided one by one, which
+/// preserves the digits of their first terms.
 ///
 /// # Errors
 /// [`Error::Structure`] for an equation that does not exist, and as [`respond`].
@@ -160,7 +160,7 @@ fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f6
     Ok(initial)
 }
 
-/// Response with the initial terms that fit the measured outputs best.
+/// Simulate with the initial terms that fit the measured outputs best.
 ///
 /// The response is linear in the initial terms. They follow by least squares on the output error, each output weighted
 /// by 1/σ of its measurement, and apply to this record only.
@@ -236,7 +236,7 @@ fn weight(y: &[f64]) -> f64 {
     }
 }
 
-/// Equation error ε = y − Σ c_k I^{α−ν_k} s_k − initial terms, with measured y on the right-hand side.
+/// Equation error ε = y − Σ c_k I^{α−ν_k} s_k − initial terms, with measured signals s.
 ///
 /// Initial terms are fitted by least squares at the given coefficients.
 ///
@@ -394,7 +394,8 @@ pub fn nyquist_margin(own_terms: &[(f64, f64)], step: f64) -> f64 {
         .sum::<f64>()
 }
 
-/// A(η) by the functional equation of ζ: A = 4(1 − 2^{s+1})·2^{−s}π^{−s−1}·sin(−πs/2)·Γ(1+s)·ζ(1+s), s = η + 1.
+/// Abel sum A(η) of [`nyquist_margin`] by the functional equation of ζ: A = 4(1 −
+/// 2^{s+1})·2^{−s}π^{−s−1}·sin(−πs/2)·Γ(1+s)·ζ(1+s), s = η + 1.
 fn alternating_sum(eta: f64) -> f64 {
     use std::f64::consts::PI;
     let s = eta + 1.0;
@@ -403,7 +404,7 @@ fn alternating_sum(eta: f64) -> f64 {
     4.0 * (1.0 - libm::exp2(s + 1.0)) * zeta
 }
 
-/// ζ(x), x > 1, by Euler–Maclaurin after 16 terms.
+/// Riemann zeta function ζ(x), x > 1, by 16 terms and Euler–Maclaurin summation.
 fn zeta(x: f64) -> f64 {
     const TERMS: f64 = 16.0;
     let mut sum = 0.0;

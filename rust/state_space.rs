@@ -10,7 +10,7 @@
 //! φ₁(z) = (e^z − 1)/z, φ₂(z) = (e^z − 1 − z)/z²,
 //!
 //! where the second input term exists for a linear input only. The recursion advances w by e^{hA} − I, and squaring
-//! computes this difference rather than e^{hA}. Slow modes keep their digits beside fast ones, and at short steps
+//! computes this difference rather than e^{hA}. Slow modes keep their digits beside fast modes and at short steps
 //! (Higham, *Functions of Matrices*, 2008, sections 10.3 and 10.7).
 
 use std::borrow::Cow;
@@ -26,7 +26,7 @@ use crate::signal::block_pulse::{delay_samples, delayed_row, Intersample};
 pub struct InputSignal {
     /// Index of the signal in the equations.
     pub signal: usize,
-    /// Samples, one a row of the record.
+    /// Samples, one per row of the record.
     pub samples: Vec<f64>,
     /// Inter-sample behavior. A linear signal is delayed at its samples and then linear between them.
     pub between: Intersample,
@@ -36,20 +36,20 @@ pub struct InputSignal {
     pub before: f64,
 }
 
-/// Largest number of states. A step costs its square.
+/// Largest number n of states. A step costs O(n²).
 const MAX_STATES: usize = 128;
-/// Largest condition of the direct terms. Beyond it a cancellation decides the orders of the equations.
+/// Largest condition number of the matrix of direct terms. Above it the orders of the system depend on a cancellation.
 const MAX_CONDITION: f64 = 1e10;
-/// Delays this close to a whole number of sampling intervals, relative to the larger of 1 and their number, are whole.
+/// Tolerance at which a delay d in sampling intervals counts as an integer, relative to max(1, d).
 const DELAY_TOLERANCE: f64 = 1e-9;
-/// Rows between two checks for a stop, with their input terms computed together.
+/// Number of rows that are computed together between two checks for a stop request.
 const BLOCK_ROWS: usize = 1 << 10;
-/// States below this are 0 from the next block on, because arithmetic below 1e−308 is slow.
+/// Magnitude below which a state is set to 0 at the next block, because arithmetic below 1e−308 is slow.
 const SMALLEST_STATE: f64 = 1e-290;
-/// Terms of the Taylor series of φ₂ for a norm of at most 1/2.
+/// Number of terms of the Taylor series of φ₂ for a norm of at most 1/2.
 const TAYLOR_TERMS: i32 = 15;
 
-/// Samples of the outputs of equations with integer orders, a row of `rows` samples for each equation, joined.
+/// Samples of the outputs of equations with integer orders, concatenated: `rows` samples for each equation.
 ///
 /// The outputs are simulated together, and a signal that is neither output nor input is zero. A sample is the value
 /// just after the inputs of its row have changed. `initial` has (exponent, coefficient) pairs per equation, empty for
@@ -102,7 +102,7 @@ pub fn respond(
     recursion.run(model.start, rows, stop).map(Some)
 }
 
-/// Integer from an order or an exponent; one above [`MAX_STATES`] is one more than that.
+/// Convert an order or exponent to an integer; values above [`MAX_STATES`] become [`MAX_STATES`] + 1.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 fn integer(order: f64) -> Result<usize> {
     let nearest = order.round();
@@ -119,17 +119,17 @@ fn integer(order: f64) -> Result<usize> {
 struct Realization {
     states: usize,
     outputs: usize,
-    /// h A.
+    /// System matrix h A.
     system: Vec<f64>,
-    /// (h B, D) of each input.
+    /// Input gains (h B, D) of each input.
     drives: Vec<(Vec<f64>, Vec<f64>)>,
-    /// C, a row for each output.
+    /// Output matrix C, a row for each output.
     read: Vec<f64>,
     start: Vec<f64>,
 }
 
 impl Realization {
-    /// Model of equations, balanced. None if the direct terms are singular, or for too many states.
+    /// Balanced state-space model of equations; None if the direct terms are singular, or for too many states.
     fn new(
         equations: &[Equation],
         inputs: &[InputSignal],
@@ -281,7 +281,7 @@ impl Realization {
     }
 }
 
-/// e^M − I, φ₁(M) and φ₂(M) of a row-major n × n matrix.
+/// Matrix functions e^M − I, φ₁(M) and φ₂(M) of an n × n matrix, row-major.
 pub(crate) struct Transition {
     pub(crate) growth: Vec<f64>,
     first: Vec<f64>,
@@ -325,14 +325,15 @@ impl Transition {
     }
 }
 
-/// e^M of a row-major n × n matrix; None if it overflows.
+/// Matrix exponential e^M of a row-major n × n matrix; None if it overflows.
 pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
     let mut growth = Transition::new(matrix, n, 1.0)?.growth;
     growth.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
     Some(growth)
 }
 
-/// Gains of an input on the states after one interval: of its value at the interval and of the next one.
+/// Gains on the states after one interval: of the value of an input at the start of the interval, and of its next
+/// value.
 pub(crate) struct InputGains {
     pub(crate) now: Vec<f64>,
     pub(crate) later: Vec<f64>,
@@ -369,10 +370,10 @@ impl InputGains {
 /// Input of a recursion.
 struct Channel<'a> {
     samples: Cow<'a, [f64]>,
-    /// Rows by which the samples are late, and the value before them.
+    /// Number of rows by which the samples are delayed.
     lag: isize,
     before: f64,
-    /// Gains of a row's own value and of the next row's value on the next state.
+    /// Gains of the value in a row on the next state.
     now: Vec<f64>,
     later: Vec<f64>,
     /// Direct gain on each output.
@@ -383,7 +384,7 @@ struct Channel<'a> {
 struct Recursion<'a> {
     states: usize,
     outputs: usize,
-    /// e^{hA} − I, column-major.
+    /// Transition matrix e^{hA} minus I, column-major.
     growth: Vec<f64>,
     read: Vec<f64>,
     channels: Vec<Channel<'a>>,
@@ -434,7 +435,8 @@ impl Recursion<'_> {
 }
 
 impl Channel<'_> {
-    /// Read the values that act in the rows from `begin` on; the last sample holds beyond the record.
+    /// Write the values of the input in the rows from `begin` on to `values`. The last sample is held beyond the
+    /// record.
     fn read(&self, begin: usize, values: &mut [f64]) {
         let last_value = self.samples.last().copied().unwrap_or(0.0);
         let early = (0..values.len()).take_while(|row| delayed_row(begin + row, self.lag).is_none()).count();
@@ -468,7 +470,8 @@ fn add_outputs(n: usize, gains: &[f64], history: &[f64], samples: &mut [f64]) {
     }
 }
 
-/// Advance the state by one block of rows; the forcing of each row is replaced by the state before its step.
+/// Advance the state by one block of rows; `history` contains the forcing of each row, which is replaced by the state
+/// at that row.
 #[inline(always)]
 fn advance(n: usize, growth: &[f64], state: &mut [f64], history: &mut [f64]) {
     let (growth, state) = (&growth[..n * n], &mut state[..n]);
@@ -494,7 +497,7 @@ mod tests {
     use crate::parallel::Stop;
     use crate::signal::block_pulse::Intersample;
 
-    /// e^{−λh} − I, φ₁ and φ₂ of the chain of two poles, from its partial fractions.
+    /// Exact e^M − I, φ₁ and φ₂ of a chain of two real poles, from partial fractions.
     fn two_poles(fast: f64, slow: f64) -> [f64; 3] {
         // Element (1, 1) of a function of [[−(f + s), f], [−s, 0]] with the eigenvalues −f and −s.
         let of = |z: fn(f64) -> f64| (-slow * z(-fast) + fast * z(-slow)) / (fast - slow);

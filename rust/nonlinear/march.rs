@@ -7,7 +7,7 @@
 //! the last pulse solve it. Sensitivities obey the same sums, linearized at the simulation, and need no iteration.
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
-use super::contact::{BodyDerivatives, BodyMotion, ContactOperators, BodyState, PulseEquations};
+use super::contact::{BodyDerivatives, BodyMotion, BodyState, ContactOperators, PulseEquations};
 use super::convolution::{average_neighbors, product, ConvolutionKernel, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
 use super::initial_state::{derivative_powers, power_term_means, EndVelocityForcing, Link};
 use super::system::{NonlinearSystem, MIN_INTEGRATION_ORDER};

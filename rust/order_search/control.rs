@@ -17,9 +17,9 @@ pub struct Control {
     pub finished_count: AtomicU64,
     /// Total number of candidates, once known.
     pub total: AtomicU64,
-    /// Number of processed candidates whose evaluation ended before the end of the record.
+    /// Number of processed candidates whose evaluation was stopped early.
     pub pruned: AtomicU64,
-    /// Set by a caller that takes checkpoints.
+    /// True if the caller takes checkpoints.
     pub saving: AtomicBool,
     /// Latest checkpoint not yet taken by the caller.
     pub checkpoint: Mutex<Option<Checkpoint>>,
@@ -80,13 +80,13 @@ impl BatchPosition {
         Self { batch, evaluated_count: 0, end: 0, size: 0, limit: f64::INFINITY, order: 0 }
     }
 
-    /// Whether the position is consistent.
+    /// True if the fields of the position are consistent.
     pub(crate) fn is_valid(&self) -> bool {
         let has_begun = self.end == 0 || (self.size > 0 && self.limit >= 0.0);
         has_begun && self.evaluated_count <= self.end
     }
 
-    /// Whether the position is before a batch, or in one with enough open candidates and this digest.
+    /// True if the position is before a batch, or in a batch with this digest and at least as many open candidates.
     pub(crate) fn fits(&self, open: u64, order: u64) -> bool {
         self.end == 0 || (self.end <= open && self.order == order)
     }
@@ -97,7 +97,7 @@ impl BatchPosition {
 pub struct Checkpoint {
     /// Position of the checkpoint.
     pub place: BatchPosition,
-    /// Whether this is the first checkpoint since the range was started. It then replaces any earlier result.
+    /// True if this is the first checkpoint of this evaluation of the range. It then replaces any earlier result.
     pub replaces_previous: bool,
     /// Partial result so far. A checkpoint that is taken holds only the rows found since the previous one. A checkpoint
     /// to resume from must hold all rows.

@@ -1,6 +1,6 @@
 //! Output errors of given candidates, each with its own orders and coefficients.
 //!
-//! A genetic algorithm evaluates its population this way.
+//! The genetic algorithm uses it for its population.
 
 use std::collections::HashMap;
 
@@ -38,7 +38,7 @@ pub struct Points {
     inputs: Vec<bool>,
     norm: Norm,
     samples: usize,
-    /// Cache by record: the kernel of an own-output term, the integral of any other signal.
+    /// Cache by record: the kernel of a term of the output, the integral of any other signal.
     cache: HashMap<Key, Vec<Vec<f64>>>,
 }
 
@@ -77,9 +77,9 @@ impl Points {
 
     /// Output error of every candidate, summed over the records: Σ|e|, or RMSE.
     ///
-    /// Infinite for orders that form no equation, for an order above that of the output, and for a simulation that
-    /// diverges. Also infinite for an error above `limit`, whose evaluation stops early. The result is bitwise
-    /// identical for any number of threads.
+    /// The error is infinite for invalid orders, for an order above that of the equation, for a simulation that
+    /// diverges, and for an error above `limit`, whose evaluation stops early. The result is bitwise identical for any
+    /// number of threads.
     ///
     /// # Errors
     /// A candidate of another length, coefficients that are not finite, threads that do not start,
@@ -209,7 +209,8 @@ impl Points {
     }
 }
 
-/// L1 output error of one candidate on one record by naive division: the oracle of [`Points::scores`]. O(m²).
+/// L1 output error of one candidate on one record by naive division, a reference for tests of [`Points::scores`].
+/// O(m²).
 ///
 /// # Panics
 /// If the record lacks a signal.

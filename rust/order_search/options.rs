@@ -1,9 +1,9 @@
 //! Options of an order search: criterion, norm, estimator, pruning and memory budget.
 //!
-//! The budget counts memory that grows with records and order grid: columns, kernels, their products, spectra and
-//! test vectors of every equation and record, and the rows of the layout of an order law. Tables of boxes and
-//! tailored test vectors use the remaining memory, or are not built. The records themselves and the workspace of each
-//! thread, some vectors of the record's length, are not counted.
+//! The budget counts memory that grows with records and order grid: columns, kernels, their products, spectra and test
+//! vectors of every equation and record, and the rows of the join of coupled equations. Tables of boxes and tailored
+//! test vectors use the remaining memory, or are not built. The records themselves and the workspace of each thread,
+//! some vectors of the record's length, are not counted.
 
 use crate::equation::Initial;
 use crate::error::{check_finite, Error, Result};
@@ -18,16 +18,16 @@ use crate::simd::LANE_COUNT;
 pub enum Criterion {
     /// Output error e = y − ŷ, ŷ the simulated output.
     OutputError,
-    /// Equation error ε = y − Σ c I^{α−ν} s, with measured signals on the right-hand side.
+    /// Equation error ε = y − Σ c I^{α−ν} s with measured signals s.
     EquationError,
 }
 
 /// Norm of an error over all samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Norm {
-    /// Σ|e| (equation (45) of the paper).
+    /// Sum of absolute errors Σ|e| (equation (45) of the paper).
     L1,
-    /// √(Σe²/M) (equation (46) of the paper).
+    /// Root mean square √(Σe²/M) (equation (46) of the paper).
     L2,
 }
 
@@ -57,7 +57,7 @@ impl Norm {
     }
 }
 
-/// Sum over pairs of values in [`LANE_COUNT`] partial sums, which do not wait for each other.
+/// Sum over pairs of values in [`LANE_COUNT`] independent partial sums.
 #[inline(always)]
 fn sum_side_by_side(a: &[f64], b: &[f64], term: impl Fn(f64, f64) -> f64) -> f64 {
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANE_COUNT>(), b.as_chunks::<LANE_COUNT>());
@@ -99,10 +99,10 @@ pub struct Options {
     pub top: usize,
     /// Number of threads, 1 to `MAX_THREADS`. The result is bitwise identical for any number.
     pub threads: usize,
-    /// Whether to stop evaluating a candidate once its bound or partial sum excludes it. `false` evaluates all
-    /// candidates completely and serves as oracle.
+    /// True to stop the evaluation of a candidate once its bound or partial sum excludes it. `false` evaluates all
+    /// candidates completely, as a reference for tests.
     pub pruning: bool,
-    /// Memory of regressors, their products, test vectors and the layout of an order law \[bytes\].
+    /// Limit \[bytes\] of the memory for regressors, their products, test vectors and the join of coupled equations.
     pub memory: u64,
 }
 
@@ -158,7 +158,7 @@ impl Options {
         Ok(())
     }
 
-    /// Whether coefficients are refined individually after an initial estimate.
+    /// True if the coefficients of each candidate are refined after an initial estimate.
     pub(crate) fn refines(&self) -> bool {
         matches!(self.estimator, Estimator::InstrumentalVariables(_))
     }
@@ -194,7 +194,7 @@ fn out_of_range(name: &str, value: f64, range: &str, remedy: &str) -> Error {
 
 const BYTES_PER_VALUE: u128 = size_of::<f64>() as u128;
 
-/// Sum of the memory needed.
+/// Total memory that a search needs.
 #[derive(Debug, Default)]
 pub(crate) struct Budget {
     bytes: u128,
@@ -203,7 +203,7 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// Add the rows of a layout \[bytes\].
+    /// Add the memory of the rows of a join \[bytes\].
     pub(crate) fn add_layout(&mut self, bytes: u128) {
         self.layout += bytes;
         self.bytes += bytes;

@@ -1,16 +1,16 @@
-//! Verdicts of candidates, rows of the result table, and counts of candidates by outcome.
+//! Outcomes of candidates, rows of the result table, and counts of candidates by outcome.
 
 use crate::order_search::options::Norm;
 
-/// Maximum failures listed individually. The others are only counted.
+/// Maximum number of failures that are listed. Further failures are only counted.
 pub(crate) const MAX_LISTED_FAILURES: usize = 100;
 
 /// Reason why a candidate has no score.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Failure {
-    /// Its regressors are linearly dependent to working precision.
+    /// Regressors are linearly dependent to working precision.
     Singular,
-    /// Its simulated output overflows.
+    /// Simulated output overflows.
     Diverged,
 }
 
@@ -21,9 +21,9 @@ pub enum Verdict {
     Score(f64),
     /// Lower bound above the limit, without simulation.
     Bounded(f64),
-    /// Early stop at this partial sum, above the limit.
+    /// Partial sum above the limit at which the evaluation was stopped.
     Stopped(f64),
-    /// No score.
+    /// No score, for this reason.
     Failed(Failure),
 }
 
@@ -109,7 +109,7 @@ impl Part {
         self.failures.truncate(MAX_LISTED_FAILURES);
     }
 
-    /// Index and raw score of each row, as later batches need them.
+    /// Index and raw score of each row, which later batches use as thresholds.
     #[must_use]
     pub fn seed(&self) -> Vec<(u64, f64)> {
         self.rows.iter().map(|row| (row.index, row.score)).collect()
@@ -152,7 +152,7 @@ impl Counts {
     }
 }
 
-/// The best `keep` rows, ties by index.
+/// Keep the best `keep` rows, ties by index.
 fn trim(rows: &mut Vec<Row>, keep: usize) {
     rows.sort_by(|a, b| a.score.total_cmp(&b.score).then(a.index.cmp(&b.index)));
     rows.truncate(keep);
@@ -171,7 +171,7 @@ impl TopRows {
         Self { rows: Vec::new(), keep, limit }
     }
 
-    /// Insert rows and drop those beyond the best.
+    /// Insert rows, and drop rows that are not among the best.
     pub(crate) fn insert_rows(&mut self, rows: impl Iterator<Item = Row>) {
         self.rows.extend(rows);
         trim(&mut self.rows, self.keep);

@@ -24,8 +24,8 @@ pub(crate) fn sort_by_guess(open: &mut [OpenCandidate]) {
     open.sort_unstable_by(|a, b| a.guess.total_cmp(&b.guess).then(a.index.cmp(&b.index)));
 }
 
-/// Screen candidates `lo … hi − 1` against a limit. Return the open and the singular ones. Compiled for the widest
-/// vector instructions available.
+/// Screen candidates `lo … hi − 1` against a limit. Return the candidates that are not excluded, and the singular ones.
+/// It is compiled for the widest vector instructions available.
 pub(crate) fn screen(catalogue: &CandidateIndex<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<OpenCandidate>, Vec<u64>) {
     simd::dispatch_simd(Screening { catalogue, lo, hi, limit })
 }
@@ -77,14 +77,14 @@ impl simd::SimdKernel for Screening<'_> {
     }
 }
 
-/// Context of the row bound, which precedes other bounds if the squared equation error ranks.
+/// Context of the row bound, which precedes other bounds if candidates are ranked by squared equation error.
 struct RowBoundContext<'a> {
     squares: &'a ResidualSumOfSquares,
     limit: f64,
 }
 
 impl<'a> RowBoundContext<'a> {
-    /// `None` if nothing would be excluded, or if coefficients are fixed.
+    /// Context of a search; `None` if the bound would exclude no candidate, or if coefficients are fixed.
     fn of(catalogue: &'a CandidateIndex<'_>, limit: f64) -> Option<Self> {
         let Problem { residual_sums: squares, equations, .. } = &catalogue.problem;
         let squares =
@@ -100,15 +100,15 @@ pub(crate) struct Screen<const L: usize> {
     initial: Vec<usize>,
     /// Columns of the next candidate.
     terms: Vec<usize>,
-    /// Columns, coefficients and initial terms of one candidate.
+    /// Columns of the terms of one candidate.
     columns: Vec<usize>,
     coefficients: Vec<f64>,
     weights: Vec<f64>,
     /// Norm cache of the tailored test vectors.
     norm_cache: NormCache,
-    /// Open positions of a row.
+    /// Positions in a row that are not excluded.
     open_positions: Vec<usize>,
-    /// Lookup state of the linearized test vectors, and the path that excluded the previous candidate.
+    /// Lookup state of the linearized test vectors.
     lookup: VectorLookup,
     path: usize,
 }
@@ -130,8 +130,8 @@ impl<const L: usize> Screen<L> {
         }
     }
 
-    /// Screen the next candidates while only one term changes, by their common row bound. Return their number. `None`
-    /// if they are too few, or if nothing is proved of them together.
+    /// Screen the next candidates that differ only in one term, by their common row bound. Return their number, or
+    /// `None` if they are too few or have no such bound.
     #[inline(always)]
     fn screen_row(
         &mut self,
@@ -168,7 +168,7 @@ impl<const L: usize> Screen<L> {
         Some(len as u64)
     }
 
-    /// Screens the next L candidates.
+    /// Screen the next L candidates.
     #[inline(always)]
     fn screen_next(
         &mut self,

@@ -10,10 +10,9 @@ use crate::recording::{Role, MIN_SIGNAL_PEAK};
 use crate::state_space::{self, InputSignal};
 
 impl OutputSimulation {
-    /// Exact samples of a model with integer orders; None if it has to be discretized by block pulses.
-    ///
-    /// That is so with fractional orders, friction, a sensor filter, nonuniform samples, missing samples of inputs, and
-    /// equations that are singular or nearly so.
+    /// Exact samples of a model with integer orders; None if the model has to be discretized by block pulses. // Block
+    /// pulses are needed for fractional orders, friction, a sensor filter, nonuniform samples, missing samples of
+    /// inputs, and equations that are singular or nearly singular.
     ///
     /// # Errors
     /// As [`state_space::respond`] and [`fit_initial_terms`].
@@ -87,7 +86,7 @@ impl OutputSimulation {
             && (0..recording.channels().len()).all(usable)
     }
 
-    /// Samples of all outputs, from the inputs if `is_driven`; None if a state space is refused.
+    /// Samples of all outputs, from the inputs if `is_driven`; None if there is no state-space form.
     fn respond(&self, terms: &Terms, is_driven: bool, stop: &Stop) -> Result<Option<Rows>> {
         let together = |equations: &[Equation], terms: &[Vec<(f64, f64)>]| {
             let (rows, step) = (self.recording.len(), self.recording.step());
@@ -124,7 +123,8 @@ impl OutputSimulation {
     }
 }
 
-/// Whether an order is an integer so nearly that differences of two are integers within the tolerance of a state space.
+/// True if an order is so close to an integer that differences of two such orders are integers within the tolerance of
+/// the state space.
 fn is_integer(order: f64) -> bool {
     (order - order.round()).abs() <= 0.5 * ORDER_TOLERANCE
 }

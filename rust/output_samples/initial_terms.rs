@@ -6,7 +6,8 @@ use crate::linalg::dense;
 use crate::linalg::orthogonal::norm;
 use crate::signal::statistics::{inner, mean};
 
-/// Relative residual of the response to an initial term on the others, below which it is collinear, as in the joint fit.
+/// Relative distance of the response to an initial term from the span of the other responses, below which it is
+/// collinear, as in the joint fit.
 const COLLINEARITY_TOLERANCE: f64 = 1e-12;
 
 /// Samples of a simulation.
@@ -32,10 +33,10 @@ pub(super) fn weight(measured: &[f64]) -> f64 {
 
 /// Add the initial terms that fit measured samples best to the samples of a simulation from rest.
 ///
-/// `columns` are the samples of all outputs for a unit of each term, `units` its equation and exponent. With `has_level`
-/// the level of each output, which no equation has a term for, is one more term, with the exponent ∞. Outputs are
-/// weighted by the inverse of their standard deviation. Missing samples are NaN and have no weight. Of collinear terms
-/// the solution of minimum norm is taken.
+/// `columns` are the samples of all outputs per unit of each term, and `units` its equation and exponent. With
+/// `has_level`, the level of each output is an additional term with the exponent ∞. Outputs are weighted by the inverse
+/// of their standard deviation. Missing samples are NaN and have no weight. Collinear terms have the solution of
+/// minimum norm.
 ///
 /// # Errors
 /// [`Error::Length`] for other numbers of samples or terms.
@@ -101,8 +102,8 @@ pub fn fit_initial_terms(
     Ok(OutputSamples { outputs, initial })
 }
 
-/// Minimum-norm least-squares solution for the last of some columns; singular values below a share of the largest are
-/// zero.
+/// Minimum-norm least-squares solution with the last column as target. Singular values below a fraction `share` of the
+/// largest are set to zero.
 fn minimum_norm_solution(columns: &[Vec<f64>], share: f64) -> Result<Vec<f64>> {
     let k = columns.len();
     let factor = dense::triangular_factor(columns);

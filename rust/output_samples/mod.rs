@@ -1,9 +1,9 @@
-//! Output samples: simulation of a model on a recording, at its sample times, on one grid or in the limit for zero step.
+//! Output samples: simulation of a model on a recording, at its sample times, on one grid or in the limit of zero step.
 //!
-//! Pulse means of the outputs become samples by integrals from the left, and direct feedthrough by the values of its
-//! inputs at the samples. Initial terms are given, or fitted to the measured samples. The step is halved until
-//! Richardson extrapolation has converged; the responses of long records are refined only where they change. Integer orders
-//! on uniform samples need no grid.
+//! Samples follow from the pulse means of the outputs before them, and direct feedthrough from the values of the inputs
+//! at the samples. Initial terms are given, or fitted to the measured samples. The step is halved until Richardson
+//! extrapolation has converged; the responses of long records are refined only where they change. Integer orders on
+//! uniform samples need no grid.
 
 mod exact;
 mod initial_terms;

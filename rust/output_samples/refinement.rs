@@ -1,5 +1,5 @@
-//! Refinement of the step until samples have converged, and superposition of responses to single samples: long records
-//! are refined only where the responses change.
+//! Refinement of the step until samples have converged. Long records use superposition of responses to single samples,
+//! which are refined only where they change.
 
 use std::sync::Arc;
 
@@ -12,21 +12,22 @@ use crate::recording::Role;
 use crate::series;
 use crate::signal::nonuniform::interpolate_gaps;
 
-/// Pulses per sampling interval of the coarsest grid. Two are the minimum for a sample that is independent of a jump of
-/// a zero-order-hold input at its time.
+/// Pulses per sampling interval of the coarsest grid. With at least two, a sample does not depend on a jump of a
+/// zero-order-hold input at its time.
 const FIRST_REFINEMENT: usize = 2;
-/// Pieces of a response start at its end divided by powers of this ratio, down to this minimum number of intervals.
-/// Halving the step on a piece costs as much as the whole response did.
+/// Ratio of the ends of successive pieces of a response, down to [`MIN_PIECE_INTERVALS`]. Halving the step on a piece
+/// costs as much as the whole response on the coarser grid.
 const PIECE_RATIO: usize = 8;
 const MIN_PIECE_INTERVALS: usize = 128;
 /// Pulses per interval of the grids that cover the whole response. The coarsest grid is not used for the first piece,
-/// where responses jump with the inputs.
+/// where responses have jumps.
 const FULL_GRID_REFINEMENTS: [usize; 3] = [1, 2, 4];
 const FINEST_FULL_GRID: usize = 4;
-/// Ratio of the second to the first half of a response above which the model is unstable and the sum loses its digits.
+/// Ratio of the second to the first half of a response above which the model counts as unstable, so that the sum of
+/// responses loses digits.
 const MAX_GROWTH_RATIO: f64 = 1e3;
 
-/// Samples of a simulation in the limit for zero step.
+/// Samples of a simulation in the limit of zero step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RefinedSamples {
     /// The samples.
@@ -37,22 +38,22 @@ pub struct RefinedSamples {
     pub change: Vec<f64>,
 }
 
-/// Options of a refinement.
+/// Options of the step refinement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
-    /// Change, relative to the largest value of each output, that terminates.
+    /// Change of each output at which the refinement ends, relative to the largest value of the output.
     pub tolerance: f64,
     /// Largest number of pulses.
     pub max_pulses: usize,
-    /// Number of sampling intervals from which on a record is simulated by superposition of responses.
+    /// Smallest number of sampling intervals of a record that is simulated by superposition of responses.
     pub long_record_intervals: usize,
     /// Memory limit \[bytes\].
     pub memory: usize,
 }
 
 impl OutputSimulation {
-    /// Samples in the limit for zero step: on refined grids, until another halving changes no output by more than the
-    /// tolerance, or until there are no more pulses.
+    /// Samples in the limit of zero step. The step is halved until this changes no output by more than the tolerance,
+    /// or until the number of pulses reaches its maximum.
     ///
     /// # Errors
     /// As [`OutputSimulation::samples`], if the equations are singular on two grids in a row;
@@ -123,7 +124,7 @@ impl OutputSimulation {
         size_of::<f64>() * (2 * self.recording.channels().len() + (10 * n + 2 * units + 8) * n)
     }
 
-    /// Samples returned for a grid on which the equations are singular: all NaN.
+    /// Samples that are all NaN, for a grid on which the equations are singular.
     fn unknown_samples(&self) -> OutputSamples {
         let count = self.times.as_ref().map_or(self.recording.len(), Vec::len);
         let n = self.equations.len();
@@ -134,15 +135,15 @@ impl OutputSimulation {
 /// Simulation as a sum of responses: to every sample of the inputs, to first samples, and to initial terms.
 struct SampleResponses<'a> {
     simulation: &'a OutputSimulation,
-    /// Signal, samples behind its limits, and whether it is linear between samples, of each input that is not zero. The
-    /// first sample of a linear input acts differently from later ones.
+    /// Each nonzero input: signal, samples after its limits, and true if it is linear between samples. The first sample
+    /// of a linear input has a different response from later samples.
     inputs: Vec<(usize, Vec<f64>, bool)>,
     /// Equation and exponent of the initial terms.
     units: Vec<(usize, f64)>,
     stop: &'a Stop,
 }
 
-/// Piece of all responses on its finest grid, and its limit for zero step.
+/// Piece of all responses on its finest grid, and its limit of zero step.
 struct Piece {
     first: usize,
     end: usize,
@@ -185,7 +186,7 @@ impl<'a> SampleResponses<'a> {
         self.simulation.equations.len()
     }
 
-    /// All responses on a grid, one block of rows per response; NaN if the equations are singular there.
+    /// All responses on a grid, one block of rows per response; NaN if the equations are singular on the grid.
     fn compute(&self, every: usize, intervals: usize) -> Result<Rows> {
         match self.try_compute(every, intervals) {
             Err(error) if error.kind() == Kind::Model => {
@@ -277,7 +278,7 @@ impl<'a> SampleResponses<'a> {
 
 /// Refine a long record as [`OutputSimulation::refine`] does; None if superposition does not apply.
 ///
-/// The refinement is that of the whole record.
+/// The refinement in the result is that of the finest full grid.
 fn refine_long_record(
     simulation: &OutputSimulation,
     initial: &InitialTerms,
@@ -368,7 +369,7 @@ fn piece_ranges(intervals: usize) -> Vec<(usize, usize)> {
     firsts.zip(ends.iter().copied()).collect()
 }
 
-/// Whether responses do not grow so much that their sum loses its digits.
+/// True if responses grow so little that their sum does not lose digits.
 fn decays(rows: &Rows) -> bool {
     rows.iter().all(|row| {
         let (first, second) = row.split_at(row.len() / 2);

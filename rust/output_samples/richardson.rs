@@ -1,19 +1,20 @@
-//! Richardson table: limit of samples for zero step, from grids of 1, 1/2, 1/4, … of a step.
+//! Richardson table: limit of samples for zero step, from grids with 1, 1/2, 1/4, … of a step.
 
 /// Samples or pulse means of each output.
 pub(super) type Rows = Vec<Vec<f64>>;
 
 /// Powers of the step in the error of a sample: 2 from the block-pulse scheme, 3 from extrapolation to a sample time, 4
-/// from the next term of both. A slope discontinuity t^η adds powers in between, which these columns do not eliminate,
-/// but none of them increases the error by more than a small factor.
+/// from the next term of both. A slope discontinuity t^η adds powers in between, which these columns do not eliminate.
+/// No column increases such an error by more than a small factor.
 const ERROR_POWERS: [i32; 3] = [2, 3, 4];
-/// A column has the error of its power if halving the step reduced its change by at least this fraction of 2^power.
+/// Smallest ratio of the reduction of a change on halving the step to 2^power, at which a column has the error of its
+/// power.
 const MIN_POWER_RATIO: f64 = 0.5;
-/// For an unknown power: minimum reduction of the change on halving the step (slightly below the square root of two),
-/// and minimum effective number of samples from which the reduction is estimated.
+/// Minimum reduction of the change on halving the step for an error of unknown power, slightly below the square root of
+/// two.
 const MIN_REDUCTION_FACTOR: f64 = 1.4;
 const MIN_EFFECTIVE_SAMPLES: f64 = 8.0;
-/// Number of grids needed to estimate such a reduction factor and to test it.
+/// Number of grids that are needed to estimate a reduction factor and to test it.
 const RATIO_TEST_GRIDS: usize = 4;
 
 /// Change of each output from samples on a grid to those on the next, relative to its largest value.
@@ -58,13 +59,14 @@ impl LimitEstimate {
     }
 }
 
-/// Largest change; infinite if one is unknown.
+/// Largest change; infinite if a change is unknown.
 fn largest_change(change: &[f64]) -> f64 {
     change.iter().fold(0.0, |most: f64, c| if c.is_nan() { f64::INFINITY } else { most.max(*c) })
 }
 
-/// Samples on a grid, then those with one power of the step after another eliminated; initial terms as a row of their
-/// own; change of each column on halving the step.
+/// Row of the Richardson table for one grid. The first column holds the samples, and each further column eliminates one
+/// more power of the step. Initial terms are an additional row of values. Each column also has its change on halving
+/// the step.
 struct Grid {
     columns: Vec<(Rows, Vec<f64>)>,
     changes: Vec<Vec<f64>>,
@@ -103,9 +105,10 @@ impl RichardsonTable {
         }
     }
 
-    /// Estimate that another halving changes least; `owners` are the outputs of the initial terms.
+    /// Estimate with the smallest expected change on another halving of the step.
     ///
-    /// If the change of a column is at most `enough`, no other estimate is tried. None without grids.
+    /// `owners` are the outputs of the initial terms. If the change of a column is at most `enough`, no other estimate
+    /// is tried. None without grids.
     pub(super) fn estimate(&self, owners: &[usize], enough: f64, measure: Measure<'_>) -> Option<LimitEstimate> {
         let grid = self.grids.last()?;
         let (column, change) = self.best_column(grid);
@@ -143,7 +146,7 @@ impl RichardsonTable {
         Some(LimitEstimate { samples, change, terms })
     }
 
-    /// Column that another halving changes least, and its change.
+    /// Column with the smallest expected change on another halving of the step, and that change.
     fn best_column(&self, grid: &Grid) -> (usize, Vec<f64>) {
         let count = grid.columns.len();
         let mut best = (if count <= 2 { count - 1 } else { 1 }, vec![f64::INFINITY; grid.columns[0].0.len()]);
@@ -189,8 +192,8 @@ fn remaining_change_ratios(older: &Rows, old: &Rows, new: &Rows) -> Option<Vec<f
 
 /// Limit for zero step of samples, and of initial terms, on grids of 1, 1/2, 1/4, … of a step.
 ///
-/// The estimate is the column of the Richardson table, or its extrapolation by Aitken's method, that another halving of
-/// the step changes least. None without grids.
+/// The estimate is a column of the Richardson table, or its extrapolation by Aitken's method. The choice has the
+/// smallest expected change on another halving of the step. None without grids.
 ///
 /// ```
 /// use ftlm::output_samples::richardson_limit;

@@ -24,23 +24,22 @@ pub(super) type Terms = Vec<Vec<(f64, f64)>>;
 
 /// Difference below which two orders are equal.
 pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
-/// Order of integration from which on a slope discontinuity is resolved by the pulses.
+/// Integration order from which on pulses resolve a slope discontinuity.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
-/// Maximum number of evaluations for the initial states of a run that is not linear in them, and relative change of the
-/// cost that terminates.
+/// Termination criteria of the fit of initial states, if the run is not linear in them.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 60, tolerance: 1e-12 };
 
-/// Initial terms of a simulation. Exponents −1, −2, … are an impulse and its derivatives before the sensor filter, the
-/// exponent ∞ is the level of an output.
+/// Initial terms of a simulation. The exponents −1, −2, … are an impulse and its derivatives before the sensor filter.
+/// The exponent ∞ is the level of an output.
 #[derive(Debug, Clone, PartialEq)]
 pub enum InitialTerms {
     /// (exponent, coefficient) of each equation.
     Given(Vec<Vec<(f64, f64)>>),
     /// Exponents of each equation, fitted to the measured samples by least squares.
     Fitted {
-        /// Exponents.
+        /// Exponents by equation.
         exponents: Vec<Vec<f64>>,
-        /// Whether each output has an unknown level as well.
+        /// True if each output also has an unknown level.
         has_level: bool,
     },
 }
@@ -56,11 +55,11 @@ pub struct OutputSimulation {
 }
 
 impl OutputSimulation {
-    /// Equations of the outputs of a recording in their sequence, and the friction of some of them. `times` \[s\] are
-    /// the times of the samples; None for the uniform samples of the recording.
+    /// Simulation of equations, in the sequence of the outputs of the recording, some of them with friction. `times`
+    /// \[s\] are the sample times; None for the uniform samples of the recording.
     ///
     /// # Errors
-    /// Equations that the recording cannot supply, or other outputs than its own.
+    /// Equations with signals that the recording lacks, or with other outputs.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
@@ -100,12 +99,12 @@ impl OutputSimulation {
         Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
 
-    /// Simulation of equations with nonlinear terms, and the friction of some of them. Nonlinear terms are terms of
-    /// derived signals, which are numbered after the signals of the recording.
+    /// Simulation of equations with non-linear terms, some of them with friction. Non-linear terms are terms of derived
+    /// signals, which are numbered after the signals of the recording.
     ///
     /// # Errors
-    /// As [`NonlinearSystem::check`]; [`Error::Structure`] for other outputs than the recording's own, for a term of an
-    /// input as high as its equation, and where the equations would have to hold for filtered signals.
+    /// As [`NonlinearSystem::check`]; [`Error::Structure`] for outputs that the recording lacks, for an input term with
+    /// the order of its equation, and if the equations would have to hold for filtered signals.
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};
@@ -187,8 +186,8 @@ impl OutputSimulation {
     /// Initial terms of a model with friction or nonlinear terms, fitted on a grid of `every` pulses per sampling
     /// interval.
     ///
-    /// Outputs are not linear in them, so they are found by optimization, from level and velocity at the
-    /// start of the run.
+    /// Outputs are not linear in the initial terms, so these are found by optimization. It starts from level and
+    /// velocity at the start of the run.
     ///
     /// # Errors
     /// As [`Recording::experiment`] and [`nonlinear::fit`].
@@ -294,7 +293,7 @@ impl OutputSimulation {
         Ok(exponents.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |e| (i, *e))).collect())
     }
 
-    /// Equation of a signal that is simulated, if a term takes it so.
+    /// Equation whose simulated output is this signal, if terms use simulated outputs.
     pub(super) fn simulated_output(&self, signal: usize) -> Option<usize> {
         self.equations.iter().position(|e| self.recording.is_coupled && e.structure.output == signal)
     }
@@ -311,7 +310,7 @@ fn coefficient(terms: &[(f64, f64)], exponent: f64) -> f64 {
     terms.iter().find(|term| term.0 == exponent).map_or(0.0, |term| term.1)
 }
 
-/// Rows multiplied by a square matrix; the rows themselves without one.
+/// Rows multiplied by a square matrix; unchanged rows without a matrix.
 fn apply(matrix: Option<&Vec<f64>>, rows: Rows) -> Rows {
     let (Some(matrix), n) = (matrix, rows.len()) else { return rows };
     let of = |i: usize| {
@@ -324,8 +323,8 @@ fn apply(matrix: Option<&Vec<f64>>, rows: Rows) -> Rows {
     (0..n).map(of).collect()
 }
 
-/// Gain of a sensor filter for a jump (degree 0), or jump of its response to the lowest derivative of an impulse that
-/// gives one; 0 if the orders of numerator and denominator differ by another number.
+/// Gain of a sensor filter of relative degree 0 for a jump. For a higher relative degree it is the jump of the response
+/// to the lowest derivative of an impulse that causes a jump. It is 0 if the relative degree is not `degree`.
 fn leading_gain(filter: &Filter, degree: f64) -> f64 {
     let of = |part: &[(f64, f64)]| {
         let highest = part.iter().filter(|(c, _)| *c != 0.0).fold(0.0, |most: f64, (_, order)| most.max(*order));
@@ -345,7 +344,7 @@ fn relative_degree(filter: &Filter) -> f64 {
     (highest(&filter.denominator) - highest(&filter.numerator) + ORDER_TOLERANCE).trunc()
 }
 
-/// Pulse means of a recording, and places of the samples among them.
+/// Pulse means of a recording on one grid, and positions of the samples in it.
 pub(super) struct Grid<'a> {
     simulation: &'a OutputSimulation,
     every: usize,
@@ -412,11 +411,12 @@ impl<'a> Grid<'a> {
         self.samples(means, &terms, false)
     }
 
-    /// Samples from pulse means: integrals from the left, direct feedthrough with its value at the sample.
+    /// Samples from pulse means, with direct feedthrough from the values of the inputs at the samples. // The last two
+    /// pulses before each sample time are extrapolated to it.
     ///
-    /// The last two pulses before each sample time are extrapolated to it. No jump of a zero-order-hold input lies in
-    /// them, so the extrapolation crosses no slope discontinuity t^α of a jump. At nonuniform sample times, between
-    /// which jumps may lie anywhere, samples follow from the pulses around them and the kink correction.
+    /// These pulses contain no jump of a zero-order-hold input, so the extrapolation crosses no slope discontinuity
+    /// t^α. At nonuniform sample times jumps may be anywhere. There, samples follow from the pulses around them and the
+    /// kink correction.
     fn samples(&self, means: &Rows, terms: &Terms, is_driven: bool) -> Result<Rows> {
         let OutputSimulation { recording, equations, times, .. } = self.simulation;
         let (n, m, every) = (means.len(), self.record.m(), self.every);
@@ -513,7 +513,7 @@ impl<'a> Grid<'a> {
         Ok(out)
     }
 
-    /// Whether a signal is a derived one, which the record does not have.
+    /// True if a signal is derived, so that the record lacks it.
     fn is_derived(&self, signal: usize) -> bool {
         signal >= self.record.len()
     }
@@ -540,10 +540,10 @@ impl<'a> Grid<'a> {
         Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
     }
 
-    /// Early part of the mean of the pulses on either side of each inner sample, by output.
+    /// Part of the mean of the pulses on either side of each inner sample that occurs only after the sample, by output.
+    /// // It is half of the response in the first pulse after a jump or a slope discontinuity of the inputs.
     ///
-    /// It is half of the response of the first pulse after a jump or a slope discontinuity of the inputs, of which only
-    /// the direct gain acts at the sample, as in the joint fit.
+    /// At the sample only the direct gain acts, as in the joint fit.
     fn early_responses(&self) -> Result<Rows> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         let (n, m, every) = (equations.len(), self.record.m(), self.every);
@@ -595,7 +595,7 @@ impl<'a> Grid<'a> {
 
     /// Kink correction at nonuniform sample times: slope discontinuities of input jumps and of initial terms.
     ///
-    /// It includes the direct path of a jump and one pass through the output's own terms, as in the joint fit.
+    /// It includes the direct path of a jump and one pass through the terms of the output, as in the joint fit.
     fn kink_corrections(&self, at: &SampleInterpolation, terms: &Terms, is_driven: bool) -> Rows {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         let step = self.record.step();

@@ -14,14 +14,14 @@ use crate::estimation::multi_innovation::Prior;
 use crate::expression::{DerivedSignal, Expression, Instruction};
 use crate::regressors::Record;
 
-/// Most values of a two-dimensional array: eight gigabytes.
+/// Maximum number of values of a two-dimensional array: eight gigabytes.
 const MOST_VALUES: usize = 1 << 30;
 
-/// (step, signals as rows, series of the sensor filter or None).
+/// Record as (step, signals as rows, series of the sensor filter or None).
 #[derive(FromPyObject)]
 pub enum RecordArg<'py> {
-    /// With nonzero initial conditions: flags of sensor filter transients, initial levels of the signals, and filter
-    /// responses to an impulse and its derivatives as rows.
+    /// Record with nonzero initial conditions. It adds flags of sensor filter transients, initial levels of the
+    /// signals, and filter responses to an impulse and its derivatives as rows.
     WithInitialState(
         f64,
         PyReadonlyArray2<'py, f64>,
@@ -30,16 +30,16 @@ pub enum RecordArg<'py> {
     ),
     Plain(f64, PyReadonlyArray2<'py, f64>, Option<PyReadonlyArray1<'py, f64>>),
 }
-/// (output, alpha, [(signal, order), …]).
+/// Structure as (output, alpha, [(signal, order), …]).
 pub type StructureArg = (usize, f64, List<(usize, f64)>);
-/// A structure and its coefficients.
+/// Equation as (structure, coefficients).
 pub type EquationArg = (StructureArg, List<f64>);
-/// (whether Caputo's powers, else these exponents).
+/// Initial terms as (true for Caputo's powers, exponents otherwise).
 #[derive(FromPyObject)]
 pub enum InitialArg {
-    /// With offset and the number of impulses of a filter transient.
+    /// Initial terms with an offset and a number of impulses of a filter transient.
     Filtered(bool, List<f64>, u8, u8),
-    /// With offset: 0 none, 1 a constant, 2 a constant and a ramp, 3 an output level.
+    /// Initial terms with an offset: 0 for none, 1 for a constant, 2 for a constant and a ramp, 3 for an output level.
     Offset(bool, List<f64>, u8),
     Plain(bool, List<f64>),
 }
@@ -108,7 +108,7 @@ pub fn records(arguments: &[RecordArg<'_>]) -> PyResult<Vec<Record>> {
     arguments.iter().map(record).collect()
 }
 
-/// Structure for a record of so many signals. `inputs` marks the inputs among them.
+/// Structure for a record with this number of signals. `inputs` marks the inputs among them.
 pub fn structure(argument: StructureArg, signals: usize, inputs: &[bool]) -> PyResult<Structure> {
     let structure = Structure {
         output: argument.0,
@@ -168,7 +168,8 @@ pub fn columns(array: &PyReadonlyArray2<'_, f64>) -> usize {
     array.shape()[1]
 }
 
-/// Most items of a sequence that is neither list nor tuple. Those two already occupy their memory.
+/// Maximum number of items of a sequence that is neither a list nor a tuple. Lists and tuples are already in memory and
+/// need no limit.
 const MOST_ITEMS: usize = 1 << 24;
 
 /// Vector from any Python sequence.

@@ -36,7 +36,7 @@ fn raise(class: &str, message: String) -> PyErr {
     })
 }
 
-/// Entry to the core for computations: runs detached from Python. A panic becomes InternalError.
+/// Run a computation of the core without the Python interpreter lock. A panic becomes InternalError.
 ///
 /// Every `#[pyfunction]` and every method converts its arguments and then makes one call of this or of
 /// [`run_attached`]. `tests/rust/bindings.rs` checks that.
@@ -44,7 +44,7 @@ pub fn run_detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Er
     Ok(py.detach(|| catch_panic(work))?)
 }
 
-/// Entry to the core for work of microseconds, where detaching would cost more: runs attached to Python.
+/// Run work of microseconds with the Python interpreter lock, because its release would take longer.
 ///
 /// A panic becomes InternalError.
 pub fn run_attached<T>(work: impl FnOnce() -> Result<T, Error>) -> PyResult<T> {

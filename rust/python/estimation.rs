@@ -55,7 +55,7 @@ pub fn least_squares(
     Ok(tuple(run_interruptible(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
 }
 
-/// Output error and coefficients of each point. None if they are not finite.
+/// Output error and coefficients of a point; None if they are not finite.
 type PointTuple = Option<(f64, Vec<f64>)>;
 
 #[pyfunction]
@@ -177,7 +177,7 @@ pub struct ExperimentFields<'py> {
     sample_times: Option<OwnTimesArg<'py>>,
 }
 
-/// Experiment that the core sampled, or one given by its fields.
+/// Experiment that the core sampled, or a dictionary of its fields.
 #[derive(FromPyObject)]
 #[allow(clippy::large_enum_variant)] // there are as many as runs
 pub enum ExperimentArg<'py> {
@@ -251,7 +251,8 @@ pub fn status(status: joint::Status) -> &'static str {
     }
 }
 
-/// Whether s^alpha minus the own terms (coefficient, order) has a zero in the closed right half-plane.
+/// Return true if s^alpha minus the autoregressive terms (coefficient, order) has a zero in the closed right
+/// half-plane.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn has_unstable_pole(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResult<bool> {

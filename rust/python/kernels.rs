@@ -1,4 +1,4 @@
-//! Bindings of operators on batches of signals: one signal a row, parameters shared by several rows once.
+//! Bindings of operators on batches of signals: one signal per row. Several rows can share one set of parameters.
 
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -14,7 +14,7 @@ use crate::signal::block_pulse::{self, Intersample};
 
 type Matrix<'py> = Bound<'py, PyArray2<f64>>;
 
-/// Rows of equal length, one after another.
+/// Batch of rows of equal length, stored one after another.
 struct Batch {
     values: Vec<f64>,
     width: usize,
@@ -37,9 +37,10 @@ impl Batch {
         PyArray1::from_vec(py, self.values).reshape([count, width])
     }
 
-    /// Change the rows of each group by `work`, which gets the number of the group and its rows one after another.
+    /// Apply `work` to the rows of each group in place.
     ///
-    /// `groups` has the group of each row, from 0 to `count` − 1.
+    /// Its arguments are the number of the group and its rows, one after another. `groups` contains the group of each
+    /// row, from 0 to `count` − 1.
     fn change_groups(
         &mut self,
         groups: &[usize],
@@ -71,7 +72,7 @@ impl Batch {
     }
 }
 
-/// Rows between two checks for a stop.
+/// Number of rows between two checks for a stop request.
 const MAX_BLOCK_ROWS: usize = 64;
 
 /// Kernels of fractional integrals of several orders, or their derivatives by the order, as rows.
@@ -105,10 +106,11 @@ pub fn block_pulse_kernels<'py>(
     PyArray1::from_vec(py, values).reshape([count, m])
 }
 
-/// Change of the rows of one kernel, one after another, by that kernel.
+/// Operation of one kernel on its rows, in place.
 type KernelWork = fn(&[f64], &mut [f64], &Stop) -> Result<()>;
 
-/// Apply `work` to rows and the first columns of their Toeplitz matrices; `groups` has the number of each row's matrix.
+/// Apply `work` to rows and the first columns of their Toeplitz matrices. `groups` contains the matrix number of each
+/// row.
 fn with_kernels<'py>(
     py: Python<'py>,
     first_columns: &PyReadonlyArray2<'py, f64>,
@@ -187,7 +189,7 @@ pub fn pulse_mean_rows<'py>(
 
 /// Multi-innovation estimates (44) of m = Q X for problems of `count` rows, one after another in `q` and `m`.
 ///
-/// One row a problem, or with `path` the coefficients after every row.
+/// The result has one row per problem, or with `path` the coefficients after every row.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn multi_innovation_rows<'py>(

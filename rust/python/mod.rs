@@ -1,6 +1,6 @@
 //! Python bindings, the only users of pyo3 and numpy.
 //!
-//! Arrays are checked here once. Python is detached during every call that computes.
+//! Arrays are checked here. The Python interpreter lock is released during every computation.
 
 mod convert;
 mod errors;
@@ -87,7 +87,7 @@ mod _core {
         module.add("SIMD", simd())
     }
 
-    /// Widest vector unit of this processor.
+    /// Name of the widest vector instruction set of this processor.
     fn simd() -> &'static str {
         #[cfg(target_arch = "x86_64")]
         {

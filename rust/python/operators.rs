@@ -150,7 +150,7 @@ pub fn fractional_integral<'py>(
     PyArray1::from_vec(py, values).reshape([count, width])
 }
 
-/// Values of a batch that are integrated between two checks for a stop.
+/// Number of values of a batch that are integrated between two checks for a stop request.
 const MAX_BLOCK_POINTS: usize = 1 << 17;
 
 #[pyfunction]

@@ -1,4 +1,4 @@
-//! Binding of the Levenberg–Marquardt method for residuals that Python callbacks compute.
+//! Bindings of the Levenberg–Marquardt method for residuals from Python callbacks.
 
 use std::cell::RefCell;
 
@@ -13,21 +13,23 @@ use crate::estimation::optimization::damped_step::{LeastSquaresProblem, Lineariz
 use crate::estimation::optimization::levenberg_marquardt::{minimize as find_minimum, MinimizationSettings};
 use crate::signal::statistics::inner;
 
-/// Excess over a constraint that rounding of a step causes: relative to the step, and for values of about 1.
+/// Violation of a constraint that counts as rounding error, relative to the step.
 const CONSTRAINT_TOLERANCE: f64 = 1e-9;
 const CONSTRAINT_ROUNDING: f64 = 1e-14;
 
-/// Relative decrease of the sum of squares by a full step at convergence, somewhat above rounding.
+/// Relative decrease of the sum of squares by a full step at which the minimization has converged, slightly above
+/// rounding error.
 const COST_REDUCTION_TOLERANCE: f64 = 1e-14;
 
-/// Residuals and Jacobian by Python callbacks, under rows · values ≤ limits.
+/// Least-squares problem with residuals and Jacobian from Python callbacks, under the constraints rows · values ≤
+/// limits.
 struct CallbackProblem<'py> {
     residuals: Bound<'py, PyAny>,
     jacobian: Bound<'py, PyAny>,
     rows: Vec<Vec<f64>>,
     limits: Vec<f64>,
     signal_norm: f64,
-    /// Exception of a callback.
+    /// Exception that a callback raised.
     raised: RefCell<Option<PyErr>>,
 }
 

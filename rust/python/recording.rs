@@ -1,4 +1,4 @@
-//! Bindings of recordings: runs that the core samples, and experiments made of them.
+//! Bindings of recordings and of the experiments sampled from them.
 
 use std::sync::Arc;
 
@@ -19,8 +19,8 @@ type Array<'py> = Bound<'py, PyArray1<f64>>;
 type Table<'py> = Bound<'py, PyArray2<f64>>;
 
 /// Signal from a dictionary with these keys: name, samples, samples at the nonuniform times of the run, role, delay
-/// \[s\], limits as (law, value or None if free), whether it passed the sensor filter, whether it enters an equation of
-/// another output.
+/// \[s\], limits as (law, value or None if free), flag of a sensor filter, flag of a signal in the equation of another
+/// output.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct ChannelArg<'py> {
@@ -125,7 +125,7 @@ impl Recording {
         })
     }
 
-    /// Means of all signals over `m` pulses; `filtered` passes those before the sensor filter through it.
+    /// Means of all signals over `m` pulses. If `filtered`, signals that were not filtered pass the sensor filter.
     fn pulses<'py>(&self, py: Python<'py>, m: usize, filtered: bool) -> PyResult<PulsesTuple<'py>> {
         let run = Arc::clone(&self.inner);
         let points = m.saturating_mul(run.channels().len());
@@ -142,7 +142,7 @@ impl Recording {
         ))
     }
 
-    /// Experiment with `every` pulses a sampling interval of each `decimation`-th sample, weights of the outputs, and
+    /// Experiment with `every` pulses per sampling interval and decimated samples. It has weights of the outputs, and
     /// robust weights of the compared samples as rows.
     #[pyo3(signature = (every, decimation, weights, shares=None))]
     #[allow(clippy::needless_pass_by_value)]
@@ -236,7 +236,7 @@ pub fn nonuniform_means<'py>(
     Ok(PyArray1::from_vec(py, means.into_vec()))
 }
 
-/// Runs of a fit of so many signals and free inputs, with these outputs.
+/// Runs of a fit with this number of signals and free input parameters, and with these outputs.
 pub fn recordings(runs: &[Py<Recording>], signals: usize, outputs: &[usize], free: usize) -> Result<Recordings> {
     let runs = Recordings::new(runs.iter().map(|run| recording::Recording::clone(&run.get().inner)).collect())?;
     if let Some(run) = runs.runs().first() {

@@ -170,7 +170,7 @@ pub fn kink_correction<'py>(
     Ok(PyArray1::from_vec(py, lacking))
 }
 
-/// (samples of the outputs as rows, (exponent, coefficient) of the initial terms by equation).
+/// Tuple of samples of the outputs as rows, and (exponent, coefficient) of the initial terms by equation.
 type SamplesTuple<'py> = (Bound<'py, PyArray2<f64>>, Vec<Vec<(f64, f64)>>);
 
 fn samples_tuple<'py>(py: Python<'py>, found: OutputSamples) -> PyResult<SamplesTuple<'py>> {
@@ -181,11 +181,11 @@ fn samples_tuple<'py>(py: Python<'py>, found: OutputSamples) -> PyResult<Samples
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct OutputSimulation {
     inner: Arc<output_samples::OutputSimulation>,
-    /// Values of one pulse per sampling interval.
+    /// Number of values on a grid of one pulse per sampling interval.
     points: usize,
 }
 
-/// (whether coefficients are fitted, (exponent, coefficient) by equation, whether levels are fitted as well).
+/// Initial terms: (true to fit coefficients, (exponent, coefficient) by equation, true to fit levels as well).
 type TermsArg = (bool, List<List<(f64, f64)>>, bool);
 
 fn initial_terms((fitted, terms, has_level): TermsArg) -> InitialTerms {
@@ -255,7 +255,8 @@ impl OutputSimulation {
         exact.map(|samples| samples_tuple(py, samples)).transpose()
     }
 
-    /// Samples in the limit for zero step, initial terms, pulses per sampling interval, and remaining change by output.
+    /// Samples in the limit of zero step, initial terms, pulses per sampling interval, and remaining relative change by
+    /// output.
     #[pyo3(signature = (terms, tolerance, max_pulses, long_record_intervals, memory, stop=None))]
     #[allow(clippy::too_many_arguments)]
     fn refine<'py>(
@@ -275,8 +276,8 @@ impl OutputSimulation {
         Ok((samples_tuple(py, samples.samples)?, samples.refinement, PyArray1::from_vec(py, samples.change)))
     }
 
-    /// (exponent, coefficient) of the initial terms of a model with friction or nonlinear terms by equation, fitted on
-    /// a grid.
+    /// Fit the initial terms of a model with friction or non-linear terms on a grid; return (exponent, coefficient) by
+    /// equation.
     #[pyo3(signature = (start, every, stop=None))]
     fn fit_initial_states(
         &self,
@@ -290,8 +291,8 @@ impl OutputSimulation {
     }
 }
 
-/// Limit for zero step of samples on grids of 1, 1/2, 1/4, … of a step: samples, change of each output, and the limits
-/// of numbers that belong to outputs `owners`.
+/// Limit for zero step of samples on grids of 1, 1/2, 1/4, … of a step: samples, change of each output, and limits of
+/// the values that belong to the outputs `owners`.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn richardson_limit<'py>(

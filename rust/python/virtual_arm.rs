@@ -228,7 +228,7 @@ impl VirtualArm {
         run_attached(|| self.plant.inject(injection))
     }
 
-    /// Run samples at rest: readings to the guard, 0 V to the output.
+    /// Run samples at rest. The guard processes the readings, and the output is 0 V.
     #[allow(clippy::needless_pass_by_value)]
     fn rest(
         &mut self,
@@ -253,7 +253,7 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Run samples under commands, until these end or a fault latches. `take` returns the readings.
+    /// Run samples with commands, until the commands end or a fault is latched. `take` returns the readings.
     #[allow(clippy::needless_pass_by_value)]
     fn run(
         &mut self,
@@ -293,7 +293,7 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Samples since the last call, shape (n, 9).
+    /// Return the samples since the last call, shape (n, 9).
     fn take<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let rows: Vec<Vec<f64>> =
             run_attached(|| Ok(std::mem::take(&mut self.rows).iter().map(|r| r.to_vec()).collect()))?;
@@ -327,7 +327,7 @@ impl VirtualArm {
         }
     }
 
-    /// Pass volts to the output stage and advance the arm under its result.
+    /// Write volts to the output stage, and advance the arm by one sample with the resulting volts.
     fn write(&mut self, output: &Bound<'_, PyAny>, volts: [f64; 2]) -> PyResult<()> {
         let (through, enabled): ([f64; 2], bool) = output.call1((volts[0], volts[1]))?.extract()?;
         run_attached(|| {
@@ -337,7 +337,8 @@ impl VirtualArm {
     }
 }
 
-/// I^q of a signal that is linear between samples, online by the sum of exponentials, as the virtual arm computes it.
+/// Fractional integral I^q of a signal that is linear between samples, computed online by a sum of exponentials, as in
+/// the virtual arm.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fractional_memory<'py>(

@@ -1,4 +1,4 @@
-//! Channel: the samples of one signal of a recording, and what acts of them: delay, saturation, dead zone.
+//! Channel: samples of one signal of a recording, with its delay, saturation and dead zone.
 
 use std::borrow::Cow;
 
@@ -13,7 +13,7 @@ pub enum Role {
     Input(Intersample),
     /// Output, linear between samples.
     Output,
-    /// Signal computed from others, held between samples; its values at single instants are not known.
+    /// Signal computed from others, held between samples; its values at single times are not known.
     Derived,
 }
 
@@ -31,7 +31,7 @@ pub struct Channel {
     pub nonuniform: Option<Vec<f64>>,
     /// Input, output or derived signal.
     pub role: Role,
-    /// Delay of an input \[s\], also of 0 if it is known to be; None without one.
+    /// Delay of an input \[s\]; None if the structure has no delay of this input.
     pub delay: Option<f64>,
     /// Saturations and dead zones in the order in which they act.
     pub nonlinearities: Vec<Nonlinearity>,
@@ -42,7 +42,7 @@ pub struct Channel {
 }
 
 impl Channel {
-    /// Uniformly sampled signal that no delay, nonlinearity or filter changes.
+    /// Uniformly sampled signal without delay, non-linearity or filter.
     #[must_use]
     pub fn new(name: &str, samples: Vec<f64>, role: Role) -> Self {
         Self {
@@ -57,7 +57,7 @@ impl Channel {
         }
     }
 
-    /// Return an error for values that no channel has.
+    /// Return an error for invalid samples or limits.
     ///
     /// # Errors
     /// [`Error::NotFinite`] for a sample of an input, [`Error::OutOfRange`] for a limit below 0.
@@ -123,7 +123,7 @@ impl Channel {
         limited
     }
 
-    /// Channel of the leading samples: so many on the grid, and so many at nonuniform times.
+    /// Channel of the first `rows` uniform and the first `nonuniform` nonuniform samples.
     pub(super) fn leading_part(&self, rows: usize, nonuniform: usize) -> Self {
         let first = |samples: &[f64], count: usize| samples[..count.min(samples.len())].to_vec();
         Self {

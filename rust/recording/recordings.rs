@@ -18,7 +18,7 @@ impl Recordings {
     /// Recordings with the same signals.
     ///
     /// # Errors
-    /// [`Error::Length`] for other numbers of signals or free inputs, [`Error::Structure`] for other outputs.
+    /// [`Error::Length`] for different numbers of signals or free inputs, [`Error::Structure`] for different outputs.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -44,7 +44,7 @@ impl Recordings {
         Ok(Self { runs, memory: usize::MAX })
     }
 
-    /// Recordings whose experiments may take so many bytes at once.
+    /// Set the memory limit of all experiments in bytes.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
@@ -98,7 +98,7 @@ impl Recordings {
         self.runs.iter().map(|run| run.experiment(sampling)).collect()
     }
 
-    /// Intersample behavior of the signals that are inputs, a hold if it is one in any run; None for other signals.
+    /// Intersample behavior of each input, a hold if it is held in any run; None for other signals.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role};
@@ -141,8 +141,8 @@ impl Recordings {
         self.runs.iter().map(of).collect()
     }
 
-    /// Records of the measured signals with `m` block pulses, all behind the sensor filter, at these values of the free
-    /// input parameters. Missing samples are interpolated.
+    /// Records of the measured signals with `m` block pulses, all filtered by the sensor filter, with these values of
+    /// the free input parameters. Missing samples are interpolated.
     ///
     /// # Errors
     /// As [`Recording::pulses`] and [`Recording::with_free_inputs`].

@@ -1,4 +1,4 @@
-//! One run, resampled on any grid: pulse means of its signals, and samples to compare a simulation with.
+//! Recording of one run on any grid: pulse means of its signals, and samples for comparison with a simulation.
 
 use std::borrow::Cow;
 
@@ -15,7 +15,7 @@ use crate::signal::block_pulse::{
 };
 use crate::signal::nonuniform::{check_times, interpolate, interpolate_gaps, NonuniformSignal, TIME_TOLERANCE};
 
-/// Fewest samples of a recording.
+/// Minimum number of samples of a recording.
 const MIN_SAMPLES: usize = 3;
 /// Smallest peak of a signal that is not zero. Squares of smaller signals underflow.
 pub(crate) const MIN_SIGNAL_PEAK: f64 = 1e-140;
@@ -32,7 +32,7 @@ pub struct Sampling {
 }
 
 impl Sampling {
-    /// Check that pulses and decimation are positive and not excessive.
+    /// Check that the numbers of pulses and the decimation are positive and not too large.
     ///
     /// # Errors
     /// [`Error::OutOfRange`].
@@ -85,13 +85,13 @@ pub struct Recording {
     outputs: Vec<usize>,
     /// Sensor filter that some signals passed.
     pub filter: Option<Filter>,
-    /// Number of initial states of the sensor filter that are unknown: 0 from rest.
+    /// Number of unknown initial states of the sensor filter: 0 with zero initial conditions.
     pub filter_states: usize,
     /// Whether all signals were zero before the first sample.
     pub is_at_rest: bool,
-    /// Whether each equation is driven by the simulated other outputs, not by the measured ones.
+    /// True if other outputs enter an equation as simulated, false if as measured.
     pub is_coupled: bool,
-    /// Whether a body has friction or an equation nonlinear terms, so that outputs are simulated before the filter.
+    /// True if an equation has friction or non-linear terms, so that outputs are simulated before the filter.
     pub has_friction: bool,
     /// Signal and law of each delay, saturation and dead zone that is to be estimated.
     pub free_inputs: Vec<(usize, InputLaw)>,
@@ -108,9 +108,9 @@ pub struct Pulses {
     pub filter: Option<Vec<f64>>,
     /// Signals that may contain an initial transient of their sensor filter.
     pub has_transient: Vec<bool>,
-    /// Initial level of each signal, to which derivatives of improper terms refer; 0 from rest.
+    /// Initial level of each signal, from which improper terms measure deviations; 0 with zero initial conditions.
     pub initial_levels: Vec<f64>,
-    /// Means of the filter's responses to an impulse and its derivatives, as far as they are known.
+    /// Pulse means of the known responses of the filter to an impulse and its derivatives.
     pub impulse_responses: Vec<Vec<f64>>,
 }
 
@@ -162,7 +162,7 @@ impl Pulses {
 }
 
 impl Recording {
-    /// Recording of signals with a uniform sampling interval, or uniform and nonuniform samples at these times \[s\].
+    /// Recording of signals with a uniform sampling interval. With `times` \[s\], it also has nonuniform samples.
     ///
     /// `outputs` are the signals that equations simulate, in the sequence of the equations.
     ///
@@ -382,7 +382,7 @@ impl Recording {
         }))
     }
 
-    /// Whether the equations hold for filtered signals: if one that is measured, not simulated, enters them.
+    /// True if the equations hold for filtered signals: a measured signal that passed the filter enters them.
     #[must_use]
     pub fn is_all_filtered(&self) -> bool {
         let simulated = |signal| (self.is_coupled || self.has_friction) && self.outputs.contains(&signal);
@@ -400,7 +400,8 @@ impl Recording {
         self.times.is_some() && self.free_inputs.is_empty() && !self.is_all_filtered()
     }
 
-    /// States of the sensor filter if its transient is to be removed from a signal, which enters equations as measured.
+    /// States of the sensor filter, if its transient is removed from a signal that enters equations as measured; else
+    /// None.
     fn removed_transient(&self, signal: usize) -> Option<FilterStates> {
         let channel = &self.channels[signal];
         let simulated = self.is_coupled && self.outputs.contains(&signal);
@@ -412,7 +413,7 @@ impl Recording {
         FilterStates::of(self.filter.as_ref()?).filter(|states| states.lasts(self.step))
     }
 
-    /// Samples of a signal as they enter the equations: after its limits, without the transient of its sensor filter.
+    /// Samples of a signal in the equations: after its limits, without the transient of its sensor filter.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -435,7 +436,7 @@ impl Recording {
         }
     }
 
-    /// Nonuniform samples of a signal as they enter the equations; the uniform ones if there are no others.
+    /// Nonuniform samples of a signal in the equations; the uniform samples if there are no others.
     fn acting_nonuniform_samples(&self, signal: usize) -> Option<Cow<'_, [f64]>> {
         let (channel, times) = (&self.channels[signal], self.times.as_ref()?);
         let limited = channel.behind_limits(channel.nonuniform.as_ref()?);
@@ -465,7 +466,8 @@ impl Recording {
         }
     }
 
-    /// Means of a signal over `m` pulses, as it acts: exact integrals of what was recorded.
+    /// Means over `m` pulses of a signal in the equations: exact integrals of the recorded signal after limits and
+    /// delay.
     ///
     /// # Errors
     /// No pulse or too many, a sample that is not finite.
@@ -513,10 +515,10 @@ impl Recording {
         pulse_means(&samples, m, intersample)
     }
 
-    /// Pulse means of every signal as it acts on the equations.
+    /// Pulse means of every signal in the equations. // If `filtered`, signals that were not measured through the
+    /// sensor filter are filtered.
     ///
-    /// `filtered` passes signals that were not measured through the sensor filter through it: the equations then hold
-    /// for filtered signals.
+    /// The equations then hold for filtered signals.
     ///
     /// # Errors
     /// As [`Recording::pulse_means`] and [`Filter::series`]; [`Error::Recording`] for a signal whose squares underflow.
@@ -570,7 +572,7 @@ impl Recording {
         })
     }
 
-    /// Initial level of a signal; 0 from rest, for filtered inputs, and for a missing first sample.
+    /// Initial level of a signal; 0 with zero initial conditions, for filtered inputs, and for a missing first sample.
     fn initial_level(&self, signal: usize) -> f64 {
         let channel = &self.channels[signal];
         if self.is_at_rest || channel.role == Role::Derived || (channel.is_filtered && self.is_all_filtered()) {
@@ -584,7 +586,7 @@ impl Recording {
         }
     }
 
-    /// The run on a grid, with the samples to compare a simulation with.
+    /// Experiment: the run on a grid, with the samples for comparison with a simulation.
     ///
     /// Free delays and limits are left to the fit. Weights of outputs are 1; missing samples have weight 0.
     ///
@@ -647,7 +649,7 @@ impl Recording {
         }
     }
 
-    /// Samples of each output as recorded, at the times at which it is compared; NaN for missing ones.
+    /// Recorded samples of each output at the times of comparison; NaN for missing samples.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -676,7 +678,7 @@ impl Recording {
         signals.saturating_add(2 * rows * self.outputs.len()).saturating_mul(size_of::<f64>())
     }
 
-    /// All samples of each output to compare with, of a grid of `every` pulses per sampling interval; NaN for missing
+    /// Samples of each output for comparison, on a grid of `every` pulses per sampling interval; NaN for missing
     /// samples.
     ///
     /// # Errors
@@ -701,7 +703,7 @@ impl Recording {
         Ok(self.outputs.iter().map(|&output| self.compared_samples(output, &pulses, every, 1)).collect())
     }
 
-    /// Recording of so many rows from rest, with a single unit sample of a signal (signal, row), or none.
+    /// Recording of `rows` samples of zero, except for one unit sample (signal, row) if given.
     pub(crate) fn unit_recording(&self, rows: usize, sample: Option<(usize, usize)>) -> Self {
         let of = |(signal, channel): (usize, &Channel)| {
             let mut samples = vec![0.0; rows];
@@ -728,7 +730,7 @@ impl Recording {
         }
     }
 
-    /// Samples of an output to compare with; filtered if the equation is.
+    /// Samples of an output for comparison; filtered if the equations hold for filtered signals.
     fn compared_samples(&self, output: usize, pulses: &Pulses, every: usize, decimation: usize) -> Vec<f64> {
         let channel = &self.channels[output];
         if pulses.filter.is_none() || channel.is_filtered {
@@ -739,8 +741,8 @@ impl Recording {
 
     /// Values of a signal at the samples, after any jump there.
     ///
-    /// None if the signal has no jump or slope discontinuity at the samples (behind a sensor filter, or computed from
-    /// other signals), and if it has missing samples.
+    /// None for a filtered or derived signal, which has no jump or slope discontinuity at the samples, and for a signal
+    /// with missing samples.
     fn point_values(&self, signal: usize, pulses: &Pulses, every: usize, decimation: usize) -> Result<PointValues> {
         let channel = &self.channels[signal];
         let smooth = pulses.filter.is_some() && !channel.is_filtered;
@@ -763,7 +765,8 @@ impl Recording {
         Ok(PointValues { values: Some(samples.iter().copied().step_by(decimation).collect()), is_zero_order_hold })
     }
 
-    /// Experiment at nonuniform sample times, known samples and point values. The first sample gives initial levels.
+    /// Experiment at nonuniform sample times, with the samples and point values. The first sample gives the initial
+    /// levels.
     #[allow(clippy::cast_precision_loss, clippy::type_complexity)]
     fn nonuniform_experiment(
         &self,

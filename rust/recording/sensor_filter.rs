@@ -1,8 +1,8 @@
 //! States of a sensor filter without zeros: its initial transient in a signal, and its responses to impulses.
 //!
-//! A signal that was filtered from an unknown state holds a sum of the filter's responses to an impulse and its
-//! derivatives. On a pulse grid an impulse would last for one pulse and its derivative for two, so these responses are
-//! those of the states.
+//! A signal filtered from an unknown initial state contains a sum of the responses of the filter to an impulse and its
+//! derivatives. On a pulse grid an impulse would last for one pulse, and its derivative for two. The responses are
+//! therefore computed from the states of the filter.
 
 use crate::equation::Filter;
 use crate::error::{check_points, Result};
@@ -11,27 +11,28 @@ use crate::linalg::orthogonal::norm;
 use crate::linalg::small::spectral_radius;
 use crate::state_space::exponential;
 
-/// Length of the fit of the transient, in time constants of the fastest pole, over which the filter's input is nearly a
-/// level and a slope; and minimum number of samples per parameter of the fit.
+/// Length of the fit of the transient, in time constants of the fastest pole. Over this time the input of the filter is
+/// nearly a straight line.
 const TRANSIENT_FIT_TIME_CONSTANTS: f64 = 1.0;
 const SAMPLES_PER_PARAMETER: usize = 2;
 /// Product of fastest pole and sampling interval above which the transient has decayed before the second sample.
 const MAX_POLE_STEP_PRODUCT: f64 = 1e3;
 
-/// Filter without zeros as a chain of states, the output first.
+/// State-space form of a filter without zeros: a chain of integrators that starts at the output.
 pub(super) struct FilterStates {
     /// Number of states.
     size: usize,
     /// Row-major system matrix.
     system: Vec<f64>,
-    /// Gain of the filter's input on the last state.
+    /// Gain of the input of the filter on the last state.
     gain: f64,
     /// Magnitude of the fastest pole \[rad/s\].
     fastest: f64,
 }
 
 impl FilterStates {
-    /// States of a filter; None if its transients are not impulse responses: for zeros, fractional orders, no order.
+    /// States of a filter; None if it has zeros, fractional orders or order 0, because its transients are not impulse
+    /// responses then.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn of(filter: &Filter) -> Option<Self> {
         let whole = |order: f64| order.fract() == 0.0;
@@ -52,7 +53,7 @@ impl FilterStates {
         Some(Self { size, system, gain, fastest })
     }
 
-    /// Whether a transient lasts beyond the first sample at this interval \[s\].
+    /// True if a transient lasts beyond the first sample, for the sampling interval `step` \[s\].
     pub(super) fn lasts(&self, step: f64) -> bool {
         self.fastest * step <= MAX_POLE_STEP_PRODUCT
     }
@@ -74,7 +75,8 @@ impl FilterStates {
         self.system.chunks_exact(self.size).map(|row| row.iter().zip(state).map(|(a, x)| a * x).sum()).collect()
     }
 
-    /// System with more states behind it, `step` times each element: (row, column, value) of what is added.
+    /// System matrix extended by `more` states and multiplied by `step`. `links` are (row, column, value) of the
+    /// additional elements.
     fn extended_system(&self, more: usize, links: &[(usize, usize, f64)], step: f64) -> Vec<f64> {
         let n = self.size + more;
         let mut whole = vec![0.0; n * n];
@@ -85,10 +87,10 @@ impl FilterStates {
         whole
     }
 
-    /// Initial transient of a signal at its samples; the first sample is all transient. None if it cannot be computed.
+    /// Initial transient of a filtered signal at its samples; None if it cannot be computed.
     ///
-    /// The signal that the filter passed is nearly a level and a slope over the first samples, beside which responses
-    /// to an impulse and its derivatives, `states` in all, are fitted.
+    /// The first sample is entirely transient. // Over the first samples the input of the filter is nearly a straight
+    /// line. The response to it and `states` responses to an impulse and its derivatives are fitted together.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn transient(&self, samples: &[f64], step: f64, states: usize) -> Option<Vec<f64>> {
         let row_count = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest * step);
@@ -141,7 +143,8 @@ impl FilterStates {
     }
 }
 
-/// One state at unit time steps for several initial states, as rows of `count`; None if the transition overflows.
+/// Free response of one state at unit time steps, one row of `count` values for each initial state; None if it
+/// overflows.
 fn free_responses(system: &[f64], n: usize, starts: &[Vec<f64>], count: usize, state: usize) -> Option<Vec<Vec<f64>>> {
     // Powers of the transition double the number of steps that are known: a row of each is read at those before.
     let mut power = exponential(system, n)?;

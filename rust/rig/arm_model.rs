@@ -1,16 +1,15 @@
-//! Two-link arm stepped in time: four coupled fractional-order equations in its angles, with dry friction at its
-//! joints.
+//! Time stepping of a two-link arm: four coupled fractional-order equations in its angles, with dry friction at its
+//! joints. // The caller supplies equations with orders and coefficients, as in identification and simulation.
 //!
-//! The caller supplies the equations with orders and coefficients, the same that identification and simulation use.
 //! Each equation is integrated once. Derivatives above order 1, D^ν θ with ν > 1, then appear on the left as momenta
 //! D^{ν−1} θ. All other terms are forces. Fractional derivatives of the angles are integrals of their rates, D^ν θ =
 //! I^{1−ν} θ′ and D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep. The history is stored in a fixed
 //! number of exponentials ([`crate::fractional::exponential_sum`]). One substep is a trapezoidal step, implicit in all
 //! four rates.
 //!
-//! Coulomb friction of a joint is a set-valued torque. It is expressed as a current that is subtracted from the motor's
-//! and may take any value up to its limit at standstill, by the law of a pulse of [`crate::friction::law`], for two
-//! coupled joints.
+//! Coulomb friction of a joint is a set-valued torque. It is expressed as a current that is subtracted from the motor
+//! current. At standstill it may have any value up to its limit. [`crate::friction::law`] gives it for one joint; an
+//! iteration couples the two joints.
 
 use crate::equation::{check_regular, tidy, Equation, ORDER_GRAIN};
 use crate::error::{check_length, check_step, Error, Result};
@@ -18,14 +17,14 @@ use crate::fractional::exponential_sum::{decay, Rates};
 use crate::friction::law::{pulse, Phase};
 use crate::linalg::small;
 
-/// Accuracy of the memory kernels, far below the error of the trapezoidal steps.
+/// Relative accuracy of the sums of exponentials, far below the error of the trapezoidal steps.
 const MEMORY_TOLERANCE: f64 = 1e-10;
-/// Most sweeps of the friction solve. One is enough for decoupled joints, a few for coupled ones.
+/// Maximum number of iterations for the friction of both joints. Decoupled joints need one, coupled joints a few.
 const FRICTION_SWEEPS: usize = 60;
 /// Rounding error relative to the largest rate change by friction.
 const RATE_ROUNDING_RATIO: f64 = 1e-12;
 
-/// Most substeps of a sample. More would take seconds each.
+/// Maximum number of substeps per sample. A sample with more would take seconds.
 const MOST_SUBSTEPS: f64 = 1e6;
 
 /// Number of signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
@@ -40,20 +39,20 @@ pub struct Parameters {
     pub coulomb: [f64; 2],
 }
 
-/// Derivative of one angle and its contributions to the four equations.
+/// Fractional derivative of one angle, and its contributions to the four equations.
 #[derive(Debug, Clone, Default)]
 struct Operator {
     signal: usize,
     order: f64,
     into: [f64; 4],
-    /// Contributions to the momenta on the left of the integrated equations.
+    /// Contributions to the momenta on the left side of the integrated equations.
     momentum: [f64; 4],
     /// Weights of the history states. Empty for orders 0 and 1.
     weights: Vec<f64>,
-    /// Weights of the rate at the start and at the end of the substep.
+    /// Weight of the rate at the start of the substep.
     before: f64,
     now: f64,
-    /// Its value at the start of the substep.
+    /// Value of the derivative at the start of the substep.
     value: f64,
 }
 
@@ -66,7 +65,7 @@ pub struct Arm {
     /// Accelerations per ampere of both motors.
     input: [[f64; 2]; 4],
     coulomb: [f64; 2],
-    /// (P − h/2·C)⁻¹ with the momenta P and the forces C per rate at the end of the substep.
+    /// Matrix (P − h/2·C)⁻¹, where P are the momenta and C the forces per unit rate at the end of the substep.
     solve: [[f64; 4]; 4],
     implicit: [[f64; 4]; 4],
     keep: Vec<f64>,
@@ -80,13 +79,13 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// Arm at rest, stepped `step` s at a time in substeps of at most `longest_substep`, for `horizon` s.
+    /// Arm at rest, with samples of `step` s in substeps of at most `longest_substep` s, for at most `horizon` s.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for an order outside [0, 3), a highest order outside (1, 2], a negative friction, a step
     /// that is not positive, a horizon that is NaN, more than a million substeps; [`Error::NotFinite`] for a
     /// coefficient; [`Error::Structure`] for a singular leading matrix, a differentiated current, and friction of a
-    /// joint that its motor does not drive.
+    /// joint on which its motor does not act.
     pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
         check_step(step)?;
         check_step(longest_substep)?;
@@ -238,7 +237,7 @@ impl Arm {
         std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])))
     }
 
-    /// Apply Coulomb friction: iterate over the friction laws of the joints until both agree.
+    /// Apply Coulomb friction: iterate over the friction laws of both joints until they converge.
     fn apply_friction(&mut self, rate: &mut [f64; 4]) {
         let columns = self.columns();
         let free = *rate;

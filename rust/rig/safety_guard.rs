@@ -1,4 +1,4 @@
-//! Safety guard of real and virtual rigs: limits on every motor command, and latched faults.
+//! Safety guard of real and virtual rigs: limits of every motor command, and latched faults.
 
 use thiserror::Error;
 
@@ -10,11 +10,11 @@ use crate::rig::virtual_arm::Reading;
 pub struct GuardSettings {
     /// Sampling interval \[s\].
     pub step: f64,
-    /// Deflection per volt of strain gauge \[rad/V\]. The deflection is minus the volts above bias times this.
+    /// Deflection per volt of strain gauge \[rad/V\]. The deflection is minus this scale times the volts above bias.
     pub strain_scale: [f64; 2],
-    /// Current per volt of the sense input \[A/V\]. The current is minus the volts times this.
+    /// Current per volt of the sense input \[A/V\]. The current is minus this scale times the volts.
     pub sense_scale: f64,
-    /// Current per volt of the command \[A/V\]. The volts are minus the current over this.
+    /// Current per volt of the command \[A/V\]. The volts are minus the current divided by this scale.
     pub command_scale: f64,
     /// Joint angle per encoder count \[rad\].
     pub encoder_scale: [f64; 2],
@@ -30,9 +30,9 @@ pub struct GuardSettings {
     pub deflection_limit: [f64; 2],
     /// Gauge voltage of saturation \[V\].
     pub saturation: f64,
-    /// Current above which a joint must move \[A\].
+    /// Current above which a joint must move; otherwise its encoder is dead \[A\].
     pub moving_current: f64,
-    /// Longest standstill above that current \[s\].
+    /// Longest standstill above `moving_current` \[s\].
     pub standstill: f64,
     /// Highest joint speed \[rad/s\]. A larger jump of the encoder is a fault.
     pub fastest: f64,
@@ -97,19 +97,19 @@ pub enum Fault {
     /// Command that is NaN or infinite.
     #[error("the command of motor {stage} is {value}, not a finite current; correct the input")]
     Command {
-        /// Which motor.
+        /// Number of the motor.
         stage: usize,
-        /// The value.
+        /// Value of the command.
         value: f64,
     },
-    /// Encoder that does not count although its motor is driven.
+    /// Encoder that does not count although its motor has current.
     #[error("encoder {stage} has not counted for {seconds:.2} s under {current:.2} A or more; it is dead, or the hub is blocked: check its cable and the gear")]
     DeadEncoder {
-        /// Which hub.
+        /// Number of the joint.
         stage: usize,
-        /// How long \[s\].
+        /// Duration of the standstill \[s\].
         seconds: f64,
-        /// Current from which it must move \[A\].
+        /// Current above which the joint must move \[A\].
         current: f64,
     },
     /// Encoder jump beyond the highest joint speed.
@@ -117,15 +117,15 @@ pub enum Fault {
         "encoder {stage} jumped by {counts} counts in one sample; its counter wrapped or its cable is loose: check it"
     )]
     EncoderJump {
-        /// Which hub.
+        /// Number of the joint.
         stage: usize,
-        /// How far.
+        /// Size of the jump in counts.
         counts: i64,
     },
     /// Strain gauge in saturation.
     #[error("strain gauge {stage} is saturated at {volts:.2} V; check its amplifier and cable")]
     Saturated {
-        /// Which link.
+        /// Number of the link.
         stage: usize,
         /// Reading \[V\].
         volts: f64,
@@ -133,19 +133,19 @@ pub enum Fault {
     /// Strain gauge that does not respond to its motor.
     #[error("strain gauge {stage} has stood at {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is dead, and would not see the link bend: check its amplifier and cable")]
     DeadGauge {
-        /// Which link.
+        /// Number of the link.
         stage: usize,
         /// Reading \[V\].
         volts: f64,
-        /// How long \[s\].
+        /// Duration without a response \[s\].
         seconds: f64,
-        /// Change of the current which it must follow \[A\].
+        /// Change of the current that must change the reading \[A\].
         current: f64,
     },
     /// Current sense that is not finite.
     #[error("the current sense of motor {stage} reads {volts} V; check the board's analog inputs")]
     Sense {
-        /// Which motor.
+        /// Number of the motor.
         stage: usize,
         /// Reading \[V\].
         volts: f64,
@@ -153,7 +153,7 @@ pub enum Fault {
     /// Deflection above its limit.
     #[error("link {stage} is bent by {degrees:.2} degrees, more than the limit of {limit:.2}; use a smaller amplitude or avoid its resonance")]
     Deflection {
-        /// Which link.
+        /// Number of the link.
         stage: usize,
         /// Deflection \[degrees\].
         degrees: f64,
@@ -179,7 +179,7 @@ pub enum Fault {
     /// Too many consecutive missed deadlines.
     #[error("{count} deadlines in a row were missed; lower the rate or the machine's load")]
     Missed {
-        /// How many.
+        /// Number of missed deadlines.
         count: u32,
     },
     /// Fault reported by the rig.
@@ -401,7 +401,8 @@ impl Guard {
         }
     }
 
-    /// Noise alone changes the reading of a working gauge. Without noise, a changed torque does.
+    /// Latch a fault if a gauge does not respond. Noise alone changes the reading of a working gauge; without noise, a
+    /// change of torque does.
     fn check_gauge(&mut self, j: usize, volts: f64) {
         let (s, gauge) = (&self.settings, &mut self.gauges[j]);
         #[allow(clippy::float_cmp)]
@@ -432,7 +433,8 @@ impl Guard {
     }
 }
 
-/// Last voltage of a strain gauge, the current at which it began, and its duration under a changed current.
+/// Monitor of one strain gauge: last voltage, current at its start, and duration of this voltage under a changed
+/// current.
 #[derive(Debug, Clone, Copy, Default)]
 struct Gauge {
     volts: f64,
@@ -440,7 +442,7 @@ struct Gauge {
     still: f64,
 }
 
-/// Second-order low-pass filter by the bilinear transform, as in a real-time model.
+/// Second-order low-pass filter, discretized by the bilinear transform.
 #[derive(Debug, Clone, Copy)]
 struct Filter {
     input: [f64; 3],

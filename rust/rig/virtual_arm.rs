@@ -39,14 +39,14 @@ pub struct Sensors {
 pub enum Injection {
     /// The encoder stops counting.
     DeadEncoder {
-        /// Stage, from 0.
+        /// Joint, from 0.
         stage: usize,
         /// First sample.
         from: u64,
     },
-    /// The gauge's amplifier sits at its rail.
+    /// The amplifier of the gauge is saturated.
     SaturatedGauge {
-        /// Stage, from 0.
+        /// Joint, from 0.
         stage: usize,
         /// First sample.
         from: u64,
@@ -60,14 +60,14 @@ pub enum Injection {
     },
     /// Deflection increased by this angle \[rad\].
     Deflection {
-        /// Stage, from 0.
+        /// Joint, from 0.
         stage: usize,
         /// First sample.
         from: u64,
         /// Angle \[rad\].
         angle: f64,
     },
-    /// Delay of the loop at one sample \[s\], on the virtual clock.
+    /// Delay of the control loop at one sample.
     Late {
         /// Sample.
         at: u64,
@@ -225,7 +225,7 @@ fn outside(name: &str, value: f64, range: &str) -> Error {
     }
 }
 
-/// Highest resolution of the converters. With more bits a step is below the rounding error of the volts.
+/// Highest resolution of the converters. With more bits the quantization step is below the rounding error of the volts.
 const MOST_BITS: u32 = 52;
 
 impl Sensors {
@@ -273,7 +273,7 @@ impl Sensors {
     }
 }
 
-/// Real-time deadlines of a loop, counted from its start.
+/// Timer of a control loop with real-time deadlines.
 #[derive(Debug)]
 pub struct Pace {
     start: Instant,
@@ -281,7 +281,7 @@ pub struct Pace {
     samples: u64,
 }
 
-/// Time before a deadline that is spent spinning. The system's sleep ends late by some tens of microseconds.
+/// Time before a deadline of busy waiting, because a sleep ends late by some tens of microseconds.
 const SPIN_WAIT: Duration = Duration::from_micros(120);
 
 /// Longest sampling interval in real time \[s\], one day, so that times do not overflow.

@@ -1,9 +1,9 @@
 //! Complex transforms of blocks of 64 real terms, for products of series block by block.
 //!
-//! Terms 64 to 127 of the product of a block of 64 terms and a piece of 128 terms are the middle product: what a block
-//! of a quotient contributes to a later one. Modulo z⁶⁴ − i a real series a + z⁶⁴ b is the complex series
-//! a + i b, and the imaginary part of the product of the two is the middle product. Its 64 values at the roots of
-//! z⁶⁴ = i are a discrete Fourier transform in two passes of 8, each with [`LANE_COUNT`] columns side by side.
+//! Terms 64 to 127 of the product of a block of 64 terms and a piece of 128 terms are the middle product. It is the
+//! contribution of a block of a quotient to a later block. Modulo z⁶⁴ − i a real series a + z⁶⁴ b is the complex series
+//! a + i b, and the imaginary part of the product of the two is the middle product. Its 64 values at the roots of z⁶⁴ =
+//! i are a discrete Fourier transform in two passes of 8, each with [`LANE_COUNT`] columns side by side.
 
 use std::array::from_fn;
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
@@ -13,7 +13,7 @@ use crate::simd::{self, LANE_COUNT};
 /// Number of terms of a block, and of values of its transform.
 pub const BLOCK_TERMS: usize = LANE_COUNT * LANE_COUNT;
 
-/// Real parts and then imaginary parts of values side by side.
+/// Real parts, then imaginary parts, of [`LANE_COUNT`] values.
 pub(super) type Tile = [[f64; LANE_COUNT]; 2];
 
 /// Values at the roots of z⁶⁴ = i, or terms modulo z⁶⁴ − i, row by row.
@@ -21,11 +21,11 @@ type Square = [Tile; LANE_COUNT];
 
 /// Factors of the transform.
 struct Factors {
-    /// e^{iπ j/128} of term j, which moves the roots of z⁶⁴ = i to those of z⁶⁴ = 1.
+    /// Factor e^{iπ j/128} of term j, which maps the roots of z⁶⁴ = i to those of z⁶⁴ = 1.
     shift: Square,
     /// Conjugates of `shift` divided by 64.
     inverse_shift: Square,
-    /// e^{2πi jk/64} between the passes.
+    /// Twiddle factors e^{2πi jk/64} between the two passes.
     between: Square,
 }
 
@@ -78,7 +78,7 @@ fn sum_rows<const RE: usize, const IM: usize>(x: &mut Square) {
     }
 }
 
-/// Rows times factors or their conjugates (`sign` −1), with rows and lanes exchanged.
+/// Multiply rows by factors, or by their conjugates if `sign` is −1, and transpose rows and lanes.
 #[inline(always)]
 fn turn_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
     for row in 0..LANE_COUNT {
@@ -91,7 +91,7 @@ fn turn_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
     from_fn(|l| [from_fn(|row| x[row][0][l]), from_fn(|row| x[row][1][l])])
 }
 
-/// Transform of a block, or of a block and the one after it.
+/// SIMD task: transform of a block, or of a block and the next one.
 struct ForwardTransform<'a> {
     factors: &'a Factors,
     low: &'a [f64; BLOCK_TERMS],
@@ -138,7 +138,7 @@ pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
     }
 }
 
-/// Middle product whose transform is given.
+/// SIMD task: middle product from its transform.
 struct InverseTransform<'a> {
     factors: &'a Factors,
     tiles: &'a [Tile],

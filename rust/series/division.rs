@@ -1,11 +1,10 @@
 //! Division of series by forward substitution in blocks that are joined by FFT products, O(m log² m).
 //!
-//! Blocks of 64 terms, of 2048 and so on each form a level. Within it the spectra of solved blocks and of the divisor's
-//! pieces are computed once, and only their products are summed for each later block. The many short transforms have
-//! their own code.
-//!
-//! Exact for every divisor with a nonzero leading coefficient, stable or not. [`Division`] returns the quotient block
-//! by block, so that a search can drop a candidate early.
+//! Blocks of 64 terms, of 2048 terms and so on each form a level. In each level the spectra of solved blocks and of the
+//! pieces of the divisor are computed once. Only their products are summed for each later block. The many short
+//! transforms have their own code. The division is exact for every divisor with a nonzero leading coefficient, also if
+//! the quotient is unstable. [`Division`] returns the quotient block by block, so that a search can drop a candidate
+//! early.
 
 use std::borrow::Cow;
 
@@ -18,10 +17,10 @@ use crate::simd::{self, LANE_COUNT};
 
 pub use super::block_transform::BLOCK_TERMS;
 
-/// Terms whose sums stay in registers while the products with a tile are subtracted.
+/// Number of terms whose sums stay in registers while products are subtracted.
 const TILE_TERMS: usize = 8;
 
-/// `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`, with the same operations for every term.
+/// Subtract a product: `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`.
 #[inline(always)]
 fn subtract_product(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     let mut at = TILE_TERMS;
@@ -57,7 +56,7 @@ fn subtract_tile_product<const L: usize>(remainder: &mut [f64], series: &[f64], 
     remainder.copy_from_slice(&sums);
 }
 
-/// Forward substitution within a block of one unknown, in place, tile by tile.
+/// SIMD task: forward substitution within a block of one unknown, in place.
 struct Substitution<'a> {
     divisor: &'a [f64],
     inverse: f64,
@@ -100,19 +99,20 @@ impl simd::SimdKernel for Substitution<'_> {
     }
 }
 
-/// Most blocks of one level. The blocks of the next level are as long as all of them together. 32 was the fastest of 8,
-/// 16 and 32 at m = 2048.
+/// Maximum number of blocks of one level. A block of the next level is as long as all of them together. 32 was the
+/// fastest of 8, 16 and 32 at m = 2048.
 const MAX_LEVEL_BLOCKS: usize = 32;
 
-/// Spectra of the solved blocks of one length, and of the pieces of the n² series that join them to later blocks.
+/// Spectra of the solved blocks of one length, and of the pieces of the n² series by which they contribute to later
+/// blocks.
 ///
-/// Piece d holds the terms d·len to (d + 2)·len of a series. The second half of its product with a block is what the
-/// block contributes to the one d + 1 further on. Contributions of several blocks are summed as spectra, tile by tile,
-/// so the spectra of one tile are stored side by side: blocks forwards, pieces backwards, per equation.
+/// Piece d contains the terms d·len to (d + 2)·len of a series. The second half of its product with block k is the
+/// contribution to block k + d + 1. Contributions of several blocks are summed as spectra, tile by tile, so the spectra
+/// of one tile are stored side by side: blocks forwards, pieces backwards, per equation.
 struct Level {
     transform: Transform,
     len: usize,
-    /// Number of blocks that there is memory for.
+    /// Number of blocks for which memory is allocated.
     capacity: usize,
     blocks: Vec<Tile>,
     pieces: Vec<Tile>,
@@ -123,9 +123,10 @@ struct Level {
 
 /// Transform whose products give the contributions of a block.
 enum Transform {
-    /// Of the shortest blocks.
+    /// Transform of the shortest blocks.
     Block,
-    /// Cyclic, of twice the length of a block. Terms that wrap around fall on the first half, which is not read.
+    /// Cyclic transform of twice the length of a block. Terms that wrap around are added to the first half, which is
+    /// not used.
     Cyclic(Plan),
 }
 
@@ -185,7 +186,7 @@ impl LevelBuffers {
         }
     }
 
-    /// Contribution of which the sum is the spectrum.
+    /// Contribution to a block, from its spectrum `tiles`.
     fn invert(&mut self, transform: &Transform, tiles: &[Tile]) -> &[f64] {
         let plan = match transform {
             Transform::Block => {
@@ -207,7 +208,7 @@ impl LevelBuffers {
     }
 }
 
-/// Spectrum of what the first `count` blocks of a level contribute to equation `i` in the next block.
+/// SIMD task: spectrum of the contribution of the first `count` blocks of a level to equation `i` in the next block.
 struct Contributions<'a> {
     n: usize,
     i: usize,
@@ -242,8 +243,8 @@ impl simd::SimdKernel for Contributions<'_> {
 /// State of an n × n division that computes the quotients block by block.
 ///
 /// Right-hand sides are added block by block ([`Division::add`]). [`Division::advance`] then solves the next block and
-/// adds the contributions of solved blocks to one later block, of the longest level whose blocks end there. Every block
-/// is transformed once, so one transform pair a block is enough.
+/// adds the contributions of solved blocks to one later block. That block belongs to the longest level whose blocks end
+/// there. Every block is transformed once.
 pub struct Division {
     n: usize,
     m: usize,
@@ -308,7 +309,7 @@ impl Division {
         &self.rest[i][..self.solved]
     }
 
-    /// All quotients. Terms beyond the solved ones are remainders.
+    /// All quotients. Terms that are not solved yet are remainders.
     pub(super) fn quotients(&self) -> &[Vec<f64>] {
         &self.rest
     }
@@ -427,7 +428,7 @@ impl Division {
 }
 
 /// Index of the longest level with a block that ends at term `solved`, the length of its blocks, and the number of them
-/// that the next one must be joined to.
+/// that contribute to the next block.
 fn level_at(solved: usize) -> (usize, usize, usize) {
     let (mut level, mut len, mut count) = (0, BLOCK_TERMS, solved / BLOCK_TERMS);
     while count != 0 && count.is_multiple_of(MAX_LEVEL_BLOCKS) {
@@ -436,7 +437,7 @@ fn level_at(solved: usize) -> (usize, usize, usize) {
     (level, len, count % MAX_LEVEL_BLOCKS)
 }
 
-/// Quotient mod z^m with m the numerator's length, exact for stable and unstable divisors. O(m log² m).
+/// Quotient mod z^m, where m is the length of the numerator; exact also if the quotient is unstable. O(m log² m).
 ///
 /// # Errors
 /// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than m.

@@ -1,4 +1,5 @@
-//! Power series in the one-step delay, truncated: multiply, divide, solve, and naive oracles.
+//! Truncated power series in the one-step delay: products, quotients, linear systems, and reference algorithms for
+//! tests.
 //!
 //! A causal operator on pulse means is a polynomial in the delay z truncated at z^m. The fractional integral F^η is one
 //! of them. All such operators commute. Products ([`product`]) are convolutions by FFT. Quotients ([`division`]) use

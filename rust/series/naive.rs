@@ -1,4 +1,4 @@
-//! Products and quotients of series by definition, the oracles of the fast algorithms.
+//! Products and quotients of series by definition, as references for tests of the fast algorithms.
 
 use super::product::direct;
 use crate::error::{Error, Result};

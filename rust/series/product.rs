@@ -4,7 +4,8 @@ use std::cell::RefCell;
 
 use crate::fft::{self, Bin, Plan, Workspace};
 
-/// Longest shorter factor of a direct product. Direct products are faster there and have no transform rounding.
+/// Largest length of the shorter factor of a direct product. Up to it, direct products are faster and have no rounding
+/// error of transforms.
 const MAX_DIRECT_TERMS: usize = 64;
 
 /// Product mod z^m by definition. O(m²).
@@ -21,7 +22,7 @@ pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
 /// Product mod z^m, that is the causal convolution of a kernel with a signal. O(m log m).
 ///
 /// # Panics
-/// If m points exceed the memory, as `vec![0.0; m]` does.
+/// If m points exceed the memory.
 #[must_use]
 pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     let (a, b) = (&a[..a.len().min(m)], &b[..b.len().min(m)]);
@@ -36,8 +37,8 @@ pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
 
 /// Products mod z^m of one series of m terms with many signals of m terms, in place. O(m log m) a signal.
 ///
-/// The spectrum of the series is computed once. `signals` holds them one after another; a rest of fewer than m terms is
-/// left as it is. A series that is zero from its second term on multiplies exactly.
+/// The spectrum of the series is computed once. `signals` holds them one after another; a remainder of fewer than m
+/// terms is unchanged. The product is exact for a series that is zero from its second term on.
 ///
 /// ```
 /// let mut signals = [1.0, 2.0, 3.0, 0.0, 1.0, 0.0];
@@ -106,7 +107,7 @@ impl Kernel {
         with_thread_buffers(plan.len(), |buffers| Self::from_plan(plan.clone(), series, buffers))
     }
 
-    /// [`Kernel::new`] with buffers of the caller.
+    /// Kernel as by [`Kernel::new`], with buffers of the caller.
     #[must_use]
     pub(crate) fn made_with(series: &[f64], buffers: &mut Buffers) -> Self {
         Self::from_plan(fft::plan(fft::fast_length(2 * series.len())), series, buffers)

@@ -2,17 +2,17 @@
 //!
 //! In pulse means I^η of integer order is h^η/(η+1)!·A(z)/(1−z)^η with an Eulerian polynomial A of degree η. In powers
 //! of 1−z it is a combination of running sums Q^l, Q = 1/(1−z), l = 0 … η. A system of such integrals is thus y = G₀ +
-//! Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and the inputs: one state for each sum. The sums stay as small as
-//! the motion, unlike the terms of a difference equation in y alone.
+//! Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and the inputs: one state for each sum. The sums have the
+//! magnitude of the outputs, unlike the terms of a difference equation in y.
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::small;
 use crate::simd::{dispatch_simd, SimdKernel};
 
-/// Highest order of an integral. Transforms are as fast for higher orders.
+/// Highest order of an integral. For higher orders transforms are as fast.
 pub const MAX_SUMS: usize = 6;
 
-/// Right-hand sides solved side by side. A single one would wait for the latency of its last term.
+/// Number of right-hand sides solved in parallel lanes, which hides the latency of the recursion.
 pub const RIGHT_SIDE_LANES: usize = 4;
 
 /// Terms of one chunk, so that its inputs stay in the cache.
@@ -129,7 +129,7 @@ impl RunningSumSystem {
         Ok(solved.map(|answer| vec![answer]).collect())
     }
 
-    /// One unknown for up to [`RIGHT_SIDE_LANES`] right-hand sides. L is the number of sums plus one.
+    /// Solve a system of one unknown for up to [`RIGHT_SIDE_LANES`] right-hand sides. L is the number of sums plus one.
     fn solve_one_unknown<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
         let mut own = [0.0; L];
         own.copy_from_slice(&self.own[..L]);
@@ -201,7 +201,7 @@ impl RunningSumSystem {
     }
 }
 
-/// One unknown for [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms.
+/// SIMD task that solves for one unknown and [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms.
 struct Block<'a, const L: usize> {
     own: &'a [f64; L],
     inverse: f64,

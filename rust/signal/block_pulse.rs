@@ -2,12 +2,12 @@
 //! times.
 //!
 //! Row j of a record is the sample at t = jh. An input command is held over [jh, (j+1)h). A measured signal is linear
-//! between its samples. Samples used in place of means would bias every estimate.
+//! between its samples. Estimates from samples in place of means would be biased.
 //!
-//! Four pulse means around a sample time determine a smooth signal to fourth order: the slope of the quartic through
-//! the integral at the pulse edges. Jumps of a zero-order-hold input break the smoothness. I^η of a jump of size Δ at p
-//! is Δ (t − p)^η/Γ(η + 1), which has a slope discontinuity, and pulse means spread the jump over its pulse. Both
-//! effects are known exactly, so samples near a jump are corrected by their difference.
+//! Four pulse means around a sample time determine a smooth signal to fourth order, by the slope of the quartic through
+//! its integral at the pulse edges. After a jump of a zero-order-hold input the signal is not smooth. I^η of a jump of
+//! size Δ at p is Δ (t − p)^η/Γ(η + 1), which has a slope discontinuity. Pulse means replace the jump by a ramp within
+//! its pulse. Both responses are known exactly, so samples near a jump are corrected by their difference.
 
 use crate::error::{check_finite, check_points, Error, Result};
 
@@ -20,7 +20,7 @@ pub enum Intersample {
     Linear,
 }
 
-/// Means of one signal over equal pulses. No conversion from or to samples is implicit.
+/// Means of one signal over equal pulses. Conversion from or to samples is always explicit.
 ///
 /// ```compile_fail,E0308
 /// use ftlm::regressors::Record;
@@ -69,11 +69,11 @@ impl PulseMeans {
 
 /// Means over `m` equal pulses of [0, (N−1)h] of a signal with N samples. O(N + m).
 ///
-/// `m` is arbitrary: N−1 is the grid of the record, a multiple of it refines the grid with the same inter-sample
-/// behavior, and a smaller `m` integrates exactly.
+/// `m` is arbitrary. m = N − 1 is the grid of the samples, and a multiple of it is a finer grid. A smaller `m` gives
+/// exact means over several samples.
 ///
 /// # Errors
-/// Fewer than two samples, m = 0 or beyond memory, a sample that is not finite.
+/// Fewer than two samples, m = 0 or too large for the memory, a sample that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -151,7 +151,7 @@ fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f6
 /// Delay samples by `delay` steps, whole and fractional: u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
 ///
 /// The result gives exact means of a held command after a delay of (d+φ)h. `before` is the value before the record.
-/// With a negative delay the last sample stays behind the end of the record.
+/// With a negative delay, the last sample is repeated at the end of the record.
 ///
 /// # Errors
 /// A delay or a sample that is not finite.
@@ -183,7 +183,8 @@ pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64
         .collect())
 }
 
-/// Row that acts in row `j` after a delay by whole rows, negative ones included; None before the record.
+/// Index of the row that row `j` shows after a delay by an integer number of rows, which may be negative; None before
+/// the record.
 pub(crate) fn delayed_row(j: usize, delay: isize) -> Option<usize> {
     j.checked_add_signed(delay.saturating_neg())
 }
@@ -203,10 +204,10 @@ pub fn point_samples(means: &[f64]) -> Vec<f64> {
     samples
 }
 
-/// Pulse means in the stencil of one sample.
+/// Number of pulse means from which one sample is interpolated.
 const STENCIL_PULSES: usize = 4;
-/// Pulses after a jump within which samples are corrected. Beyond, the error of spreading the jump falls with the
-/// square of the step, like all other errors of the scheme.
+/// Pulses after a jump within which samples are corrected. Later, the error decreases with the square of the step, like
+/// all other errors of the scheme.
 const KINK_RANGE_PULSES: f64 = 16.0;
 
 /// Jump of a held signal near a sample time. Lengths in pulses.
@@ -216,7 +217,7 @@ struct NearbyJump {
     before: f64,
     /// First pulse of the stencil, relative to the pulse of the jump.
     first: isize,
-    /// Fraction of its pulse before the jump.
+    /// Fraction of the pulse of the jump that is before the jump.
     share: f64,
     size: f64,
 }
@@ -346,8 +347,8 @@ impl SampleInterpolation {
     }
 }
 
-/// Weights of four pulse means for the value at x pulses from the start of the first one: slopes of the Lagrange
-/// polynomials through the integral at the five edges.
+/// Weights of four pulse means for the value at x pulses from the start of the first one. They are slopes of the
+/// Lagrange polynomials through the integral at the five edges.
 #[allow(clippy::cast_precision_loss)]
 fn stencil(x: f64) -> [f64; STENCIL_PULSES] {
     let slope = |m: usize| -> f64 {

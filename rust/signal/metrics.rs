@@ -7,13 +7,13 @@ use crate::fft;
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub struct Metrics {
-    /// Σ|y − ŷ| (paper (45)), in the unit of the output.
+    /// Sum of absolute errors Σ|y − ŷ| (paper (45)), in the unit of the output.
     pub error: f64,
     /// Root mean square error √(Σ(y − ŷ)²/M), equation (46) of the paper.
     pub rmse: f64,
-    /// RMSE / σ(y), σ over M (paper (47) as its tables use it).
+    /// Normalized error NR = RMSE / σ(y), σ with divisor M (paper (47), as in its tables).
     pub nr: f64,
-    /// 100·(1 − ‖y − ŷ‖/‖y − ȳ‖) in percent.
+    /// Fit 100·(1 − ‖y − ŷ‖/‖y − ȳ‖) in percent.
     pub fit_percent: f64,
 }
 
@@ -53,7 +53,7 @@ pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Correlation {
-    /// r(k) = corr(x(t + k), y(t)) for k = −lags … lags. Zero for a constant signal.
+    /// Correlations r(k) = corr(x(t + k), y(t)) for k = −lags … lags; zero for a constant signal.
     pub values: Vec<f64>,
     /// Variance of each value for independent x and y: Bartlett's Σ ρx(τ)ρy(τ)/N (doi:10.2307/2983611).
     ///
@@ -63,7 +63,7 @@ pub struct Correlation {
     pub window: usize,
 }
 
-/// Correlation times in the truncated sum (Sokal's windowing). A longer window adds only noise.
+/// Length of the truncated sum in correlation times (Sokal's windowing). A longer window adds only noise.
 const WINDOW_CORRELATION_TIMES: f64 = 6.0;
 
 /// Correlations up to `lags` of x with y, each run about its own mean. O(N log N).
@@ -155,7 +155,7 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     behind.chain(&time[..=lags]).copied().collect()
 }
 
-/// Oracle of [`covariances`] by definition. O(N lags).
+/// Cross-covariances by definition, a reference for tests of [`covariances`]. O(N lags).
 #[cfg(feature = "oracles")]
 #[must_use]
 pub fn covariances_naive(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {

@@ -8,7 +8,7 @@ use std::borrow::Cow;
 use super::block_pulse::{check_pulses, Intersample, PulseMeans};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 
-/// Largest distance of a sample from an edge of a pulse, in pulses, at which both coincide.
+/// Largest distance of a sample time from a pulse edge, in pulses, at which the two coincide.
 const EDGE_TOLERANCE_PULSES: f64 = 1e-6;
 /// Relative tolerance of comparisons of times, as a share of the duration.
 pub(crate) const TIME_TOLERANCE: f64 = 1e-12;
@@ -22,7 +22,7 @@ pub struct NonuniformSignal<'a> {
 }
 
 impl<'a> NonuniformSignal<'a> {
-    /// Signal of as many samples as times, one at least. Values may be NaN where a linear signal was not read.
+    /// Signal with one value per sample time, at least one. Missing values of a linear signal are NaN.
     ///
     /// # Errors
     /// [`Error::Length`]; [`Error::Structure`] for times that do not ascend from 0.
@@ -37,7 +37,8 @@ impl<'a> NonuniformSignal<'a> {
         Self { times: Cow::Borrowed(times), values: Cow::Borrowed(values), intersample }
     }
 
-    /// Signal after a delay \[s\], with the value before its first sample; after a negative one the last value stays.
+    /// Signal after a delay \[s\], with the value before its first sample; with a negative delay, the last value is
+    /// held.
     #[must_use]
     pub fn with_delay(self, delay: f64, before: f64) -> Self {
         if delay == 0.0 {
@@ -80,7 +81,7 @@ impl<'a> NonuniformSignal<'a> {
         }))
     }
 
-    /// Means of a zero-order-hold signal: bit-exact where the value is constant within a pulse.
+    /// Means of a zero-order-hold signal, without rounding error if the value is constant within a pulse.
     fn hold_means(&self, edges: &[f64], step: f64) -> Vec<f64> {
         let m = edges.len() - 1;
         let close = |edge: f64, time: f64| (edge - time).abs() <= EDGE_TOLERANCE_PULSES * step;
@@ -150,7 +151,8 @@ impl<'a> NonuniformSignal<'a> {
         times.iter().map(value_before).collect()
     }
 
-    /// Times \[s\] and sizes of the jumps of a hold, the one from 0 at the start included; None for a linear signal.
+    /// Times \[s\] and sizes of the jumps of a zero-order-hold signal, including the initial jump from 0; None for a
+    /// linear signal.
     #[must_use]
     pub fn jumps(&self) -> Option<(Vec<f64>, Vec<f64>)> {
         let mut before = 0.0;
@@ -178,7 +180,7 @@ pub(crate) fn check_times(times: &[f64]) -> Result<()> {
 
 /// Linear interpolation of samples at ascending times; the first or last value outside them.
 ///
-/// Next to a missing value (NaN) only the sample times themselves have values.
+/// In an interval with a missing value (NaN) at one end, the result is NaN.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn interpolate(time: f64, times: &[f64], values: &[f64]) -> f64 {

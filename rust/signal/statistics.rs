@@ -7,14 +7,14 @@ use crate::simd::{dispatch_simd, dot, SimdKernel};
 pub const NORMAL_MAD_PER_SIGMA: f64 = 0.674_489_750_196_081_7;
 /// Huber's threshold in standard deviations. Under normal noise the efficiency is 95 % of that of least squares.
 pub const HUBER_THRESHOLD: f64 = 1.345;
-/// 99 % quantile of a normal variable. The test rejects one in a hundred true models.
+/// 99 % quantile of a normal variable. A test with this quantile rejects 1 % of true models.
 const NORMAL_99: f64 = 2.326_347_874_040_840_8;
 /// Default number of lags of a whiteness test.
 pub const WHITENESS_LAGS: usize = 25;
-/// Most values that are summed serially before pairwise summation.
+/// Maximum number of values that are summed one by one in pairwise summation.
 const MAX_SERIAL_SUM_VALUES: usize = 128;
 
-/// Inner product of two rows of one length.
+/// SIMD task: inner product of two rows of equal length.
 struct Inner<'a>(&'a [f64], &'a [f64]);
 
 impl SimdKernel for Inner<'_> {
@@ -133,14 +133,15 @@ pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
     (sums, pairs)
 }
 
-/// A series about its own mean, 0 at missing samples.
+/// Series minus its mean; 0 at missing samples.
 fn subtract_mean(values: &[f64]) -> Vec<f64> {
     let finite: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
     let center = if finite.is_empty() { 0.0 } else { mean(&finite) };
     values.iter().map(|v| if v.is_nan() { 0.0 } else { v - center }).collect()
 }
 
-/// Sum over lags of (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)², chi-squared with as many degrees of freedom for white noise.
+/// Portmanteau statistic Σ_k (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)² over `lags` lags k. For white noise it is chi-squared with
+/// `lags` degrees of freedom.
 ///
 /// The variance of noise may change within the series: that of each lag is estimated from the products themselves
 /// (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). Each series is centered on its own mean, and the results
@@ -200,16 +201,16 @@ pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
     degrees * libm::pow(1.0 - spread + quantile * spread.sqrt(), 3.0)
 }
 
-/// Samples of the shortest run needed for each coefficient of an autoregression.
+/// Number of samples of the shortest run that are needed for each coefficient of an autoregression.
 const SAMPLES_A_COEFFICIENT: usize = 10;
-/// Fewest points of the circulant. A correlation of 0.99 per sample has decayed within it.
+/// Minimum length of the circulant matrix. Within it, a correlation of 0.99 per sample has decayed.
 const LEAST_CIRCLE: usize = 4096;
 
-/// Whitening filter 1, a₁, …, aₙ of series with one spectrum, and the innovation variance.
+/// Whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance. // The Yule–Walker
+/// equations are solved by the Levinson–Durbin recursion (doi:10.1093/biomet/47.3-4.233).
 ///
-/// Yule-Walker equations by Levinson-Durbin (doi:10.1093/biomet/47.3-4.233). Covariances are pooled over the series,
-/// each about its own mean. The order, `most` at most, minimizes the Bayesian information criterion. NaN counts as a
-/// missing sample.
+/// Covariances are pooled over the series, each about its own mean. The order, `most` at most, minimizes the Bayesian
+/// information criterion. NaN counts as a missing sample.
 ///
 /// ```
 /// // Every other value the opposite: x_k = −0.9 x_{k−1} + a bounded disturbance.
@@ -258,9 +259,9 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
 
 /// Autoregression 1, a₁, …, aₙ of a series and the innovation variance, by Burg's method.
 ///
-/// The series is not centered. Yule-Walker estimates move a root near 1, that of a random walk, inward and so
-/// underestimate slow correlation; Burg's do not (Kay, Modern Spectral Estimation, §7.6). The order, at most `most`,
-/// minimizes Schwarz's criterion. NaN marks a missing sample: pairs that begin or end at it are left out.
+/// The series is not centered. Yule–Walker estimates shift a root near 1, as of a random walk, inward, so they
+/// underestimate slow correlation. Burg's estimates do not (Kay, Modern Spectral Estimation, §7.6). The order, at most
+/// `most`, minimizes Schwarz's criterion. NaN marks a missing sample: pairs that begin or end at it are left out.
 ///
 /// ```
 /// // The sum of ±1 is a random walk: each value predicts the next one.
@@ -310,16 +311,16 @@ pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
     (best, remaining)
 }
 
-/// Samples needed for each lag of an input in an ARX model, all runs together.
+/// Number of samples of all runs that are needed for each lag of an input in an ARX model.
 const SAMPLES_AN_INPUT_LAG: usize = 40;
-/// Share of a column of a regression that is left beside the columns before it, below which it is dropped.
+/// Relative residual of a regression column on the previous columns, below which the column is omitted.
 const COLUMN_TOLERANCE: f64 = 1e-8;
 
-/// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t), k ≥ 1, of series that may follow inputs.
+/// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t), k ≥ 1, of series that may depend on inputs.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct ArxModel {
-    /// Whitening filter 1, a₁, …, aₙ of the noise, without what follows the inputs.
+    /// Whitening filter 1, a₁, …, aₙ of the noise, without the response to the inputs.
     pub filter: Vec<f64>,
     /// First row of the innovations in each series.
     pub start: usize,
@@ -331,10 +332,10 @@ pub struct ArxModel {
 
 /// ARX model with a noise spectrum that all series share, by least squares. O((lags · inputs)² · N).
 ///
-/// An AR model without the inputs would take the response to an input for noise, and mask it. The order of the AR part,
-/// at most `most`, minimizes the Bayesian information criterion; inputs have lags 1 to `most`, fewer if samples are few.
-/// Lag 0 is left out: under feedback, the input at lag 0 contains the current noise. NaN is a missing sample of a series;
-/// `inputs` have one row for each series and no missing samples.
+/// An AR model without inputs would model the response to an input as noise. The order of the AR part, at most `most`,
+/// minimizes the Bayesian information criterion; inputs have lags 1 to `most`, fewer if samples are few. Lag 0 is left
+/// out: under feedback, the input at lag 0 contains the current noise. NaN is a missing sample of a series; `inputs`
+/// have one row for each series and no missing samples.
 ///
 /// ```
 /// // A sinusoid that follows an input, and noise that changes its sign at random: the filter is that of the noise.
@@ -430,7 +431,8 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
     ArxModel { filter, start, innovations, parameters: regression.used.len() }
 }
 
-/// Rows about their own means, all divided by the largest value, and that value; NaN stays.
+/// Subtract its mean from each row and divide all rows by the largest magnitude; return the rows and that magnitude.
+/// NaN remains.
 fn scale_to_one(rows: &[&[f64]]) -> (Vec<Vec<f64>>, f64) {
     let centered: Vec<Vec<f64>> = rows
         .iter()
@@ -443,7 +445,7 @@ fn scale_to_one(rows: &[&[f64]]) -> (Vec<Vec<f64>>, f64) {
     (centered.into_iter().map(|row| row.into_iter().map(|v| v / scale).collect()).collect(), scale)
 }
 
-/// Stepwise regression of the last column of a Gram matrix on its others, by the sweep operator.
+/// Stepwise regression of the last column of a Gram matrix on the other columns, by the sweep operator.
 #[derive(Debug, Clone)]
 struct Regression {
     gram: Vec<Vec<f64>>,
@@ -474,12 +476,12 @@ impl Regression {
         self.used.push(column);
     }
 
-    /// Sum of squares that the columns leave of the last one.
+    /// Residual sum of squares of the last column.
     fn residual_power(&self) -> f64 {
         self.gram.last().and_then(|line| line.last()).copied().unwrap_or(0.0)
     }
 
-    /// Coefficient of each column, 0 for those that are not used; none for the last.
+    /// Coefficient of each column except the last; 0 for columns that are not used.
     fn coefficients(&self) -> Vec<f64> {
         let last = self.gram.len() - 1;
         let mut values = vec![0.0; last];
@@ -538,7 +540,7 @@ pub fn multiply_toeplitz(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> 
         .collect()
 }
 
-/// The least power of two above a number.
+/// Smallest power of two above a number.
 fn power_above(number: usize) -> usize {
     1 << (usize::BITS - number.leading_zeros())
 }

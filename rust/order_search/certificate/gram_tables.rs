@@ -350,12 +350,12 @@ impl Region {
         Ok(())
     }
 
-    /// Whether a term belongs to the output itself.
+    /// True if the signal of a term is the output.
     fn own(&self, term: usize) -> bool {
         self.terms[term].signal == self.output
     }
 
-    /// Lowest and highest order of integration of a term.
+    /// Lowest and highest integration order α − ν of a term.
     pub(super) fn integrations(&self, term: usize) -> (f64, f64) {
         let least = if self.own(term) { self.min_separation } else { 0.0 };
         ((self.alpha.0 - self.terms[term].highest).max(least), self.alpha.1 - self.terms[term].lowest)
@@ -400,7 +400,7 @@ impl Region {
         Some((alpha, etas.iter().map(|eta| alpha - eta).collect()))
     }
 
-    /// Orders of integration of the region near the midpoint of a cell. `None` if the cell contains none.
+    /// Integration orders in the region that are nearest to the midpoint of a cell. `None` if the cell contains none.
     pub(super) fn midpoint_orders(&self, within: &[(f64, f64)]) -> Option<Vec<f64>> {
         let (low, high) = self.alpha_interval(within)?;
         let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);

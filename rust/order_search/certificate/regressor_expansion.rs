@@ -1,9 +1,9 @@
 //! Taylor expansion of the regressor I^η s in its order η, with a bound of the remainder.
 //!
-//! v_n = Δ²n^{η+1} is differentiated term by term. Columns may be scaled freely, also by e^{−λ(η−η₀)}. With λ the
-//! mean logarithmic slope of the column at η₀, the scaled column rotates but hardly changes its norm. The remainder
-//! after the third derivative follows from a bound of the fourth: it is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two
-//! pulses, whose terms increase with η from t = 1 on.
+//! The kernel v_n = Δ²n^{η+1} is differentiated term by term. Columns may be scaled, also by e^{−λ(η−η₀)}. If λ is the
+//! mean logarithmic slope of the column at η₀, the scaled column changes its direction but hardly its norm. The
+//! remainder follows from a bound of the fourth derivative, which is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two
+//! pulses. Its terms increase with η for t ≥ 1.
 
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
@@ -17,15 +17,15 @@ pub(super) const EXPANSION_DEGREE: usize = 3;
 /// Number of columns of the expansion: the value and its derivatives.
 pub(super) const EXPANSION_COLUMNS: usize = EXPANSION_DEGREE + 1;
 
-/// Terms of the binomial sum at distances below [`NEAR_DISTANCE_PULSES`], where it converges slowly, and above. 4^−26
-/// and 64^−10 are below the rounding error.
+/// Number of terms of the binomial sum at distances below [`NEAR_DISTANCE_PULSES`], where it converges slowly, and
+/// above. The omitted terms, 4^−26 and 64^−10, are below the rounding error.
 const BINOMIAL_TERMS: [usize; 2] = [26, 10];
 const NEAR_DISTANCE_PULSES: usize = 8;
 
 /// Factorials of 0 to 4.
 const FACTORIAL_TABLE: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
 
-/// Expansion of one signal's regressor about one order. Records are concatenated, and the value has unit norm.
+/// Expansion of the regressor of one signal about one order. Records are concatenated, and the value has unit norm.
 pub(super) struct RegressorExpansion {
     pub(super) columns: [Vec<f64>; EXPANSION_COLUMNS],
     /// Norms of the columns.
@@ -34,7 +34,8 @@ pub(super) struct RegressorExpansion {
     pub(super) remainder: f64,
 }
 
-/// Σ_k C(η+1, 2k) n^{−2k} and its derivatives over their factorials, and n^{η+1} and ln n, by distance n from 2 on.
+/// Binomial sums Σ_k C(η+1, 2k) n^{−2k}, their derivatives divided by factorials, n^{η+1} and ln n, for distances n ≥
+/// 2.
 struct BinomialSums {
     eta: f64,
     sums: Vec<[f64; EXPANSION_COLUMNS]>,
@@ -74,7 +75,7 @@ impl BinomialSums {
         Self { eta, sums: sums.collect(), powers: powers.collect() }
     }
 
-    /// (∂/∂η − μ)^j v_n, n = 1 … m.
+    /// Scaled derivative (∂/∂η − μ)^j v_n of the kernel, n = 1 … m.
     fn derivative(&self, j: usize, mu: f64, m: usize) -> Vec<f64> {
         let power = |x: f64| x.powi(i32::try_from(j).unwrap_or(0));
         let double = libm::exp2(self.eta + 1.0);
@@ -94,7 +95,7 @@ impl BinomialSums {
     }
 }
 
-/// Σ_n of the upper bounds of |(∂/∂η − μ)⁴ v_n|, for all orders up to `highest`.
+/// Sum over n of upper bounds of |(∂/∂η − μ)⁴ v_n|, for all orders up to `highest`.
 #[allow(clippy::cast_precision_loss)]
 fn fourth_derivative_bound(highest: f64, mu: f64, m: usize) -> f64 {
     let b = highest;
@@ -191,7 +192,7 @@ impl RegressorExpansion {
 }
 
 impl BinomialSums {
-    /// Σ_n of the moduli of the summands of the derivative.
+    /// Sum over n of the moduli of the summands of the derivative.
     fn moduli(&self, j: usize, mu: f64) -> f64 {
         let power = |x: f64| x.abs().powi(i32::try_from(j).unwrap_or(0));
         let near = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
@@ -207,7 +208,7 @@ impl BinomialSums {
     }
 }
 
-/// Relative rounding-error bound of a sum with this many terms, a generous multiple.
+/// Relative rounding-error bound of a sum of `m` terms, with a safety factor.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn rounding_unit(m: usize) -> f64 {
     16.0 * f64::EPSILON * (m.max(64) as f64)

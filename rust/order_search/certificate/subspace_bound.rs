@@ -1,16 +1,16 @@
 //! Lower bound over a cell from the subspace spanned by its columns and their first two derivatives.
 //!
-//! Near orders with nearly dependent columns the coefficients are poorly determined, and a bound based on them proves
-//! nothing. The distance of the output from this subspace still bounds the equation error for coefficients of limited
+//! If the columns are nearly dependent, the coefficients are poorly determined, and the bound of `cell_bound` is
+//! useless. The distance of the output from this subspace still bounds the equation error for coefficients of limited
 //! size, since the subspace omits only terms of third order from the columns.
 
 use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPANSION_COLUMNS, MAX_TERMS};
 
-/// Number of spanning columns of a term: the value and its derivatives.
+/// Number of columns of the subspace per term: the value and its derivatives.
 const SPANNED_DERIVATIVES: usize = 3;
 const MAX_BASIS_ROWS: usize = SPANNED_DERIVATIVES * MAX_TERMS;
-/// Ridge on the squared coefficients, relative to the goal for all of them together, and its minimum. The ridge keeps
-/// nearly dependent columns harmless.
+/// Ridge on the sum of squared coefficients, relative to the goal. The ridge limits the coefficients of nearly
+/// dependent columns.
 const RIDGE_GOAL_SHARE: f64 = 0.05;
 const MIN_RIDGE: f64 = 1e-11;
 /// Relative margin for the rounding of the bound.
@@ -77,8 +77,8 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Lower bound of the relative squared residual over the cell, 0 if nothing is proved. It holds for coefficients
-    /// whose terms sum up to at most `largest` times the norm of the output. The ridge is tuned for `goal`.
+    /// Lower bound of the relative squared residual over the cell, 0 without a proof. It holds for coefficients whose
+    /// terms have a sum of norms of at most `largest` times the norm of the output. The ridge is tuned for `goal`.
     pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
         if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || goal.is_nan() {
             return 0.0;
@@ -112,7 +112,7 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Approximate minimizer of the form with the ridge.
+    /// Approximate minimizer of the quadratic form with the ridge added.
     fn ridge_solution(&self, added: f64) -> [f64; MAX_BASIS_ROWS] {
         let n = self.count;
         let mut factor = self.matrix;

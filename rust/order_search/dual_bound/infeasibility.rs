@@ -1,6 +1,6 @@
-//! Infeasibility proofs: no coefficients reduce a candidate's error to the threshold.
+//! Proofs of infeasibility: no coefficients reduce the error of a candidate to the threshold.
 //!
-//! They serve candidates whose coefficients are not refined yet. With d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of
+//! They are used before the coefficients of a candidate are refined. With d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of
 //! at most L requires |⟨t, w⟩|² ≤ L²(|d|‖t‖ + S)² for every test vector t, by the dual bound, and
 //!
 //!   (a + S)² ≤ (1+κ)a² + (1+1/κ)S², S² ≤ Σ c_i²ρ_i²/p_i for any κ, p_i > 0 with Σ p_i = 1.
@@ -12,13 +12,13 @@ use crate::linalg::small::packed_index;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, Wide, NO_INDEX};
 use crate::simd::LANE_COUNT;
 
-/// Maximum steps of the search for multipliers of the test vectors. On the grid of Plant A, three suffice on average.
+/// Maximum number of steps of the search for multipliers of the test vectors. Three suffice on average.
 const MAX_MULTIPLIER_STEPS: usize = 12;
-/// Relative rounding margin of a diagonal element and its row, a generous multiple of k² ε.
+/// Relative rounding margin of a diagonal element and its row: k² ε with a safety factor.
 const DEFINITENESS_MARGIN: f64 = 1e-12;
 
-/// Contribution of one unknown to a group of conditions. It has a part in ⟨t, w⟩ over the limit, one in d‖t‖ (real and
-/// imaginary parts each), and ρ.
+/// Contribution of one unknown to a group of conditions: to ⟨t, w⟩ divided by the limit, to d‖t‖ (real and imaginary
+/// part each), and ρ.
 #[derive(Debug, Clone, Copy)]
 struct Effect {
     error: [Wide; 2],
@@ -29,16 +29,16 @@ struct Effect {
 const NO_EFFECT: Effect =
     Effect { error: [[0.0; LANE_COUNT]; 2], divisor: [[0.0; LANE_COUNT]; 2], slack: [0.0; LANE_COUNT] };
 
-/// State of one infeasibility proof, reused between candidates.
+/// Workspace of an infeasibility proof, reused from candidate to candidate.
 #[derive(Default)]
 pub(crate) struct InfeasibilityProof {
     /// Number of unknowns. The last one is the constant 1.
     unknowns: usize,
-    /// Effect of unknown i on group g at g·unknowns + i.
+    /// Effect of unknown i on group g, at index g·unknowns + i.
     effects: Vec<Effect>,
     at: Vec<f64>,
     weights: Vec<Wide>,
-    /// Lower rows of the weighted form, of its part from ⟨t, w⟩ alone, and moduli of its diagonal.
+    /// Lower triangle of the weighted quadratic form, row-major.
     form: Vec<f64>,
     errors: Vec<f64>,
     sizes: Vec<f64>,
@@ -126,8 +126,9 @@ impl InfeasibilityProof {
         self.at.push(1.0);
     }
 
-    /// Search multipliers whose quadratic form is positive definite. Each step moves to the minimizer of the last form
-    /// and raises the multipliers of the conditions violated there. Return `false` once no condition is violated.
+    /// Search for multipliers whose quadratic form is positive definite. Each step moves to the minimizer of the last
+    /// form and increases the multipliers of the conditions that are violated there. Return `false` once no condition
+    /// is violated.
     #[inline(always)]
     pub(super) fn find_multipliers(&mut self) -> bool {
         let k = self.unknowns;
@@ -191,7 +192,7 @@ impl InfeasibilityProof {
         false
     }
 
-    /// Violation ratio, |d|‖t‖ and S of one group of conditions at the current point.
+    /// Violation ratio, |d|‖t‖ and S of each condition of one group at the current point.
     #[inline(always)]
     fn state(&self, group: usize) -> [Wide; 3] {
         let zero = [0.0; LANE_COUNT];
@@ -214,7 +215,7 @@ impl InfeasibilityProof {
         [ratios, size, slack]
     }
 
-    /// Assemble the weighted form. Its inequalities are tight at the current point.
+    /// Assemble the weighted quadratic form. Its inequalities are equalities at the current point.
     #[inline(always)]
     fn assemble(&mut self, states: &[[Wide; 3]], smallest: f64) {
         let k = self.unknowns;

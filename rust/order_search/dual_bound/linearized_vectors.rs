@@ -1,9 +1,10 @@
-//! Test vectors linearized in the coefficients: built for one candidate, corrected to first order for others.
+//! Test vectors linearized in the coefficients: built for one candidate, corrected to first order for others. // The
+//! test vector of the candidate with denominator D₀ and output error e₀ is t₀ = D₀⁻ᵀ sign(e₀).
 //!
-//! For the candidate with divisor D₀ and output error e₀, t₀ = D₀⁻ᵀ sign(e₀). A candidate with the same own orders
-//! has D = D₀ − Σ x_m G_m, where the G_m are combinations of its F_i. One Newton step for D⁻ᵀ sign(e₀) gives t = t₀ +
-//! Σ x_m v_m with v_m = D₀⁻ᵀ G_mᵀ t₀. Then Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m up to rounding. The loss is of second
-//! order and is bounded by a few precomputed norms.
+//! A candidate with the same orders of the output terms has D = D₀ − Σ x_m G_m, where the G_m are combinations of the
+//! kernels F_i of these terms. One Newton step for D⁻ᵀ sign(e₀) gives t = t₀ + Σ x_m v_m with v_m = D₀⁻ᵀ G_mᵀ t₀. Then
+//! Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m up to rounding. The decrease of the bound is of second order, and a few precomputed
+//! norms limit it.
 
 use std::collections::BTreeMap;
 
@@ -16,19 +17,20 @@ use crate::regressors::{Bank, Index, Key, Record};
 use crate::series::{divide, reciprocal, Buffers, Kernel, SumOfProducts};
 use crate::simd;
 
-/// Maximum own terms of a candidate.
+/// Maximum number of output terms of a candidate.
 pub(crate) const MAX_OWN_TERMS: usize = 4;
-/// Largest ratio of error to limit for which a vector is built. A vector for a candidate with a larger error covers the
-/// first samples only, whose error bounds that of all.
+/// Largest ratio of error to limit for which a vector is built. For a candidate with a larger error the vector covers
+/// the first samples only. Their error is a lower bound of the error of all samples.
 const MAX_ERROR_LIMIT_RATIO: f64 = 4.0;
-/// Magnitude below which products stay finite.
+/// Magnitude below which products of two values do not overflow.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
 /// Whether a test vector that was built for `made_for` proves that the output error of `equation`, Σ|y − ŷ| or
 /// Σ(y − ŷ)², exceeds `limit`. The vector is corrected to first order; the orders of the output must be the same.
 ///
 /// # Errors
-/// Invalid orders or signals, not one coefficient for each term, other orders of the output or more than 4.
+/// Invalid orders or signals, a wrong number of coefficients, different orders of the output terms, or more than 4 such
+/// terms.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -83,35 +85,36 @@ pub fn excluded_by_linearized_vector(
 
 /// Test vector and its first-order corrections, over all records.
 pub(crate) struct LinearizedVector {
-    /// Own coefficients of the candidate that the vector is built for.
+    /// Coefficients of the output terms of the candidate for which the vector is built.
     center: Vec<f64>,
-    /// F_i = G_i + Σ_{j<i} mix[i·k + j] G_j.
+    /// Coefficients of the kernels in the basis: F_i = G_i + Σ_{j<i} mix[i·k + j] G_j.
     mix: Vec<f64>,
-    /// Largest value of each v_m, and ‖D₀ᵀv_m − G_mᵀt₀‖.
+    /// Largest magnitude of each correction v_m.
     peak_values: Vec<f64>,
     solution_residuals: Vec<f64>,
     /// Upper bound of Σ|g_m| of the series of G_m and of its components, times the largest norm.
     series_norms: Vec<f64>,
-    /// ‖G_nᵀv_m + G_mᵀv_n‖ for n < m and ‖G_mᵀv_m‖, packed by rows.
+    /// Norms ‖G_nᵀv_m + G_mᵀv_n‖ for n < m and ‖G_mᵀv_m‖, packed by rows.
     second_order_norms: Vec<f64>,
-    /// ‖D₀ᵀt₀‖, and (1 + Σ|c|Σ|f|) of D₀, times the largest norm.
+    /// Norm ‖D₀ᵀt₀‖.
     norm: f64,
     center_norm: f64,
-    /// ⟨t₀, ·⟩, ⟨v_m, ·⟩ with the target, the own columns and all input columns, k + 1 by k + 1 + all.
+    /// Products of t₀ and the v_m with the target, the output columns and all input columns, (k + 1) × (k + 1 + number
+    /// of input columns).
     products: Vec<f64>,
 }
 
-/// Set of linearized test vectors of a search, by the own columns of their candidates.
+/// Set of linearized test vectors of a search, by the output columns of their candidates.
 pub(crate) struct LinearizedVectors {
     rounding_bounds: RoundingBounds,
-    /// Index among the input columns, [`NO_INDEX`] for an own column.
+    /// Index among the input columns, [`NO_INDEX`] for an output column.
     input_index: Vec<usize>,
     width: usize,
     ranges: BTreeMap<Vec<usize>, (usize, usize)>,
     vectors: Vec<LinearizedVector>,
 }
 
-/// Lookup state of one thread, kept from one candidate to the next.
+/// Lookup state of one thread, reused from candidate to candidate.
 #[derive(Default)]
 pub(crate) struct VectorLookup {
     own: Vec<usize>,
@@ -140,7 +143,7 @@ impl LinearizedVectors {
         }
     }
 
-    /// Memory of one vector for candidates with this many own terms \[bytes\].
+    /// Memory of one vector for candidates with this many output terms \[bytes\].
     pub(crate) fn bytes(&self, own: usize) -> u64 {
         8 * ((own + 1) * (own + 1 + self.width) + own * (2 * own + 4) + 8) as u64
     }
@@ -150,7 +153,7 @@ impl LinearizedVectors {
         terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX).collect()
     }
 
-    /// Store the vectors built for candidates with these own columns.
+    /// Store the vectors built for candidates with these output columns.
     pub(crate) fn add(&mut self, own: Vec<usize>, new_vectors: Vec<LinearizedVector>) {
         let from = self.vectors.len();
         self.vectors.extend(new_vectors);
@@ -284,7 +287,7 @@ impl LinearizedVectors {
         })
     }
 
-    /// ⟨t₀, ·⟩ and ⟨v_m, ·⟩.
+    /// Products of t₀ and of the v_m with target, output columns and input columns.
     fn products(
         &self,
         parts: &[RecordVectors],
@@ -332,7 +335,7 @@ impl LinearizedVectors {
         false
     }
 
-    /// Whether this vector proves that the raw score exceeds the limit, for a candidate with the same own columns.
+    /// Whether this vector proves that the raw score exceeds the limit, for a candidate with the same output columns.
     #[inline(always)]
     pub(crate) fn vector_excludes(
         &self,
@@ -393,16 +396,16 @@ impl LinearizedVectors {
 /// Intermediate vectors on one record, stored in reversed time.
 struct RecordVectors {
     divisor: Vec<f64>,
-    /// t₀, then the v_m.
+    /// Vectors t₀, v_1, v_2, ….
     vectors: Vec<Vec<f64>>,
-    /// G_mᵀt₀.
+    /// Vectors G_mᵀt₀.
     first_order_terms: Vec<Vec<f64>>,
     /// Series of G_m.
     series: Vec<Vec<f64>>,
 }
 
 impl RecordVectors {
-    /// Compute the v_m, and accumulate the norms that the bound needs.
+    /// Compute the corrections v_m, and accumulate the norms that the bound needs.
     fn add_corrections(&mut self, accumulator: &mut NormAccumulator, buffers: &mut Buffers) {
         let (m, k) = (self.divisor.len(), self.first_order_terms.len());
         let (divisor, inverse) = (Kernel::new(&self.divisor), Kernel::new(&reciprocal(&self.divisor)));
@@ -471,7 +474,7 @@ impl NormAccumulator {
     }
 }
 
-/// Kernel that adds inner products of vectors with columns to `out`, vectors by columns.
+/// SIMD task that adds inner products of vectors with columns to `out`, one row per vector.
 struct Products<'a> {
     vectors: &'a [Vec<f64>],
     columns: &'a [&'a [f64]],

@@ -1,7 +1,7 @@
 //! Dual lower bound of a candidate's output error from a few inner products.
 //!
-//! With D = 1 − Σ c_i F_i over the own-output terms and w = y − Σ c x the equation error, the output error obeys D e
-//! = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
+//! Let D = 1 − Σ c_i F_i over the terms of the output, and let w = y − Σ c x be the equation error. The output error e
+//! satisfies D e = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
 //!
 //!   ‖e‖ ≥ |⟨t, w⟩| / ‖Dᵀt‖ in the dual norm, and ‖Dᵀt‖ ≤ |1 − Σ c_i g_i|·‖t‖ + Σ |c_i|·‖F_iᵀt − g_i t‖
 //!
@@ -52,7 +52,8 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 }
 
 /// Whether no coefficients of this structure give an output error of at most `limit`. The error is Σ|y − ŷ| or Σ(y −
-/// ŷ)² with zero initial conditions. Fixed coefficients keep their values. The proof starts at `start`.
+/// ŷ)² with zero initial conditions. Fixed coefficients keep their values. `start` is the initial guess of the
+/// coefficients.
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
@@ -145,7 +146,7 @@ pub fn excluded_in_turn(
         .collect())
 }
 
-/// Return the bound with all fixed test vectors on one record, and the columns of a structure's terms.
+/// Return the bound with all fixed test vectors on one record, and the columns of the terms of a structure.
 fn build_pool_bound(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
     structure.check(record.len(), |_| true)?;
     let mut index = Index::default();
@@ -169,7 +170,7 @@ impl Bound {
 
     /// Build `count` test vectors for these records, a multiple of [`LANE_COUNT`] and at most [`MAX_TEST_VECTORS`].
     ///
-    /// `output_error` selects whether own-output columns enter the divisor. For the equation error D = 1. Runs on the
+    /// If `output_error`, the columns of the output enter the denominator D. For the equation error D = 1. Runs on the
     /// current thread pool. The result is unusable after a stop request.
     pub(crate) fn new(
         (banks, targets): (&[Bank], &[Vec<f64>]),

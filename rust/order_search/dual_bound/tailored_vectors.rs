@@ -1,9 +1,9 @@
 //! Test vectors tailored to single candidates, and rounding-error bounds of their products.
 //!
-//! A candidate with divisor D and output error e has the vector t = D⁻ᵀ sign(e). For this candidate ⟨t, w⟩/‖Dᵀt‖
-//! equals its score. For any other candidate it is a lower bound, as for every test vector. Dᵀt is computed exactly,
-//! so the bound stays tight for large coefficients of opposite sign and for noise common to all candidates. The
-//! records are concatenated, so one bound covers the error on all of them.
+//! A candidate with divisor D and output error e has the vector t = D⁻ᵀ sign(e). For this candidate ⟨t, w⟩/‖Dᵀt‖ equals
+//! its score. For any other candidate it is a lower bound, as for every test vector. Dᵀt is computed exactly, so the
+//! bound is tight also for large coefficients of opposite sign and for noise common to all candidates. The records are
+//! concatenated, so one bound covers the error on all of them.
 
 use rayon::prelude::*;
 
@@ -15,51 +15,51 @@ use crate::regressors::Bank;
 use crate::series::{divide, Buffers, Kernel};
 use crate::simd::{self, LANE_COUNT};
 
-/// Samples per block of a norm. The limit is checked after each block.
+/// Number of samples after which the partial sum of a norm is compared with the limit.
 const NORM_CHECK_SAMPLES: usize = 8 * LANE_COUNT;
-/// Magnitude below which products and sums stay finite.
+/// Magnitude below which products and sums do not overflow.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
-/// Maximum own terms of a candidate whose norms are cached, and number of cache entries.
+/// Maximum number of output terms of a candidate whose norm is cached.
 const MAX_CACHED_OWN_TERMS: usize = 2;
 const NORM_CACHE_ENTRIES: usize = 256;
 
-/// Row of an own column in the transposed products, and its coefficient.
+/// Row of an output column in the transposed products, and its coefficient.
 type Weighted = (usize, f64);
 
 /// Test vector over all records and its products with every column.
 pub(crate) struct TailoredVector {
     /// Values of the vector, at most 1 in modulus, zero-padded to a multiple of [`NORM_CHECK_SAMPLES`].
     vector: Vec<f64>,
-    /// ⟨t, x⟩ of every column, and ⟨t, y⟩ of the target.
+    /// Products ⟨t, x⟩ with every column x.
     products: Vec<f64>,
     target: f64,
-    /// Fᵀt of every own column, one after the other, each as long as the vector.
+    /// Vectors Fᵀt of all output columns, one after another, each as long as the test vector.
     transposed_products: Vec<f64>,
 }
 
-/// Norm ‖Dᵀt‖ of one vector for one candidate. Candidates with the same own columns and similar coefficients have
+/// Norm ‖Dᵀt‖ of one vector for one candidate. Candidates with the same output columns and similar coefficients have
 /// nearly the same norm.
 #[derive(Clone, Copy)]
 struct CachedNorm {
     vector: usize,
     own: [Weighted; MAX_CACHED_OWN_TERMS],
-    /// ‖Dᵀt‖ with its rounding-error bound.
+    /// Norm ‖Dᵀt‖ plus its rounding-error bound.
     norm: f64,
-    /// a₂ = share·a₁ + g for the a = Fᵀt of both columns. ‖a₁‖ and ‖g‖ are NaN until first needed.
+    /// Factor in a₂ = share·a₁ + g, where a₁ and a₂ are the vectors Fᵀt of the two output columns.
     share: f64,
     deviation_norms: [f64; MAX_CACHED_OWN_TERMS],
     /// Rounding-error bound per unit change of a coefficient.
     slack: [f64; MAX_CACHED_OWN_TERMS],
 }
 
-/// Cache of one thread, kept from one candidate to the next.
+/// Cache of one thread, reused from candidate to candidate.
 #[derive(Default)]
 pub(crate) struct NormCache {
     own: Vec<Weighted>,
     /// Index of the vector that excluded the previous candidate.
     last_vector: usize,
-    /// Norms by own columns. `None` disables the cache.
+    /// Norms by output columns. `None` disables the cache.
     norms: Option<Vec<Option<CachedNorm>>>,
 }
 
@@ -73,7 +73,7 @@ impl NormCache {
 /// Test vectors tailored to candidates, and their rounding-error bounds.
 pub(crate) struct TailoredVectors {
     rounding_bounds: RoundingBounds,
-    /// Row of an own column, [`NO_INDEX`] for any other column.
+    /// Row of an output column, [`NO_INDEX`] for any other column.
     rows: Vec<usize>,
     pub(crate) vectors: Vec<TailoredVector>,
 }
@@ -235,7 +235,7 @@ impl TailoredVectors {
         false
     }
 
-    /// Upper bound of ‖Dᵀt‖ of a candidate with the same own columns.
+    /// Upper bound of ‖Dᵀt‖ of a candidate with the same output columns.
     #[inline(always)]
     fn norm_upper_bound(&self, cached: &CachedNorm, own: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
         let off = [own[0].1 - cached.own[0].1, own[1].1 - cached.own[1].1];
@@ -263,7 +263,7 @@ impl TailoredVectors {
         cached.slack[1] += share.abs() * cached.slack[0];
     }
 
-    /// ‖a − share·b‖ in the dual norm, for rows whose length is a multiple of [`NORM_CHECK_SAMPLES`].
+    /// Dual norm ‖a − share·b‖ of rows whose length is a multiple of [`NORM_CHECK_SAMPLES`].
     #[inline(always)]
     fn difference_norm(&self, a: &[f64], b: &[f64], share: f64) -> f64 {
         let mut all = [0.0_f64; LANE_COUNT];
@@ -293,7 +293,7 @@ impl TailoredVectors {
         }
     }
 
-    /// ‖t − Σ c Fᵀt‖ in the dual norm if it is at most `most`. `None` if it is larger or cannot be computed safely.
+    /// Dual norm ‖t − Σ c Fᵀt‖ if it is at most `most`. `None` if it is larger or cannot be computed safely.
     #[inline(always)]
     fn norm_up_to_limit(&self, fitted: &TailoredVector, own: &[Weighted], most: f64) -> Option<f64> {
         // A NaN limit proves nothing, and the coefficients below cannot overflow.
@@ -352,10 +352,10 @@ fn own_columns(bank: &Bank) -> Vec<usize> {
 /// Rounding-error bounds over all records.
 pub(super) struct RoundingBounds {
     pub(super) norm: Norm,
-    /// Rounding-error bound of |⟨t, w⟩| per unit of a column's coefficient, and for the target, if |t| ≤ 1.
+    /// Rounding-error bound of |⟨t, w⟩| per unit of the coefficient of each column, if |t| ≤ 1.
     pub(super) rounding: Vec<f64>,
     pub(super) target_rounding: f64,
-    /// Sum of the moduli of an own column's kernel times the largest dual norm, 0 for any other column.
+    /// Sum of the moduli of the kernel of an output column, times the largest dual norm, 0 for any other column.
     pub(super) kernel_norms: Vec<f64>,
     /// Largest dual norm of a vector whose values are at most 1 in modulus.
     pub(super) max_dual_norm: f64,

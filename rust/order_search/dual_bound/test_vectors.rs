@@ -1,6 +1,7 @@
 //! Set of fixed test vectors, and their inner products with the regressors.
 //!
-//! The vectors are complex exponentials under windows that end smoothly, for which F_iᵀt is nearly a multiple of t.
+//! The vectors are complex exponentials with windows that end smoothly. For such a vector t, F_iᵀt is nearly a multiple
+//! of t.
 
 use rayon::prelude::*;
 
@@ -17,14 +18,14 @@ pub(super) type Wide = [f64; LANE_COUNT];
 /// Lowest frequency of a test vector [cycles per record].
 const MIN_CYCLES_PER_RECORD: f64 = 0.3;
 
-/// Memory of the spectra of test vectors, and of columns, per batch \[bytes\].
+/// Memory of the spectra of test vectors per batch \[bytes\].
 const VECTOR_SPECTRA_BYTES: usize = 64 << 20;
 const COLUMN_SPECTRA_BYTES: usize = 192 << 20;
 
-/// Window of a test vector. An abrupt end would disturb all its integrals.
+/// Window of a test vector. An abrupt end would change all its integrals.
 #[derive(Debug, Clone, Copy)]
 enum Window {
-    /// 1 up to this fraction of the record, then half a cosine down to 0.
+    /// Constant 1 up to this fraction of the record, then a half cosine down to 0.
     Taper(f64),
     /// Exponential decay to e^{−rate} at the end of the record.
     Decay(f64),
@@ -40,12 +41,12 @@ impl Window {
     }
 }
 
-/// Windows and their number of frequencies. They were tuned on the grid of Plant A at three noise levels: the late
-/// taper excludes most candidates, the decays exclude those with an early error.
+/// Windows and their number of frequencies. They were chosen by measurements at three noise levels: the late taper
+/// excludes most candidates, the decays exclude those with an early error.
 const WINDOW_FREQUENCY_COUNTS: [(Window, usize); 3] =
     [(Window::Taper(0.5), 24), (Window::Taper(0.0), 12), (Window::Decay(5.0), 12)];
 
-/// Number of test vectors to select from.
+/// Number of test vectors from which a search selects.
 pub(super) const MAX_TEST_VECTORS: usize = 48;
 
 /// Window and number of cycles per record.
@@ -69,7 +70,7 @@ fn vector_shapes(count: usize, m: usize) -> Vec<Shape> {
         .collect()
 }
 
-/// Write a test vector's real and imaginary parts.
+/// Write the real and imaginary part of a test vector to `halves`.
 #[allow(clippy::cast_precision_loss)]
 fn write_vector((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
     let m = halves[0].len();
@@ -96,18 +97,19 @@ pub(super) fn build_vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64
         .collect()
 }
 
-/// Workspace of one test vector that is applied to own columns in sequence.
+/// Workspace in which one test vector is multiplied by the kernels of the output columns in sequence.
 struct Vector {
     halves: [Vec<f64>; 2],
-    /// Index among all test vectors.
+    /// Index of the test vector.
     number: usize,
     size: f64,
-    /// Spectra of the time-reversed halves. Fᵀt is the time reversal of F applied to the time-reversed t.
+    /// Spectra of the time-reversed real and imaginary part. Fᵀt is the time reversal of F applied to the time-reversed
+    /// t.
     spectra: [Kernel; 2],
-    /// Fᵀt of the current column and of the previous one, in reversed time.
+    /// Vector Fᵀt of the current column, in reversed time.
     here: [Vec<f64>; 2],
     before: [Vec<f64>; 2],
-    /// g and rounding-error bound of the current column.
+    /// Factor g (real, imaginary) and rounding-error bound of the current column.
     last: Option<[f64; 3]>,
 }
 
@@ -119,7 +121,7 @@ impl Vector {
         Self { halves: none(), number: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
     }
 
-    /// Load the test vector stored in the halves.
+    /// Compute the spectra of the test vector stored as real and imaginary part.
     fn load_spectra(&mut self, which: usize, size: f64, buffers: &mut Buffers) {
         for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
             spectrum.read(half.iter().rev().copied(), buffers);
@@ -127,8 +129,8 @@ impl Vector {
         (self.number, self.size, self.last) = (which, size, None);
     }
 
-    /// Return the entries of [`divisor_effects`] for the next own column, with the step in place of the path length.
-    /// `length` is the sum of the column's moduli.
+    /// Return the entries of [`divisor_effects`] for the next output column, with the distance from the previous column
+    /// in place of the path length. `length` is the sum of the moduli of the column.
     fn apply_column(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
         std::mem::swap(&mut self.here, &mut self.before);
         for (spectrum, product) in self.spectra.iter().zip(&mut self.here) {
@@ -142,8 +144,8 @@ impl Vector {
     }
 }
 
-/// g·‖t‖, ‖Fᵀt − g t‖ and path length of Fᵀt − g t since the first own column. One entry for every own column and test
-/// vector, columns first. The result is unusable after a stop request.
+/// Compute g·‖t‖, ‖Fᵀt − g t‖ and the path length of Fᵀt − g t from the first output column, for every output column
+/// and test vector, columns first. The result is unusable after a stop request.
 pub(super) fn divisor_effects(
     bank: &Bank,
     own: &[usize],
@@ -225,8 +227,8 @@ pub(super) fn divisor_effects(
     out
 }
 
-/// g, ‖u − g t‖, rounding-error bound and distance from the previous vector. u is given in reversed time, as is the
-/// previous u with its g and bound. g is the projection of u on t, which is optimal for the L2 norm.
+/// Compute g, ‖u − g t‖, its rounding-error bound and the distance from the previous vector. u and the previous u are
+/// in reversed time. g is the projection of u on t, which is optimal for the L2 norm.
 #[allow(clippy::cast_precision_loss)]
 fn column_effect(
     [a, b]: &[Vec<f64>; 2],
@@ -272,32 +274,32 @@ fn column_effect(
     [g, h, f64::sqrt(rest) + rounding_error, rounding_error, step]
 }
 
-/// Index of a column that does not enter the divisor.
+/// Index of a column that does not enter the denominator.
 pub(crate) const NO_INDEX: usize = usize::MAX;
 
 /// Set of fixed test vectors on one record: products with every column and norms.
 pub(crate) struct TestVectors {
     /// Number of [`Wide`] groups of test vectors.
     pub(crate) groups: usize,
-    /// ⟨t, x⟩ of column p and group g at p·groups + g, real and imaginary part.
+    /// Products ⟨t, x⟩ of column p and group g at index p·groups + g, real and imaginary part.
     pub(crate) products: Vec<[Wide; 2]>,
-    /// ⟨t, y⟩.
+    /// Products ⟨t, y⟩ with the target, by group.
     pub(crate) target: Vec<[Wide; 2]>,
-    /// Row of a column in `effects`, [`NO_INDEX`] if it is not an own column.
+    /// Row of a column in `effects`, [`NO_INDEX`] if it is not an output column.
     pub(crate) rows: Vec<usize>,
-    /// g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and the path length of Fᵀt − g t since the first row. The distance of two
-    /// rows is at most the path length between them.
+    /// Values g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and path length of Fᵀt − g t from the first row. The distance of
+    /// two rows is at most the path length between them.
     pub(crate) effects: Vec<[Wide; 4]>,
-    /// ‖t‖ in the dual norm.
+    /// Dual norm ‖t‖, by group.
     pub(crate) size: Vec<Wide>,
-    /// Rounding-error bound of |⟨t, w⟩| per unit of a column's coefficient, and for the target.
+    /// Rounding-error bound of |⟨t, w⟩| per unit of the coefficient of each column.
     pub(crate) rounding: Vec<f64>,
     pub(crate) target_rounding: f64,
     /// Relative rounding-error bound of a sum of m terms.
     pub(crate) unit: f64,
 }
 
-/// Maximum own columns whose slack is bounded jointly.
+/// Maximum number of output columns whose slack is bounded jointly.
 const MAX_JOINT_OWN_COLUMNS: usize = 4;
 
 impl TestVectors {
@@ -461,7 +463,7 @@ impl TestVectors {
         (bounds, guesses)
     }
 
-    /// Upper bound of ‖Σ c (Fᵀt − g t)‖ for own columns whose coefficients may cancel. The sum of all coefficients
+    /// Upper bound of ‖Σ c (Fᵀt − g t)‖ for output columns whose coefficients may cancel. The sum of all coefficients
     /// multiplies the first row. Each partial sum multiplies the path length to the next row.
     #[inline(always)]
     fn joint_slack(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {

@@ -1,10 +1,11 @@
-//! Unstable zeros of a candidate's divisor: proof, without simulation, that its simulated output diverges.
+//! Unstable zeros of the denominator of a candidate, which prove without simulation that its simulated output diverges.
 //!
 //! The simulated output obeys D ŷ = N. As polynomials, D(z) ŷ(z) = N(z) + τ(z), where τ contains the terms beyond the
-//! record, which are negligible inside the unit circle. If ‖e‖ ≤ L, then Σ|ŷ| ≤ Σ|y| + L, so |τ| < |N| can be proved
-//! on a closed path inside it. By Rouché's theorem D ŷ and N have the same number of zeros inside the path, at least
-//! as many as D. A candidate whose D has more zeros than its N therefore exceeds the limit. The zeros are counted by
-//! the winding number along the path, from values at nodes, chords between them, and bounds of the second derivative.
+//! record, which are negligible inside the unit circle. If ‖e‖ ≤ L, then Σ|ŷ| ≤ Σ|y| + L, so |τ| < |N| can be proved on
+//! a closed path inside the unit circle. By Rouché's theorem D ŷ and N have the same number of zeros inside the path,
+//! at least as many as D. A candidate whose D has more zeros than its N therefore exceeds the limit. The zeros are
+//! counted by the winding number along the path, from values at nodes, chords between them, and bounds of the second
+//! derivative.
 
 use rayon::prelude::*;
 
@@ -17,18 +18,17 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::LANE_COUNT;
 
-/// Decay rates of the paths, per record. A path encloses the half disc to the right of its rate, with three times the
-/// rate as radius. Slower growth hardly enlarges the simulated output. Faster growth is stopped early by the simulation
-/// itself.
+/// Decay rates of the paths, per record length. A path encloses the half disc to the right of its rate, with three
+/// times the rate as radius. Slower growth hardly increases the simulated output. Faster growth ends the simulation
+/// early.
 const PATH_DECAY_RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
-/// Ratio of radius to rate, and chords on the arc and on the line of one half path. The other half is its mirror image.
-/// Chords on the line are half as long because the powers decay most slowly there.
+/// Ratio of the radius of a path to its rate.
 const PATH_RADIUS_RATIO: f64 = 3.0;
 const PATH_CHORD_COUNTS: [usize; 2] = [25, 39];
 const PATH_SEGMENT_COUNT: usize = PATH_CHORD_COUNTS[0] + PATH_CHORD_COUNTS[1];
-/// Nodes of a path in the tables, padded so that each node has a successor in whole lanes.
+/// Number of nodes of a path in the tables, padded to whole SIMD lanes.
 const PADDED_NODE_COUNT: usize = PATH_SEGMENT_COUNT + LANE_COUNT;
-/// Samples read per block, and maximum samples of a record. Products with all columns at all nodes are expensive.
+/// Number of samples that are processed per block.
 const SAMPLES_PER_BLOCK: usize = 4096;
 const MAX_RECORD_SAMPLES: usize = 1 << 14;
 
@@ -79,13 +79,13 @@ pub(crate) struct UnstableZeros {
 struct PathSums {
     paths: usize,
     samples: f64,
-    /// Real and imaginary part per column and node, and per segment a bound from second derivative and rounding.
+    /// Real and imaginary part by column and node, and by segment a bound from the second derivative and rounding.
     values: Vec<[[f64; PADDED_NODE_COUNT]; 3]>,
-    /// Largest |z^M| of each segment.
+    /// Largest |z^M| of each segment, for M samples.
     tails: Vec<[f64; PATH_SEGMENT_COUNT]>,
-    /// Sum of the moduli of an own column's kernel, or of another column.
+    /// Sum of the moduli of each column; for an output column, of its kernel.
     sums: Vec<f64>,
-    /// Σ|y|.
+    /// Sum of moduli Σ|y| of the output.
     output_modulus: f64,
     /// Relative rounding-error bound of a sum of M terms.
     unit: f64,
@@ -190,7 +190,7 @@ impl PathSums {
     }
 
     /// Number of zeros of D, or of N, inside a path, from the winding number of the values along it. `None` if the
-    /// values may pass through 0, or N through its truncation bound.
+    /// values, or N reduced by its truncation bound, may be 0 on the path.
     #[inline(always)]
     fn count_zeros(
         &self,

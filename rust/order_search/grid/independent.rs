@@ -1,16 +1,16 @@
 //! Order grid with independent orders: α from a list, the order of each term from its own axis.
 //!
-//! The tuples of orders of one signal are counted and found by rank without storing them.
+//! The tuples of orders of one signal are counted, and found by their rank, without being stored.
 
 use crate::equation::{tidy, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
 use crate::fractional::kernels::{MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
 
-/// Maximum candidates of one search, about one hour with dual bounds and pruning.
+/// Maximum number of candidates of one search, which takes about one hour with dual bounds and pruning.
 pub const MAX_CANDIDATES: u128 = 10_000_000_000;
-/// Maximum prefixes of tuples whose completions are counted when a grid is built, a few seconds.
+/// Maximum number of prefixes of tuples whose completions are counted when a grid is built, which takes a few seconds.
 const MAX_PREFIXES: u128 = 1 << 28;
-/// Maximum terms of one signal. The number of their permutations just fits into 128 bits.
+/// Maximum number of terms of one signal. The number of their permutations fits into 128 bits.
 const MAX_TERMS: usize = 34;
 
 /// Candidate orders of one term.
@@ -26,9 +26,9 @@ pub struct TermAxis {
 
 /// Grid of all orders of one equation: α from a list, each term's order from its own axis.
 ///
-/// Own-output orders satisfy 0 ≤ ν < α, others 0 ≤ ν ≤ α. Inputs may have a negative order. Orders of one signal are
-/// distinct. Interchangeable ones are unordered, with the larger first. Indices ascend in α. Within an α the last
-/// signal's tuple varies fastest, within a tuple its last order, both from the largest down.
+/// Orders of output terms satisfy 0 ≤ ν < α, other orders 0 ≤ ν ≤ α. Inputs may have a negative order. Orders of one
+/// signal are distinct. Orders of interchangeable terms are sorted, the larger first. Indices ascend with α. For the
+/// same α the tuple of the last signal varies fastest, and within a tuple its last order. Both descend.
 #[derive(Debug, Clone)]
 pub struct OrderGrid {
     output: usize,
@@ -38,7 +38,7 @@ pub struct OrderGrid {
     pub(super) count: u64,
 }
 
-/// Candidates of one α: the product of its groups' tuples.
+/// Candidates of one α: the product of the tuples of all groups.
 #[derive(Debug, Clone)]
 pub(crate) struct Block {
     pub(crate) alpha: f64,
@@ -180,7 +180,7 @@ impl OrderGrid {
     }
 }
 
-/// Raise an error for a grid that is too large by the lengths of its axes, before it is enumerated.
+/// Return an error for a grid whose axes are too long, before it is enumerated.
 fn check_size(axes: &[Vec<Vec<f64>>], firsts: &[Vec<Vec<usize>>]) -> Result<()> {
     let lengths = |axes: &[Vec<f64>], first: &[usize]| -> Vec<u128> {
         axes.iter().zip(first).map(|(a, f)| (a.len() - f) as u128).collect()
@@ -208,7 +208,7 @@ fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
     values
 }
 
-/// Number of prefixes per stored count. Counts between are recomputed on look-up.
+/// Number of prefixes per stored count. Other counts are computed when needed.
 pub(super) const PREFIX_STRIDE: usize = 64;
 
 /// Terms of one signal, their axes, and the pairs of values that exclude each other.
@@ -228,7 +228,7 @@ pub(crate) struct Group {
 pub(crate) struct GroupTuples {
     /// First value of each axis within the range.
     pub(crate) first: Vec<usize>,
-    /// Number of prefixes (all orders except the last), and of tuples.
+    /// Number of prefixes. A prefix is a tuple without its last order.
     pub(super) prefixes: usize,
     pub(super) count: u64,
     /// Number of tuples before every [`PREFIX_STRIDE`]th prefix.
@@ -250,7 +250,7 @@ impl Bits {
         self.0[i / 64] >> (i % 64) & 1 == 1
     }
 
-    /// Smallest member that is at least `from`.
+    /// Smallest position in the set that is at least `from`.
     pub(super) fn next(&self, from: usize) -> Option<usize> {
         let mut word = from / 64;
         let mut bits = *self.0.get(word)? & (!0 << (from % 64));
@@ -277,7 +277,7 @@ impl Bits {
         at - from
     }
 
-    /// Member with `rank` members before it.
+    /// Position in the set that has `rank` positions of the set before it.
     pub(super) fn select(&self, mut rank: u64) -> Option<usize> {
         for (word, &bits) in self.0.iter().enumerate() {
             let bit_count = u64::from(bits.count_ones());
@@ -325,7 +325,7 @@ impl Group {
         self.terms.len() - 1
     }
 
-    /// Axis positions of a prefix with this number.
+    /// Write the axis positions of the prefix with this number to `digits`.
     pub(super) fn decode(&self, first: &[usize], prefix: usize, digits: &mut [usize]) {
         let mut rest = prefix;
         for a in (0..self.last()).rev() {
@@ -335,8 +335,8 @@ impl Group {
         }
     }
 
-    /// Call `take` with each word of the set of last values that complete a prefix, and its position. No call if the
-    /// prefix is inconsistent.
+    /// Call `take` with the index and the bits of each word of the set of last values that complete a prefix. An
+    /// inconsistent prefix has no completions.
     #[inline]
     pub(super) fn completions(&self, first: &[usize], digits: &[usize], mut take: impl FnMut(usize, u64)) {
         let last = self.last();

@@ -1,24 +1,24 @@
-//! Order grid under an order law: a few free orders determine the orders of all equations of a stage.
+//! Order grid under an order law: a few free orders determine the orders of all coupled equations.
 
 use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
 use crate::fractional::kernels::MAX_EXCESS;
 
-/// Maximum tuples of free orders of a stage. The cost of a search depends on the distinct orders of its equations.
+/// Maximum number of tuples of free orders. The cost of a search depends on the distinct orders of its equations.
 pub const MAX_TUPLES: u128 = 5_000_000_000;
 
-/// Equation of a stage. α and its terms' orders are affine functions of the stage's free orders.
+/// Equation under an order law. α and the orders of its terms are affine functions of the free orders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LawEquation {
     /// Output of the equation.
     pub output: usize,
-    /// α.
+    /// Highest order α.
     pub order: AffineOrder,
     /// Signal and order of each term.
     pub terms: Vec<(usize, AffineOrder)>,
 }
 
-/// Grid of free orders under an order law. Tuples that form no equation are excluded.
+/// Grid of free orders under an order law. Tuples that give an invalid equation are excluded.
 #[derive(Debug, Clone)]
 pub struct OrderLawGrid {
     axes: Vec<Vec<f64>>,
@@ -84,8 +84,8 @@ impl OrderLawGrid {
         }
     }
 
-    /// Set the fixed coefficients, `fixed[e]` by term of equation e. Terms with a fixed coefficient may exceed their
-    /// equation's α.
+    /// Set the fixed coefficients, `fixed[e]` by term of equation e. Terms with a fixed coefficient may have an order
+    /// above the α of their equation.
     ///
     /// A term above α with a free coefficient is excluded because it nearly equates an output with itself.
     #[must_use]
@@ -115,7 +115,7 @@ impl OrderLawGrid {
         &self.equations
     }
 
-    /// Free orders at an index of the product, the first varying slowest. Indices beyond the end wrap around.
+    /// Free orders at an index of the product, the first one varying slowest. Indices beyond the end wrap around.
     #[must_use]
     pub fn free(&self, index: u64) -> Vec<f64> {
         let mut rest = index;
@@ -157,7 +157,7 @@ impl OrderLawGrid {
         &self.axes
     }
 
-    /// Whether α and the terms' orders form an equation whose orders of one signal are distinct.
+    /// True if α and the orders of the terms are valid, and the orders of each signal distinct.
     pub(crate) fn fits(&self, equation: &LawEquation, orders: &[f64]) -> bool {
         let alpha = orders[0];
         let input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
@@ -180,7 +180,7 @@ impl OrderLawGrid {
 }
 
 impl LawEquation {
-    /// Raise an error if the equation refers to other signals or free orders.
+    /// Return an error if the equation refers to a signal or free order that does not exist.
     fn check(&self, free: usize, signals: usize) -> Result<()> {
         for signal in std::iter::once(self.output).chain(self.terms.iter().map(|term| term.0)) {
             if signal >= signals {

@@ -1,7 +1,7 @@
 //! Traversal of an order grid: in index order, by two-dimensional slices, or in a low-discrepancy order.
 //!
-//! A slice is a contiguous range of indices over which only two orders vary, each through all of its values. A
-//! low-discrepancy order spreads every initial part of the candidates evenly over the whole grid.
+//! A slice is a contiguous range of indices over which only two orders vary, each through all of its values. In a
+//! low-discrepancy order, the first candidates, whatever their number, are evenly distributed over the grid.
 
 use crate::equation::{Structure, Term};
 use crate::order_search::grid::independent::{Bits, OrderGrid, PREFIX_STRIDE};
@@ -104,7 +104,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Move a group to a prefix. Return whether any value completes it.
+    /// Move a group to a prefix; return true if any value completes it.
     fn enter(&mut self, g: usize, prefix: usize) -> bool {
         let group = &self.lattice.groups[g];
         let first = &self.lattice.blocks[self.block].tuples[g].first;
@@ -121,8 +121,8 @@ impl<'a> Cursor<'a> {
         any != 0
     }
 
-    /// Advance to the next candidate, if there is one. Return the first group that has changed, 0 after a change of
-    /// block.
+    /// Advance to the next candidate, if there is one. Return the index of the first group that has changed, or 0 after
+    /// a change of block.
     pub(crate) fn advance(&mut self) -> usize {
         let groups = self.lattice.groups.len();
         for g in (0..groups).rev() {
@@ -141,8 +141,8 @@ impl<'a> Cursor<'a> {
         0
     }
 
-    /// Term and axis position that alone change over this and the next `len` − 1 candidates, by one position each.
-    /// `None` if something else changes, too.
+    /// Term and axis position, if only this term changes over this and the next `len` − 1 candidates, by one position
+    /// each. `None` if another term changes, too.
     #[inline]
     pub(crate) fn adjacent_block(&self, len: usize) -> Option<(usize, usize)> {
         let slices = &self.lattice.blocks[self.block].tuples;
@@ -153,7 +153,7 @@ impl<'a> Cursor<'a> {
         (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
     }
 
-    /// Term, axis position and number of the next candidates over which this term alone changes, by one position each.
+    /// Term, axis position and number of the next candidates over which only this term changes, by one position each.
     /// `None` if no order varies.
     #[inline]
     pub(crate) fn adjacent_run(&self) -> Option<(usize, usize, usize)> {
@@ -173,7 +173,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Advance a group to its next tuple. Return whether there is one.
+    /// Advance a group to its next tuple. Return true if there is one.
     fn step(&mut self, g: usize) -> bool {
         let last = self.lattice.groups[g].last();
         if let Some(next) = self.completions[g].next(self.digits[g][last] + 1) {
@@ -219,18 +219,18 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// Candidates `lo … hi − 1`: one row for each order of one term, with a run of orders of another term.
+/// Slice of candidates `lo … hi − 1`: one row for each order of one term, with consecutive orders of another term.
 #[derive(Debug, Clone)]
 pub(crate) struct GridSlice {
     pub(crate) lo: u64,
     pub(crate) hi: u64,
-    /// Number of the block, and axis position of every term's order at `lo`.
+    /// Number of the block.
     pub(crate) block: usize,
     pub(crate) digits: Vec<usize>,
-    /// Term whose order changes from row to row, and its orders.
+    /// Term whose order changes from row to row.
     pub(crate) outer: usize,
     pub(crate) rows: Vec<usize>,
-    /// Term whose order varies along a row, its first order and the number of its orders.
+    /// Term whose order varies along a row.
     pub(crate) inner: usize,
     pub(crate) first: usize,
     pub(crate) len: usize,
@@ -277,7 +277,7 @@ impl OrderGrid {
         Some(GridSlice { lo, hi, block: cursor.block(), digits, outer: u, rows, inner: v, first, len })
     }
 }
-/// Fractional part of the golden ratio. Its multiples are evenly distributed.
+/// Fractional part of the golden ratio. Its multiples modulo 1 are evenly distributed.
 const GOLDEN_FRACTION: f64 = 0.618_033_988_75;
 
 /// Position of an index in [0, 1). Consecutive indices are far apart.

@@ -1,7 +1,8 @@
 //! Best-first evaluation of a coupled search.
 //!
-//! The distinct orders of each equation are evaluated once. Table entries start as lower bounds (early stop) and are
-//! refined until every tuple that may enter the table is exact. The result equals that of enumeration, ties by index.
+//! Each distinct combination of orders of an equation is evaluated once. Scores are first lower bounds, because
+//! simulations stop early. They are refined until every tuple of free orders that may enter the result table is exact.
+//! The result equals that of a full enumeration, ties by index.
 
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
@@ -23,9 +24,9 @@ use crate::order_search::stage_join::join::{
 use crate::parallel::{pool, PerThread};
 use crate::regressors::Record;
 
-/// Ratio to the best score up to which an equation's candidates are evaluated first.
+/// Ratio to the best score up to which the candidates of an equation are evaluated in the first pass.
 const FIRST_LIMIT: f64 = 4.0;
-/// Minimum candidates of one equation between two updates of its best score.
+/// Minimum number of candidates of one equation between two updates of its best score.
 const CANDIDATES_PER_UPDATE: usize = 4096;
 
 /// Row of the result table: one tuple of free orders.
@@ -35,7 +36,7 @@ pub struct StageRow {
     pub index: u64,
     /// Free orders.
     pub free: Vec<f64>,
-    /// Sum of the equations' scores, each divided by its scale.
+    /// Sum of the scores of the equations, each divided by its scale.
     pub score: f64,
     /// The structure of each equation.
     pub structures: Vec<Structure>,
@@ -60,7 +61,7 @@ pub struct StageOutcome {
 struct Table {
     problem: Problem,
     candidates: Candidates,
-    /// Candidates that occur in some tuple.
+    /// Candidates that occur in a tuple of the grid.
     used: Vec<usize>,
     scale: f64,
 }
@@ -77,7 +78,7 @@ impl Table {
     }
 }
 
-/// Stage of coupled equations, prepared for a search, with the data shared by their candidates.
+/// Coupled equations prepared for a search, with the data shared by their candidates.
 pub struct Stage<'a> {
     lattice: Cow<'a, OrderLawGrid>,
     options: Options,
@@ -87,12 +88,12 @@ pub struct Stage<'a> {
 
 /// State of a coupled search: scores of every candidate, and the candidates to evaluate next.
 ///
-/// The next candidates depend only on the verdicts of earlier ones. They may therefore be evaluated anywhere and in any
-/// order.
+/// The next candidates depend only on the outcomes of earlier ones. They may therefore be evaluated on any machine and
+/// in any order.
 pub struct SearchState {
     join: Join,
     entries: ScoreTables,
-    /// First pass: current equation, number of its candidates already requested, its best score so far.
+    /// State of the first pass: current equation, number of its candidates already requested, best score up to now.
     pass: (usize, usize, f64),
     limit_factor: f64,
     pending_spans: Vec<Span>,
@@ -102,13 +103,13 @@ pub struct SearchState {
 }
 
 impl<'a> Stage<'a> {
-    /// Build the join and the data shared by every equation's candidates.
+    /// Build the join and the data shared by the candidates of each equation.
     ///
-    /// The entry `fixed[e]` holds the fixed coefficients of equation e, and `scales[e]` divides its score. An example
-    /// for norm L1 is σ(y)·M. Joint angles and link deflections then have equal weight.
+    /// The entry `fixed[e]` holds the fixed coefficients of equation e, and `scales[e]` divides its score. For the L1
+    /// norm, σ(y)·M gives all outputs equal weight.
     ///
     /// # Errors
-    /// As [`crate::order_search::batches::search`]; [`Error::EmptyOrderGrid`] where no tuple obeys the law,
+    /// As [`crate::order_search::batches::search`]; [`Error::EmptyOrderGrid`] if no tuple satisfies the law,
     /// [`Error::OutOfRange`] for a scale that is not positive.
     pub fn new(
         records: &[Record],
@@ -181,7 +182,7 @@ impl<'a> Stage<'a> {
         Ok((stage, course))
     }
 
-    /// Raw sum up to which a candidate is evaluated for a scaled score.
+    /// Raw sum that corresponds to a scaled score of an equation.
     fn raw_limit(&self, equation: usize, score: f64) -> f64 {
         let scaled = score * self.tables[equation].scale;
         let raw = match self.options.norm {
@@ -192,10 +193,10 @@ impl<'a> Stage<'a> {
         raw * (1.0 + 1e-12)
     }
 
-    /// Evaluate these candidates. Return their verdicts in raw sums.
+    /// Evaluate these candidates. Return their outcomes with raw sums.
     ///
     /// # Errors
-    /// Candidates that are not part of this stage, or [`Error::Interrupted`].
+    /// Candidates of another search, or [`Error::Interrupted`].
     pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
         let mut requests = Vec::new();
         for &Span { equation, first, last, limit } in spans {
@@ -279,7 +280,8 @@ impl SearchState {
         &self.pending_spans
     }
 
-    /// Number of candidates to evaluate in total, as far as known. A candidate stopped early may be evaluated again.
+    /// Total number of candidates to evaluate, as known up to now. A candidate whose simulation stopped early may be
+    /// evaluated again.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.total
@@ -291,7 +293,7 @@ impl SearchState {
         self.best_rows.first().map(|incumbent| incumbent.0)
     }
 
-    /// Raise an error if the state belongs to another stage.
+    /// Return an error if the state belongs to another search.
     fn check(&self, stage: &Stage<'_>) -> Result<()> {
         let candidates = stage.tables.iter().map(|table| table.candidates.len());
         if candidates.eq(self.entries.iter().map(Vec::len)) {
@@ -305,10 +307,10 @@ impl SearchState {
         std::array::from_fn(|h| self.join.halves[h].states(&self.entries))
     }
 
-    /// Record the verdicts of the pending candidates, in their order, and select the next ones.
+    /// Record the outcomes of the pending candidates, in their order, and select the next ones.
     ///
     /// # Errors
-    /// Verdicts that do not match, or [`Error::Interrupted`].
+    /// Outcomes that do not match, or [`Error::Interrupted`].
     pub fn record_verdicts(
         &mut self,
         stage: &Stage<'_>,

@@ -1,11 +1,11 @@
-//! Layout of a join: compatible orders of the equations under the order law, with their scores and bounds.
+//! Join of the score tables of coupled equations: compatible orders of the equations under the order law. // The order
+//! law makes all orders functions of a few free orders x, so many tuples x give the same orders of one equation.
 //!
-//! The law ties the equations' orders to a few free orders, so many tuples of free orders share an equation's orders.
-//! The free orders are divided between the first equation and the others: x = (a, b). An equation's orders are the
-//! contribution of its own half of x plus an addend from the other half, which takes few distinct values. (a, addend
-//! from b) and (b, addend from a) are compatible exactly if each names the other's addend. Rows of both halves meet
-//! in the bucket of the two addends. Every pair within a bucket is a tuple, and every tuple is one pair of one
-//! bucket. The product of the axes is never enumerated.
+//! The free orders are divided into two halves, x = (a, b), one for the first equation and one for the others. The
+//! orders of an equation are a contribution of its own half plus an addend from the other half, which has few distinct
+//! values. A row of a half is (a, addend from b) or (b, addend from a). Two rows are compatible if each has the addend
+//! that the other one contributes. Compatible rows are stored in the same bucket. Every pair in a bucket is a tuple,
+//! and every tuple is one pair of one bucket. The product of the axes is never enumerated.
 
 use std::collections::hash_map::Entry as Slot;
 use std::collections::HashMap;
@@ -19,7 +19,7 @@ use crate::order_search::control::Control;
 use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
 use crate::order_search::result::Failure;
 
-/// Row of one half of the join: values of its own free orders, and the addend of the other half.
+/// Row of one half of the join: values of the free orders of this half, and the addend of the other half.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct HalfRow {
     /// Bucket number, from the two addends that the row shares with rows of the other half.
@@ -33,7 +33,7 @@ pub(super) struct HalfRow {
 /// One half of the join.
 pub(super) struct Half {
     pub(super) equations: Range<usize>,
-    /// Candidates of each equation, combination by combination.
+    /// Number of the candidate of each equation, for one combination after another.
     combinations: Vec<u32>,
     pub(super) rows: Vec<HalfRow>,
 }
@@ -63,22 +63,23 @@ impl Half {
     }
 }
 
-/// Rows of both halves that are compatible, each with each.
+/// Rows of both halves of which every pair is compatible.
 pub(super) struct Bucket {
     pub(super) rows: [Range<usize>; 2],
 }
 
-/// Layout of a join.
+/// Join of two halves of the free orders.
 pub(super) struct Join {
     pub(super) halves: [Half; 2],
     pub(super) buckets: Vec<Bucket>,
 }
 
-/// Maximum rows of both halves, about 1 GB.
+/// Maximum number of rows of both halves, about 1 GB.
 const MAX_HALF_ROWS: u128 = 40_000_000;
-/// Memory per row, doubled while the list grows \[bytes\].
+/// Memory per row \[bytes\], twice the size of a row because a growing list is copied.
 const BYTES_PER_HALF_ROW: u128 = 2 * size_of::<HalfRow>() as u128;
-/// Maximum free orders assigned to either half by trial. Further ones belong to the second half.
+/// Maximum number of free orders for which all divisions into halves are tried. Further free orders belong to the
+/// second half.
 const MAX_SPLIT_ORDERS: usize = 10;
 
 /// Select the free orders of the first half such that the number of rows is smallest.
@@ -126,8 +127,8 @@ fn split_free_orders(
 }
 
 impl Join {
-    /// Build the join and the distinct candidates of every equation, and mark the candidates that occur in some tuple.
-    /// Raises an error for rows beyond this memory \[bytes\].
+    /// Build the join and the distinct candidates of every equation, and mark the candidates that occur in a tuple.
+    /// Return an error if the rows need more than `memory` bytes.
     pub(super) fn new(
         lattice: &OrderLawGrid,
         candidates: &mut [Candidates],
@@ -268,7 +269,7 @@ pub(super) struct ScoreEntry {
     pub(super) class: Class,
 }
 
-/// Class of an entry, or of several combined: the first failure, else the largest class.
+/// Class of a score entry. The class of a sum is the first failure, else the largest class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Class {
     Exact,
@@ -299,7 +300,7 @@ pub(super) const UNEVALUATED_ENTRY: ScoreEntry = ScoreEntry { value: 0.0, class:
 /// Entries of every candidate of every equation.
 pub(super) type ScoreTables = Vec<Vec<ScoreEntry>>;
 
-/// Candidates `first … last − 1` of one equation, to be evaluated up to one limit of the scaled score.
+/// Range of candidates `first … last − 1` of one equation that are evaluated up to a limit of the scaled score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
     /// Number of the equation.
@@ -328,7 +329,7 @@ pub(super) fn spans(equation: usize, requests: impl Iterator<Item = (usize, f64)
 pub(super) struct Candidates {
     output: usize,
     signals: Vec<usize>,
-    /// α and the terms' orders, one candidate after the other.
+    /// Orders α and ν of the terms, one candidate after another.
     orders: Vec<f64>,
     ids: HashMap<Box<[i64]>, u32>,
 }
@@ -364,15 +365,15 @@ impl Candidates {
     }
 }
 
-/// A count as a 32-bit number, the type of the tables.
+/// Convert a count to the 32-bit type of the tables.
 pub(super) fn to_u32(count: usize) -> Result<u32> {
     u32::try_from(count).map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })
 }
 
-/// Rows of a layout between two checks for a stop request.
+/// Number of rows between two checks for a stop request.
 pub(super) const ROWS_PER_STOP_CHECK: usize = 4096;
 
-/// Distinct vectors of sums.
+/// Set of distinct vectors of order-law sums, with their numbers.
 #[derive(Debug)]
 pub(super) struct DistinctSums {
     width: usize,
@@ -427,7 +428,7 @@ impl DistinctSums {
     }
 }
 
-/// Order laws of some equations of a stage, with the free orders divided into two sets.
+/// Order laws of some coupled equations, with the free orders divided into two sets.
 pub(super) struct OrderLawSums {
     equations: Range<usize>,
     constants: Vec<f64>,
@@ -478,8 +479,8 @@ impl OrderLawSums {
         Ok(Some(distinct))
     }
 
-    /// Call `take` for every choice of these free orders. Its arguments are the contribution to a tuple's index, the
-    /// sums in these laws (constants included) and the sums in the other laws (without).
+    /// Call `take` for every choice of these free orders. Its arguments are the contribution to the index of a tuple,
+    /// the sums in these laws including constants, and the sums in the other laws without constants.
     ///
     /// # Errors
     /// The first error of `take`.
@@ -515,7 +516,7 @@ impl OrderLawSums {
         }
     }
 
-    /// Compute the orders of these equations from their own sums and an addend. Return whether they form equations.
+    /// Compute the orders of these equations from their own sums and an addend. Return true if they are valid.
     pub(super) fn orders(&self, lattice: &OrderLawGrid, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
         orders.clear();
         orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));

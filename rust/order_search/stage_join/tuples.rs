@@ -1,6 +1,6 @@
-//! Tuples of a join: the best ones, the unresolved ones, and the counts by outcome.
+//! Tuples of a join: the best tuples, the tuples without an exact score, and counts by outcome.
 //!
-//! They are found bucket by bucket.
+//! All are computed bucket by bucket.
 
 use rayon::prelude::*;
 
@@ -31,7 +31,7 @@ impl Join {
         least.iter().all(|v| v.is_finite()).then_some(least)
     }
 
-    /// Score of a tuple, added over the equations in the order of an enumeration.
+    /// Score of a tuple, summed over the equations in the same sequence as in an enumeration.
     fn score(&self, scores: &ScoreTables, pair: [u32; 2]) -> f64 {
         let halves = self.halves.iter().zip(pair);
         halves
@@ -109,7 +109,7 @@ impl Join {
         Ok(best_pairs)
     }
 
-    /// Inexact entries that may still belong to a row of the table, with the score up to which to evaluate each.
+    /// Candidates without an exact score that may still belong to a row of the table, with the score limit of each.
     pub(super) fn unresolved_spans(
         &self,
         states: &[Vec<ScoreEntry>; 2],
@@ -200,7 +200,7 @@ impl Join {
         (counts, failures)
     }
 
-    /// Add the failures of a bucket that may be among the first. Rows are sorted by index.
+    /// Add the failures of a bucket that may be among the first by index. Rows are sorted by index.
     fn list_failures(&self, parts: [&[HalfRow]; 2], states: &[Vec<ScoreEntry>; 2], failures: &mut Vec<(u64, Failure)>) {
         for first in parts[0] {
             for second in parts[1] {

@@ -1,4 +1,4 @@
-//! Bindings of the joint fit in one call, and of the multistart whose candidates several fits share.
+//! Bindings of the joint fit, and of a multistart whose candidates several fits can use.
 
 use std::sync::Arc;
 
@@ -23,10 +23,11 @@ use crate::python::recording::{recordings, Recording};
 use crate::recording::Recordings;
 
 type Table<'py> = Bound<'py, PyArray2<f64>>;
-/// Resources: (threads, bytes of memory of one order grid).
+/// Resources as (number of threads, bytes of memory of one order grid).
 type Means = (usize, u64);
 
-/// Candidates of a multistart, best first. Fits of the same structure to the same runs continue from them.
+/// Candidates of a multistart, best first. Later fits of the same structure to the same runs can start from these
+/// candidates.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct JointMultistart {
     inner: Arc<Vec<Candidate>>,
@@ -38,7 +39,7 @@ pub(super) fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Reco
     recordings(runs, free.structure.recorded_count(), &outputs, free.structure.inputs.len())
 }
 
-/// Multistart of a problem.
+/// Run the multistart of a problem on runs.
 #[pyfunction]
 #[pyo3(signature = (problem, runs, means, progress=None, stop=None))]
 #[allow(clippy::needless_pass_by_value)]
@@ -61,8 +62,7 @@ pub fn joint_multistart(
     Ok(JointMultistart { inner: Arc::new(candidates) })
 }
 
-/// Initial guess near an earlier fit: (values of the free parameters, noise of each output, pulses per sampling
-/// interval).
+/// Warm start from an earlier fit: (values of the free parameters, noise of each output, pulses per sampling interval).
 type NearArg = (List<f64>, List<f64>, usize);
 
 /// Fit a structure to its runs; None if the simulation overflows for every initial guess.

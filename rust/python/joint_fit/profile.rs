@@ -17,12 +17,12 @@ use crate::python::convert::{matrix, rows, vector, List};
 use crate::python::order_search::watch::{run_with_progress, Stop};
 use crate::python::recording::Recording;
 
-/// Least sum of squares, values of both parameters, sums of squares.
+/// Cost surface as (smallest sum of squares, values of both parameters, sums of squares).
 type SurfaceTuple<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
 
 /// State of a fit from a dictionary with these keys: estimate, values on its finest grid, weight of each output, robust
-/// weights of the samples by run, pulses per sampling interval, whether they are enough, whether unstable models are
-/// avoided.
+/// weights of the samples by run, pulses per sampling interval, true if the step has converged, true if unstable models
+/// are excluded.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct FitArg<'py> {
@@ -47,7 +47,7 @@ fn state(fit: FitArg<'_>) -> PyResult<FitState> {
     })
 }
 
-/// Return an error for an index that is no parameter.
+/// Return an error for an index without a parameter.
 fn check_parameters(problem: &JointProblem, parameters: &[usize]) -> PyResult<()> {
     let size = problem.inner.problem.size();
     match parameters.iter().find(|&&i| i >= size) {
@@ -61,8 +61,8 @@ fn check_parameters(problem: &JointProblem, parameters: &[usize]) -> PyResult<()
 
 /// Profile-likelihood intervals of a fit around the optimum that `evaluations` lead to.
 ///
-/// Without `parameters`, of those whose Wald interval is inaccurate. `budget` is the number of simulations in all, and
-/// the least one of each bound.
+/// Without `parameters`, those with an inaccurate Wald interval are profiled. `budget` is the maximum number of
+/// simulations for all bounds, and the smallest initial budget of each bound.
 #[pyfunction]
 #[pyo3(signature = (
     problem, runs, fit, parameters, width, *, budget=None, threads=1, evaluations=120, progress=None, stop=None,
@@ -99,7 +99,7 @@ pub fn profile_intervals<'py>(
     Ok(dict)
 }
 
-/// Most points of a cost surface on each axis. Each pair is a simulation.
+/// Maximum number of points on each axis of a cost surface. Each pair of values is a simulation.
 const MAX_SURFACE_POINTS: usize = 64;
 
 #[allow(clippy::cast_precision_loss)]

@@ -63,7 +63,7 @@ pub fn long_run_covariance<'py>(
     matrix(py, covariance, size)
 }
 
-/// Filter that whitens series with one spectrum, and the innovation variance.
+/// Whitening filter of series with a common spectrum, and the innovation variance.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn whitening_filter<'py>(
@@ -79,8 +79,8 @@ pub fn whitening_filter<'py>(
     Ok((PyArray1::from_vec(py, filter), power))
 }
 
-/// ARX model of series that may follow inputs: whitening filter of the noise, first row and values of the innovations,
-/// number of coefficients.
+/// ARX model of series that may depend on inputs: whitening filter of the noise, first row and values of the
+/// innovations, number of coefficients.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn arx_model<'py>(
@@ -137,7 +137,7 @@ pub fn portmanteau(py: Python<'_>, series: List<PyReadonlyArray1<'_, f64>>, lags
     })
 }
 
-/// Whether autocorrelations of a series are consistent with white noise.
+/// Return true if the autocorrelations of a series are consistent with white noise.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn is_white(py: Python<'_>, series: PyReadonlyArray1<'_, f64>, lags: usize) -> PyResult<bool> {

@@ -72,7 +72,7 @@ fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> FrictionParameters {
     FrictionParameters { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
 }
 
-/// Structure whose signals and coefficients exist.
+/// Parse a structure. Return an error for a signal or coefficient that does not exist.
 pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> {
     let term = |(signal, at, coefficient, factor): TermArg| ParametricTerm {
         signal,

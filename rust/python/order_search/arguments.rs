@@ -1,4 +1,5 @@
-//! Conversion of Python tuples to settings, order grids, parts and verdicts of a search, and of results to tuples.
+//! Conversion of Python tuples to settings, order grids, partial results and outcomes of a search, and of results to
+//! tuples.
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -16,7 +17,7 @@ use crate::order_search::stage_join::Span;
 use crate::python::convert::{initial, prior, records, to_lists, to_vectors, InitialArg, List, RecordArg};
 use crate::regressors::Record;
 
-/// Convergence tolerance of a candidate's instrumental variables, far below a change of the ranking.
+/// Convergence tolerance of the instrumental variables of a candidate, too small to affect the ranking.
 const IV_CONVERGENCE_TOLERANCE: f64 = 1e-4;
 
 /// Settings from a dictionary with these keys. `innovation_length` is 0 for least squares, `iterations` is 0 without
@@ -114,7 +115,7 @@ impl<F> SearchInputs<F> {
         Ok(Self { records: records(runs)?, inputs: inputs.into(), fixed, options: settings.options(terms)? })
     }
 
-    /// Records, with the low-noise signals that the estimator needs.
+    /// Records, with the noise-free substitutes that the estimator needs.
     pub fn records(&mut self, control: &Control) -> Result<Vec<Record>, Error> {
         let records = std::mem::take(&mut self.records);
         if !matches!(self.options.estimator, Estimator::InstrumentalVariables(_)) {
@@ -204,15 +205,17 @@ pub fn failure_name(failure: Failure) -> &'static str {
 
 /// Row of a result: (index, raw score, coefficients, initial terms by record).
 type RowArg = (u64, f64, List<f64>, List<List<f64>>);
-/// Counts: candidates, kept, beaten, bounded, stopped, singular, diverged. Then, if any, those of the bounded in boxes.
+/// Counts: candidates, table rows, beaten, excluded by bound, stopped, singular, diverged. Optional last: excluded by
+/// box.
 #[derive(FromPyObject, IntoPyObject)]
 pub enum CountsArg {
     Plain((u64, u64, u64, u64, u64, u64, u64)),
     Boxed((u64, u64, u64, u64, u64, u64, u64, u64)),
 }
-/// Part of a result: rows, counts, (index, whether diverged rather than singular) of failures.
+/// Part of a result: rows, counts, (index, true if diverged, false if singular) of failures.
 pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
-/// Checkpoint: (batch, followed, end, size, limit, order), whether the block was restarted, and the part so far.
+/// Checkpoint: (batch, number of evaluated candidates, end, size, limit, order), true if the block was restarted,
+/// partial result.
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
 /// Result of batches as Python tuples.
@@ -305,7 +308,7 @@ pub fn span((equation, first, last, limit): SpanArg) -> Span {
     Span { equation, first, last, limit }
 }
 
-/// Serialize verdicts: raw sums as little-endian doubles, and one byte each for the kind.
+/// Serialize outcomes of candidates: raw sums as little-endian doubles, and kinds as one byte each.
 pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     let pairs = verdicts.iter().map(|verdict| match *verdict {
         Verdict::Score(raw) => (raw, 0),
@@ -318,7 +321,7 @@ pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     (values.concat(), kinds)
 }
 
-/// Verdicts serialized by [`verdicts_of`].
+/// Deserialize the outcomes serialized by [`verdicts_of`].
 pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
     let decoded = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
         let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));

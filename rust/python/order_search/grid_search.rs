@@ -53,7 +53,7 @@ pub fn search<'py>(
     result.dict(py)
 }
 
-/// Row of a table, initial terms by record.
+/// Row of a result table. Initial terms are listed by record.
 #[derive(IntoPyObject)]
 struct FoundRow {
     index: u64,
@@ -103,7 +103,7 @@ impl OrderTable {
     }
 }
 
-/// Plan of a search: number of candidates, ends of its generations, and number of the present algorithm.
+/// Plan of a search: number of candidates, ends of its generations, and version of the present algorithm.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_plan(
@@ -123,7 +123,7 @@ pub fn search_plan(
     })
 }
 
-/// Result of a search from the parts of its batches, for records of so many samples.
+/// Result of a search from the parts of its batches, for records with this number of samples.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_join<'py>(
@@ -165,7 +165,7 @@ pub fn search_join<'py>(
     result.dict(py)
 }
 
-/// Search prepared for its batches, on this machine or on several.
+/// Order search prepared for the evaluation of its batches, on one machine or several.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct OrderSearch {
     ready: batches::BatchEvaluator<'static>,
@@ -310,7 +310,7 @@ impl Points {
     }
 }
 
-/// Test hook: panic in the call, in the search thread, or in one of its workers.
+/// Test hook: panic in the call, in the search thread, or in a worker thread of the search.
 #[pyfunction]
 #[allow(clippy::panic)]
 pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {

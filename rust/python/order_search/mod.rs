@@ -1,4 +1,4 @@
-//! Bindings of the order search: order grid, coupled search, given points. Ctrl-C is watched during a search.
+//! Bindings of the order search: order grid, coupled search, given points. Ctrl-C interrupts a search.
 
 mod arguments;
 mod grid_search;

@@ -1,4 +1,4 @@
-//! Bindings of the coupled search over the free orders of a joint: in one call, or block by block.
+//! Bindings of the coupled order search, in one call or block by block.
 
 use std::borrow::Cow;
 use std::sync::{Mutex, PoisonError};
@@ -82,8 +82,8 @@ impl StageTable {
     }
 }
 
-/// Search over coupled equations, prepared for evaluation here or elsewhere. The instance that keeps the search state
-/// collects results.
+/// Order search over coupled equations, prepared for evaluation on one machine or several. One instance has the search
+/// state and collects the results.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct StageSearch {
     stage: Stage<'static>,
@@ -129,19 +129,19 @@ impl StageSearch {
         Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
     }
 
-    /// Candidates to evaluate next. Empty at the end.
+    /// Blocks of candidates to evaluate next; empty if the search is complete.
     fn pending_spans(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
         run_detached(py, || {
             self.course(|c| Ok(c.pending_spans().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
         })
     }
 
-    /// Number of candidates to evaluate as far as known, and the best score so far.
+    /// Total number of candidates to evaluate, as known up to now, and the best score up to now.
     fn state(&self, py: Python<'_>) -> PyResult<(u64, Option<f64>)> {
         run_detached(py, || self.course(|c| Ok((c.total(), c.best()))))
     }
 
-    /// Evaluate candidates.
+    /// Evaluate blocks of candidates; return their outcomes as bytes.
     #[allow(clippy::needless_pass_by_value)]
     fn follow<'py>(
         &self,
@@ -165,7 +165,7 @@ impl StageSearch {
         })
     }
 
-    /// Result, once no candidates are pending.
+    /// Result of the search, once no candidates are pending.
     fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let result = run_watched(py, None, |control| {
             let outcome = self.course(|course| self.stage.outcome(course, control))?;

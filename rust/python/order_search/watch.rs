@@ -15,7 +15,7 @@ use crate::python::errors::{catch_panic, run_attached, run_detached};
 /// Polling interval of Python signals, well below the half second within which Ctrl-C must end a search.
 const SIGNAL_POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Run `work` on a separate thread, and watch signals and report progress on this one.
+/// Run `work` on a separate thread. The calling thread polls Python signals and reports progress.
 pub fn run_watched<T: Send>(
     py: Python<'_>,
     progress: Option<&Py<PyAny>>,
@@ -73,11 +73,11 @@ pub fn run_checkpointed<T: Send>(
     Ok(result)
 }
 
-/// Most points of work, counted once a pass, that runs without a separate thread. It takes less time than one polling
+/// Maximum number of points that are processed without a separate thread. This takes less time than one polling
 /// interval.
 const MAX_INLINE_POINTS: usize = 1 << 17;
 
-/// Cancellation flag for [`run_interruptible`] work on other threads than the one that Ctrl-C interrupts.
+/// Cancellation flag for work on threads that Ctrl-C does not interrupt.
 #[pyclass(module = "ftlm._core", frozen)]
 #[derive(Clone, Default)]
 pub struct Stop(parallel::Stop);
@@ -89,7 +89,7 @@ impl Stop {
         run_attached(|| Ok(Self::default()))
     }
 
-    /// Cancel all work with this flag, now and later.
+    /// Cancel all current and later work with this flag.
     fn set(&self) -> PyResult<()> {
         run_attached(|| {
             self.0.set();
@@ -106,8 +106,8 @@ impl Stop {
 
 /// Run `work` on `points` values such that Ctrl-C or a set flag returns at once.
 ///
-/// Transforms of millions of points cannot be stopped, so their thread is abandoned. It ends at the next check of
-/// `work` for cancellation and does not access Python.
+/// Transforms of millions of points cannot be stopped, so their thread is not joined. The thread ends at the next check
+/// for cancellation and does not access Python.
 pub fn run_interruptible<T: Send + 'static>(
     py: Python<'_>,
     points: usize,
@@ -142,19 +142,19 @@ pub fn run_interruptible<T: Send + 'static>(
     })
 }
 
-/// Message of a computing thread: progress, as steps done and total, or its end.
+/// Message of a computing thread: progress (steps done, all steps) or the result.
 enum WorkerMessage<T> {
     Progresses(usize, usize),
     Ends(Result<T, Error>),
 }
 
-/// Reports steps done and total.
+/// Progress callback of (steps done, all steps).
 pub type Report<'a> = &'a dyn Fn(usize, usize) -> Result<(), Error>;
 
 /// As [`run_interruptible`], always on a separate thread, which reports its progress.
 ///
-/// `progress` is called on the calling thread, so that an abandoned thread does not access Python. An exception of it
-/// stops the computation.
+/// `progress` is called on the calling thread, so the computing thread does not access Python. An exception of
+/// `progress` stops the computation.
 pub fn run_with_progress<T: Send + 'static>(
     py: Python<'_>,
     flag: Option<&Stop>,
