@@ -1,4 +1,4 @@
-"""Makes the table of bad data: forty inputs in every format, and what ftlm said of each."""
+"""Write the table of bad data: forty inputs in every format, and the message of ftlm on each."""
 
 import tempfile
 from pathlib import Path
@@ -13,7 +13,7 @@ NAN, INF = float("nan"), float("inf")
 
 
 def good():
-    """Columns of a good run: a square input and an oscillation."""
+    """Return columns of a good run: a square input and an oscillation."""
     t = np.arange(ROWS) * STEP
     u = np.where(np.arange(ROWS) % 32 < 20, 1.0, -1.0)
     y = np.sin(20 * t) * np.exp(-2 * t) + 0.01 * np.cos(3 * np.arange(ROWS) ** 1.5)
@@ -21,7 +21,7 @@ def good():
 
 
 def put(column, rows, value):
-    """A good run with a value at some rows of a column."""
+    """Return a good run with a value at some rows of a column."""
 
     def change(data):
         data[column][rows] = value
@@ -31,27 +31,27 @@ def put(column, rows, value):
 
 
 def replaced(column, make):
-    """A good run with a column made anew."""
+    """Return a good run in which the function `make` computes a column."""
     return lambda data: {**data, column: make(data[column])}
 
 
 def cut(start, stop):
-    """Rows of a good run."""
+    """Return some rows of a good run."""
     return lambda data: {name: values[start:stop] for name, values in data.items()}
 
 
 def without(*rows):
-    """A good run without some rows."""
+    """Return a good run without some rows."""
     return lambda data: {name: np.delete(values, rows) for name, values in data.items()}
 
 
 def jittered(share):
-    """Times that are off by a share of the step."""
+    """Return sample times with a jitter of a share of the step."""
     return replaced("t", lambda t: t + share * STEP * np.sin(1.7 * np.arange(t.size) + 1))
 
 
 def texts(values):
-    """Numbers as text."""
+    """Return numbers as text."""
     return np.array([repr(float(v)) for v in values], object)
 
 
@@ -107,7 +107,7 @@ FORMATS = ("arrays", "csv", "mat", "parquet")
 
 
 def read(kind, data, folder, options):
-    """A run from columns in a format.
+    """Return a run loaded from columns that are written in a file format.
 
     Raises
     ------
@@ -142,7 +142,10 @@ def read(kind, data, folder, options):
 
 
 def said(name, kind, folder):
-    """What ftlm said: (verdict, words, run or None, columns); the verdict is "refused", "said", "taken" or "–"."""
+    """Return the message of ftlm: (verdict, text, run or None, columns).
+
+    The verdict is "refused", "said", "taken" or "–".
+    """
     make, options = CASES[name]
     data = make(good())
     try:
@@ -168,12 +171,12 @@ def said(name, kind, folder):
 
 
 def table(folder):
-    """Rows of (case, format, verdict, words)."""
+    """Return rows of (case, format, verdict, message)."""
     return [(name, kind, *said(name, kind, folder)[:2]) for name in CASES for kind in FORMATS]
 
 
 def cell(text):
-    """Text for a cell of a table in Markdown."""
+    """Return text for a cell of a table in Markdown."""
     for old, new in (
         ("\\", "\\\\"),
         ("|", "\\|"),
@@ -200,7 +203,7 @@ shows what is wrong. No case ends in another way: nothing is repaired, filled, d
 
 
 def page(rows):
-    """The page; formats that were answered alike share a row."""
+    """Return the page; formats with the same message share a row."""
     lines = ["| what is wrong | in | verdict | what ftlm said |", "| --- | --- | --- | --- |"]
     for name in CASES:
         groups = {}
@@ -213,7 +216,7 @@ def page(rows):
 
 
 def lines_of(text):
-    """(case, format): the line that answers it."""
+    """Return the table row of each (case, format)."""
     found, case = {}, ""
     for line in text.splitlines():
         cells = [c.strip() for c in line.split(" | ")]

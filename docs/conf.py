@@ -1,4 +1,4 @@
-"""How the pages are built: `make docs`, warnings as errors, no network, pictures drawn by the build itself."""
+"""Configuration of the Sphinx pages, built by `make docs`: warnings are errors, no network, pictures from the build."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Writes docs/findings.md, the catalogue of findings: ``python docs/findings.py``."""
+"""Write docs/findings.md, the catalogue of findings: ``python docs/findings.py``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ CHANGED_LEVELS = (
 
 
 def changed_levels() -> list[str]:
-    """The table of the cases whose level was changed."""
+    """Return the table of the findings whose severity depends on the case."""
     rows = ["## Levels that were changed\n", "| code | before | now | where |", "| --- | --- | --- | --- |"]
     return rows + [
         f"| `{c}` | {old} | {finding_catalogue().kinds[c].level} | {why} |" for old, c, why in CHANGED_LEVELS
@@ -73,14 +73,14 @@ def changed_levels() -> list[str]:
 
 
 def cell(text: str) -> str:
-    """Text of a table's cell, with placeholders in italics."""
+    """Return the text of a table cell, with placeholders in italics."""
     shown = re.sub(r"\{ask\[(\w+)(?: is ([\w-]+))?\]\}", lambda m: f"`{m[1]}={repr(m[2]) if m[2] else ''}`", text)
     shown = re.sub(r"\{choose\[[^\]]*\]\}", "`validate`", shown)
     return re.sub(r"\{(\w+)(?::[^}]*)?\}", r"*\1*", shown).replace("|", "").replace("**", "* *")
 
 
 def page() -> str:
-    """The page."""
+    """Return the page as Markdown."""
     parts = [LEAD]
     for level in FINDING_LEVELS:
         parts += [f"## {level.capitalize()}\n", "| code | sentence | remedy |", "| --- | --- | --- |"]

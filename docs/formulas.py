@@ -1,4 +1,4 @@
-"""Formulas of the pages as SVG by matplotlib's mathtext: no script and no network, in the color of the text."""
+"""Formulas of the pages as SVG by matplotlib's mathtext, without scripts and network, in the color of the text."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COMMANDS = {Path.MOVETO: "M", Path.LINETO: "L", Path.CURVE3: "Q", Path.CURVE4: "
 
 
 def draw(formula: str) -> str:
-    """Return a formula as SVG whose baseline is that of the line."""
+    """Return a formula as SVG, aligned with the baseline of the text."""
     font = FontProperties(size=SIZE_PT, math_fontfamily="dejavuserif")
     text = f"${' '.join(formula.split())}$"
     width, height, depth, *_ = MathTextParser("path").parse(text, dpi=72, prop=font)
@@ -50,13 +50,13 @@ def in_line(self: HTML5Translator, node: nodes.math) -> None:
 
 
 def in_block(self: HTML5Translator, node: nodes.math_block) -> None:
-    """Write a formula by itself, a drawing a line."""
+    """Write formulas in a block of their own, one drawing per line."""
     lines = "<br/>".join(draw(part) for part in node.astext().replace("\\frac", "\\dfrac").split("\\\\"))
     self.body.append(f'<div class="formula">{lines}</div>')
 
 
 def setup(app: Sphinx) -> None:
-    """Register the drawings as a way to show formulas."""
+    """Register the drawings as a math renderer of Sphinx."""
 
     def visit(write: Callable[[HTML5Translator, Any], None]) -> Callable[[HTML5Translator, Any], None]:
         def write_and_skip(self: HTML5Translator, node: Any) -> None:

@@ -1,4 +1,4 @@
-"""Draws the pictures of the pages from seeded runs, so that they are always what this version does."""
+"""Draw the pictures of the pages from seeded runs, so that they show the results of this version."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def example(name: str, kind: str, seed: int) -> ftlm.Run:
-    """The tutorial's machine: a fractional oscillator with 1 % noise."""
+    """Return a run of the tutorial's machine: a fractional oscillator with 1 % noise."""
     t = np.arange(2001) * 0.01
     u = np.sign(np.sin(2 * np.pi * t / 5 + 1e-9)) if kind == "square" else np.sin(0.2 * t**1.6)
     truth = ftlm.Model(ftlm.equation("D^1.8 y = -0.6 D^0.8 y - 9 y + 4 u"))
@@ -29,7 +29,7 @@ def example(name: str, kind: str, seed: int) -> ftlm.Run:
 
 
 def draw(folder: Path) -> None:
-    """Write every picture; that of the README is kept beside this file."""
+    """Write every picture; the picture of the README is stored beside this file."""
     folder.mkdir(exist_ok=True)
     square, chirp = example("square", "square", 1), example("chirp", "chirp", 2)
     structure = ftlm.equation(
@@ -50,7 +50,7 @@ def draw(folder: Path) -> None:
 
 
 def performance() -> dict[str, Figure]:
-    """Cost against size, from what the bench wrote."""
+    """Return charts of computation time over problem size, from the results of the benchmark."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
     measured = json.loads((Path(__file__).parent / "performance.json").read_text(encoding="utf-8"))
@@ -99,7 +99,7 @@ def performance() -> dict[str, Figure]:
 
 
 def boxes() -> Figure:
-    """Processor time of searches in boxes against the size of their lattice, from what the bench wrote."""
+    """Return the processor time of branch-and-bound searches over the size of the order grid, from the benchmark."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
     measured = json.loads((Path(__file__).parent / "boxes.json").read_text(encoding="utf-8"))
@@ -119,7 +119,7 @@ def boxes() -> Figure:
 
 
 def moves() -> dict[str, Figure]:
-    """Moves of the tip, where loops stay stable and how still designs leave it, from what the bench wrote; phases."""
+    """Return charts of tip moves, of stable loops and of residual vibration from the benchmark, and phase charts."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
     measured = json.loads((Path(__file__).parent / "tips.json").read_text(encoding="utf-8"))
@@ -165,7 +165,7 @@ def moves() -> dict[str, Figure]:
 
 
 def _plants(rows: list[list[float]]) -> tuple[np.ndarray, list[float], list[float]]:
-    """What was found, by delay and stiffness."""
+    """Return a table of results by delay and stiffness, with both axes."""
     times, delays = (sorted({row[k] for row in rows}) for k in (0, 1))
     found = {(a, b): c for a, b, c in rows}
     grid = [[np.nan if found[a, b] is None else float(found[a, b]) for a in times] for b in delays]
@@ -173,7 +173,7 @@ def _plants(rows: list[list[float]]) -> tuple[np.ndarray, list[float], list[floa
 
 
 def phases() -> Figure:
-    """Phase of the open loop around its crossover: a fractional PID, and one whose orders are whole."""
+    """Return the open-loop phase around the crossover, for a fractional PID and for one of integer orders."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
     hub = ftlm.Model(ftlm.equation("D^2 theta11 = -63 D^0.95 theta11 + 140 I1"))
@@ -199,7 +199,7 @@ def phases() -> Figure:
 
 
 def next_experiment(folder: Path) -> Figure:
-    """Intervals of Plant A's orders after a designed run, from what the bench wrote; beside it writes their table."""
+    """Return the intervals of Plant A's orders after a designed run, and write their table, from the benchmark."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
     measured = json.loads((Path(__file__).parent / "next_experiment.json").read_text(encoding="utf-8"))
@@ -249,7 +249,7 @@ def next_experiment(folder: Path) -> Figure:
 
 
 def unseen() -> Figure:
-    """A deflection that neither model was fitted to: the published algorithm and the default, from the same run."""
+    """Return simulations of a deflection on validation data, by the published algorithm and by the default."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
     square, sine = (demo_run(kind, duration=6.0).select(["I1", "theta11", "theta12"]) for kind in ("square", "sine"))

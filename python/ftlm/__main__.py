@@ -1,4 +1,4 @@
-"""Entry point of ``ftlm`` and ``python -m ftlm``; an interrupt during its imports ends the program cleanly."""
+"""Entry point of ``ftlm`` and ``python -m ftlm``; Ctrl-C during imports ends the program without a traceback."""
 
 import gc
 import os

@@ -1,4 +1,4 @@
-"""Findings about data, fits and models, and the catalogue of their sentences."""
+"""Findings about data, fits and models, and the catalogue of their messages."""
 
 from __future__ import annotations
 

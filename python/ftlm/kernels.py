@@ -322,7 +322,7 @@ MIN_CORRELATION_EIGENVALUE = 1e-12
 
 
 class Candidates:
-    """Evaluation of many tuples of orders of one equation D^alpha y = sum of c_j D^order_j x_j, from rest.
+    """Evaluator of many tuples of orders of one equation D^alpha y = sum of c_j D^order_j x_j, from rest.
 
     It follows equations (22)-(45).
 

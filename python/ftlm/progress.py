@@ -158,7 +158,7 @@ class Progress:
             self._stop()
 
     def so_far(self, count: int, total: int) -> None:
-        """Show the progress of work whose total is only known so far."""
+        """Show the progress of work whose total number may still increase."""
         passed = time.monotonic() - self._start
         if self._quiet or passed < BAR_DELAY_S:
             return

@@ -591,11 +591,11 @@ class SampleResponses:
     Parameters
     ----------
     model
-        Model from rest, without input nonlinearities.
+        Model from rest, without input non-linearities.
     run
         Run of which only names, step and intersample behavior are used.
     inputs
-        Samples of the inputs, after input nonlinearities.
+        Samples of the inputs, after input non-linearities.
     first_samples
         First samples of the signals for which they act differently from later ones.
     names

@@ -607,7 +607,7 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
         ({"structure": ["__import__('os').system('id')"]}, None),
         ({"way": "guess"}, "way = 'guess' is not known"),
         ({"way": "offered", "structure": ["D y = a y + b u"]}, "a comparison needs at least two structures"),
-        ({"way": "auto", "structure": [], "method": "least-squares"}, "a choice of structures"),
+        ({"way": "auto", "structure": [], "method": "least-squares"}, "a structure selection uses output error"),
         ({"method": "magic"}, "method = 'magic'"),
         ({"offset": "much"}, "offset = 'much'"),
         ({"loss": "none"}, "loss = 'none'"),

@@ -168,7 +168,7 @@ def test_a_report_of_a_saved_model(folder: Path) -> None:
     assert alone.returncode == 0, alone.stderr
     assert "No validation run was given" in (folder / "alone.html").read_text("utf-8")
     missing = run_command("report", "given.json", "-o", "nowhere/x.html", cwd=folder)
-    assert (missing.returncode, "is not a folder; make it first" in missing.stderr) == (3, True)
+    assert (missing.returncode, "is not a folder; create it first" in missing.stderr) == (3, True)
     np.savetxt(folder / "other.csv", np.ones((60, 2)).cumsum(axis=0), delimiter=",", header="t,w", comments="")
     refused = run_command(
         "report", "given.json", "--validation", "other.csv", "--time", "t", "-y", "w", "-o", "x.html", cwd=folder
@@ -638,6 +638,6 @@ def test_a_file_to_write_is_checked_before_the_work(tmp_path):
     for words in (["-o", str(path)], ["--out", str(tmp_path / "no" / "a.csv")]):
         refused = CliRunner().invoke(commands, words)
         assert refused.exit_code == 3
-        assert "overwrite it with --force" in refused.stderr or "is not a folder; make it first" in refused.stderr
+        assert "overwrite it with --force" in refused.stderr or "is not a folder; create it first" in refused.stderr
     assert CliRunner().invoke(commands, ["-o", str(path), "--force"]).exit_code == 0
     assert done == [(str(path), False), (str(path), True)]

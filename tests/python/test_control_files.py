@@ -155,10 +155,10 @@ def test_a_damaged_lqg_is_refused_by_what_is_wrong(tmp_path):
         ("feedback", [[1.0]], "feedback has shape"),
         ("measured", ["hub", "bond"], "bond is not one of its outputs"),
         ("rate", 0.0, "rate is not above 0"),
-        ("noise", [], "its noise"),
-        ("poles", [], "0 poles are not those of"),
+        ("noise", [], "has no noise level"),
+        ("poles", [], "0 poles do not match"),
         ("tracked", "h" * 9999, "damaged: h{500}"),
-        ("deviations", [1.0], "its errors"),
+        ("deviations", [1.0], "approximation errors"),
         ("b", [1.0], "Expected `array`"),
         ("feedback", [[1e999] * len(whole["controller"]["a"])], "is not an ftlm controller|not finite"),
     ):

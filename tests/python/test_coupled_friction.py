@@ -306,7 +306,7 @@ def test_friction_is_named() -> None:
     [
         ({"friction": "colomb"}, "friction = 'colomb' is not known; use False, 'coulomb' or 'stribeck'"),
         ({"friction": 2}, "friction = 2 is not known"),
-        ({"friction": "stribeck"}, "needs the simulated velocity; use coupling='simulated'"),
+        ({"friction": "stribeck"}, "requires the simulated velocity; use coupling='simulated'"),
         ({"hub": "no"}, "hub = 'no' is neither True nor False"),
         ({"cross_damping": 1}, "cross_damping = 1 is neither True nor False"),
         ({"cross_sensitivity": "inertial"}, "cross_sensitivity = 'inertial' is neither True nor False"),

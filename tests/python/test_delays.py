@@ -280,5 +280,5 @@ def test_an_input_is_no_more_than_a_row_early():
     with pytest.raises(ftlm.ModelError, match="more than one sampling interval"):
         ftlm.Model(ftlm.equation("D y = -1.0 y + 1.0 u", delay={"u": -0.21})).simulate(run)
     early = ftlm.Model(ftlm.equation("D y = -1.0 y + 1.0 u", delay={"u": -0.1}))
-    with pytest.raises(ftlm.ModelError, match="no linear system answers before its input"):
+    with pytest.raises(ftlm.ModelError, match="no linear system responds before its input"):
         ftlm.analysis.to_control(early, band=(0.1, 10.0))

@@ -59,14 +59,14 @@ BAD = {
     ),
     "own order at alpha": (
         MODEL,
-        "own-output order 1.5 of y is outside [0, 1.5)",
+        "order 1.5 of a term of the output y is outside [0, 1.5)",
         lambda: ftlm.equation("D^1.5 y = a D^1.5 y"),
     ),
-    "own order above alpha": (MODEL, "own-output order 2 of y", lambda: ftlm.equation("D^1.5 y = a D^2 y")),
-    "own order below 0": (MODEL, "own-output order -0.5 of y", lambda: ftlm.equation("D^1.5 y = a D^-0.5 y")),
+    "own order above alpha": (MODEL, "order 2 of a term of the output y", lambda: ftlm.equation("D^1.5 y = a D^2 y")),
+    "own order below 0": (MODEL, "order -0.5 of a term of the output y", lambda: ftlm.equation("D^1.5 y = a D^-0.5 y")),
     "own order fixed above alpha": (
         MODEL,
-        "own-output order 1.8 of y",
+        "order 1.8 of a term of the output y",
         lambda: ftlm.equation(WORDS, orders={"alpha": 1.5, "beta": 1.8}),
     ),
     "input order above alpha": (
@@ -114,12 +114,12 @@ BAD = {
     # Pulses
     "m above what the data carry": (
         MODEL,
-        "m = 65 is more than run 'run' carries: 65 rows are 64 pulses",
+        "m = 65 is more than run 'run' allows: 65 rows give 64 pulses",
         lambda: search(m=65),
     ),
     "m of a short second run": (
         MODEL,
-        "m = 64 is more than run 'short' carries: 33 rows are 32 pulses",
+        "m = 64 is more than run 'short' allows: 33 rows give 32 pulses",
         lambda: search([run(), run(Y[:33], U[:33], name="short")]),
     ),
     "m no power of two with Haar rows": (
@@ -238,7 +238,7 @@ BAD = {
         "measured is not finite at index 7 (1 such values in all)",
         lambda: ftlm.metrics(spoiled(7), Y),
     ),
-    "empty array": (DATA, "x has shape (0,) and holds no value", lambda: ftlm.fractional_integral([], 0.5, step=1)),
+    "empty array": (DATA, "x has shape (0,) and no values", lambda: ftlm.fractional_integral([], 0.5, step=1)),
     "array of text": (DATA, "x holds <U1 values; give real numbers", lambda: ftlm.haar_inverse(["a", "b"])),
     "array of objects": (DATA, "x holds object values; give real numbers", lambda: ftlm.haar_inverse([None, 1.0])),
     "array of complex numbers": (DATA, "x holds complex128 values", lambda: ftlm.haar_transform(Y[:64] * 1j)),

@@ -275,7 +275,7 @@ def test_hostile_names_stay_in_comments():
 
 
 def test_other_tools_and_a_missing_band_are_refused():
-    with pytest.raises(ftlm.ModelError, match="give the band of frequencies"):
+    with pytest.raises(ftlm.ModelError, match="give the frequency band"):
         exports.export_text(model(ONE), "control")
     with pytest.raises(ftlm.ModelError, match="use 'control', 'matlab' or 'json'"):
         exports.export_text(model(ONE), "excel")

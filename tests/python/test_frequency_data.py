@@ -548,7 +548,7 @@ def test_what_cannot_be_a_response_is_refused_in_words():
         ),
         (lambda: make([1.0, 2.0], [1, 1], deviation=[1.0]), r"deviation has 1 values, frequency 2"),
         (lambda: make([1.0, 2.0], [1, 1], deviation=[1.0, 0.0]), r"deviation is not above 0: 0.0 at row 1, 1 in all"),
-        (lambda: arc().slice(1e6), r"nothing was measured from 1e\+06 to inf rad/s; it reaches"),
+        (lambda: arc().slice(1e6), r"there are no data from 1e\+06 to inf rad/s; the data cover"),
     ):
         with pytest.raises(ftlm.DataError, match=words):
             what()
@@ -633,7 +633,7 @@ def test_columns_that_cannot_be_told_are_refused(heads, words, tmp_path):
 def test_what_is_said_of_a_file_is_checked(tmp_path):
     path = written(tmp_path / "x.csv", ("f", "gain", "phase"), [(1, -2, 3), (2, 3, 4), (3, 4, 5)])
     for options, words in (
-        ({}, r"column 'gain': a size is negative, first at row 0, 1 in all; say magnitude_unit='dB'"),
+        ({}, r"column 'gain': a magnitude is negative, first at row 0, 1 in all; say magnitude_unit='dB'"),
         ({"magnitude_unit": "db"}, r"magnitude_unit='db' is unknown \(did you mean 'dB'\?\)"),
         ({"magnitude_unit": "dB", "phase_unit": "turns"}, r"phase_unit='turns' is unknown"),
         (

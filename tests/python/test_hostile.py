@@ -428,7 +428,7 @@ def test_a_sequence_is_not_believed_when_it_tells_its_length(values):
     assert _core.order_grid_size((0, np.array([1.0, 2.0]), []), [True]) == 2
     assert _core.order_grid_size((0, range(1, 3), []), [True]) == 2
     for words in ("12", {1.0: 2.0}, {1.0, 2.0}):
-        with pytest.raises(TypeError, match="is no sequence"):
+        with pytest.raises(TypeError, match="is not a sequence"):
             _core.order_grid_size((0, words, []), [True])
 
 

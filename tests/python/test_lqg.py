@@ -85,7 +85,7 @@ def test_the_response_at_complex_frequencies_goes_on_from_the_real_ones(sensor):
 
 
 def test_too_few_poles_are_refused_with_what_they_are_off():
-    with pytest.raises(ftlm.ModelError, match=r"3 states are off by up to .* dB and .* degrees .* narrower band"):
+    with pytest.raises(ftlm.ModelError, match=r"3 states has errors of up to .* dB and .* degrees .* narrower band"):
         designed(poles=2)
 
 
@@ -289,7 +289,7 @@ REFUSED = [
     ({"band": (10**5000,)}, "band = a tuple is not a pair"),
     ({"measured": ["bend"], "noise": {"bend": 1e-4}}, "no observer from bend"),
     ({"output": "huub"}, "did you mean 'hub'"),
-    ({"output": "bend"}, "bend cannot be held at a value by I"),
+    ({"output": "bend"}, "bend cannot follow a constant reference"),
     ({"input": "U"}, "input = 'U' is not one"),
     ({"limit": 0.0}, "limit = 0.0"),
     ({"rate": 0}, "rate = 0"),
@@ -350,7 +350,7 @@ def test_an_observer_reads_a_run_that_fits_it():
     run = driven(WHOLE, seconds=0.2)[0]
     with pytest.raises(ftlm.DataError, match="has no bend; the observer reads I, hub, bend"):
         seen.over(run.select(["I", "hub"]))
-    with pytest.raises(ftlm.DataError, match="make it for rate=250"):
+    with pytest.raises(ftlm.DataError, match="design it with rate=250"):
         seen.over(run.resample(0.004))
     with pytest.raises(ftlm.ModelError, match="process_noise = 0"):
         control.observer(model(WHOLE), noise=QUIET, process_noise=0)
@@ -429,7 +429,11 @@ PATHS = [
     ({"output": None}, ftlm.ModelError, "output = None is not a sum"),
     ({"samples": 1.5}, ftlm.ModelError, "samples = 1.5"),
     ({"seed": -1}, ftlm.ModelError, "seed = -1"),
-    ({"path": control.point_to_point(0.3, 0.2, dwell_before=0.0)}, ftlm.ModelError, "rest longer before its move"),
+    (
+        {"path": control.point_to_point(0.3, 0.2, dwell_before=0.0)},
+        ftlm.ModelError,
+        "stay at rest longer before the move",
+    ),
 ]
 
 

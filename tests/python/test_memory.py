@@ -279,5 +279,5 @@ def test_a_simulation_asks_for_memory_before_it_takes_it(monkeypatch):
 def test_a_fit_asks_for_the_memory_of_its_grids(monkeypatch):
     structure, start = ftlm.equation("D^alpha y = a y + b u", initial="rest"), {"alpha": 0.7, "a": -2.0, "b": 1.0}
     monkeypatch.setenv("FTLM_MEMORY", "100K")
-    with pytest.raises(ftlm.ModelError, match=r"grids of 1 pulses a sample of run 'long' need .* FTLM_MEMORY"):
+    with pytest.raises(ftlm.ModelError, match=r"grids of 1 pulses per sample of run 'long' need .* FTLM_MEMORY"):
         fit_output_error([long_run(5000)], structure, start=start)

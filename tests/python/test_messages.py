@@ -144,7 +144,7 @@ def test_no_other_header_states_one(tmp_path):
 def test_a_header_and_an_argument_that_contradict_each_other_are_refused(tmp_path):
     path = table(tmp_path / "r.csv", "time [ms]", 1e-3)
     assert ftlm.load(path, **SIGNALS, time_unit="ms").step == pytest.approx(0.01, rel=1e-9)
-    with pytest.raises(ftlm.DataError, match=r"its header states 'ms', and time_unit='s' is asked for; leave"):
+    with pytest.raises(ftlm.DataError, match=r"its header states 'ms', and time_unit='s' is given; leave"):
         ftlm.load(path, **SIGNALS, time_unit="s")
     unknown = table(tmp_path / "x.csv", "time [samples]")
     with pytest.raises(ftlm.DataError, match=r"its header states the unit 'samples', which is unknown"):
@@ -166,7 +166,7 @@ def test_the_command_line_takes_a_unit_of_time(tmp_path):
         "inspect", table(tmp_path / "s.csv", "time [ms]", 1e-3), "-u", "u", "-y", "y", "--time-unit", "s"
     )
     assert done.exit_code == 3
-    assert "--time-unit s is asked for; leave --time-unit out" in done.stderr
+    assert "--time-unit s is given; leave --time-unit out" in done.stderr
     readers = {n for n, c in get_command(app).commands.items() if any("--time" in p.opts for p in c.params)}
     takers = {n for n, c in get_command(app).commands.items() if any("--time-unit" in p.opts for p in c.params)}
     assert readers == takers

@@ -246,17 +246,17 @@ def test_what_is_no_text_is_refused(text):
         ("D^0 y = a u", "its left-hand side has no derivative"),
         ("D^-1 y = a u", "order alpha = -1 of y is outside (0, 10]"),
         ("D^1e400 y = a u", "order alpha = inf of y is outside (0, 10]"),
-        ("D^1.5 y = a D^1.5 y", "own-output order 1.5 of y is outside [0, 1.5)"),
-        ("D^1.5 y = a D^1.6 y", "own-output order 1.6 of y is outside [0, 1.5)"),
-        ("D^1.5 y = a D^-0.1 y", "own-output order -0.1 of y is outside [0, 1.5)"),
+        ("D^1.5 y = a D^1.5 y", "order 1.5 of a term of the output y is outside [0, 1.5)"),
+        ("D^1.5 y = a D^1.6 y", "order 1.6 of a term of the output y is outside [0, 1.5)"),
+        ("D^1.5 y = a D^-0.1 y", "order -0.1 of a term of the output y is outside [0, 1.5)"),
         ("D^1.5 y = a D^10.5 u", "order 10.5 of u is above 10"),
         ("D^1.5 y = a D^-3.5 u", "order -3.5 of u is below -3"),
         ("D^1.5 y = a y + a u", "coefficient a occurs twice in the equation of y"),
         ("D y = a y; D z = a z", "coefficient a occurs in two equations"),
         ("D y = a u; D^2 y = b u", "two equations have the output y"),
         ("D^a y = a u", "a names an order and a coefficient"),
-        ("D y = 0 a u", "factor 0 of a u in the equation of y makes the coefficient meaningless"),
-        ("D y = 1e400 a u", "factor inf of a u in the equation of y makes the coefficient meaningless"),
+        ("D y = 0 a u", "factor 0 of a u in the equation of y is 0 or not finite"),
+        ("D y = 1e400 a u", "factor inf of a u in the equation of y is 0 or not finite"),
         ("D y = 1e400 u", "coefficient of u in the equation of y is inf, which is not finite"),
     ],
 )
@@ -357,7 +357,7 @@ def test_values_of_an_order(spec, values):
         ("0:3:1e-300", "increment 1e-300 is below 1e-09, the resolution of orders; raise the increment"),
         (
             [0.5, 0.7, 0.7000000001],
-            "values 0.7 and 0.7000000001 are one order: orders are kept to 1e-09; leave one out",
+            "values 0.7 and 0.7000000001 are equal, because orders have a resolution of 1e-09; leave one out",
         ),
         (11.0, "= 11 is outside [-3, 10]"),
         (math.nan, "= nan is outside [-3, 10]"),
@@ -419,7 +419,7 @@ def test_order_laws():
     assert str(partly) == "D^1.9 y = a D^(-mu+1.9) y + b D^mu u"
     assert not ftlm.equation("D^alpha y = a D^beta y + b u").has_order_law
     assert ftlm.equation("D^alpha y = a D^mu y + b D^mu u").has_order_law  # one order in two places
-    with pytest.raises(ftlm.ModelError, match=r"own-output order 2.2 of y is outside \[0, 1.9\)"):
+    with pytest.raises(ftlm.ModelError, match=r"order 2.2 of a term of the output y is outside \[0, 1.9\)"):
         structure.with_orders({"alpha": 1.9, "mu": -0.3})
 
 
@@ -654,7 +654,7 @@ def test_whether_a_file_may_be_written_is_said_before_it_is(tmp_path):
         for check in (check_new, check_free):
             with pytest.raises(ftlm.DataError, match=f"^{re.escape(text)}$"):
                 check(path, force=False)
-    with pytest.raises(ftlm.DataError, match=f"^{re.escape(f'{new} is not a folder')}; make it first$"):
+    with pytest.raises(ftlm.DataError, match=f"^{re.escape(f'{new} is not a folder')}; create it first$"):
         check_free(None, new / "file", force=False)
     check_free(there, new, None, force=True)
     assert check_new(new / "file", force=False) == new / "file"

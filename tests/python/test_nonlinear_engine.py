@@ -343,7 +343,7 @@ def test_a_derivative_of_an_actuator_beside_friction_is_refused():
     # A first-order actuator whose derivative drives the body would have to have an end velocity itself.
     text = "D^2 y = -1 y - 1 y^3 + 1 D w - 0.2*sign(D y); D w = -1 w - 1 w^3 + 3 u"
     refused = ftlm.Model(ftlm.equation(text, coupling="simulated"))
-    with pytest.raises(ftlm.ModelError, match="order of a nonlinear term in an equation with friction"):
+    with pytest.raises(ftlm.ModelError, match="order of a non-linear term in an equation with friction"):
         refused.simulate(run)
 
 

@@ -254,7 +254,7 @@ def test_stages_are_those_that_all_runs_have(fractional):
         stages_in([run, run.select(["theta12"])])
     with pytest.raises(ftlm.DataError, match="give two or more"):
         cross_validate_orders([run])
-    with pytest.raises(ftlm.DataError, match="names of their own"):
+    with pytest.raises(ftlm.DataError, match="do not have distinct names"):
         cross_validate_orders([run, run])
 
 
@@ -262,7 +262,7 @@ def test_stages_are_those_that_all_runs_have(fractional):
     ("words", "code", "message"),
     [
         (["one.csv"], 3, "give two or more"),
-        (["one.csv", "one.csv"], 3, "names of their own"),
+        (["one.csv", "one.csv"], 3, "do not have distinct names"),
         (["one.csv", "gone.csv"], 3, "gone.csv"),
         (["one.csv", "one.csv", "-o", "there.html"], 3, "there.html"),
         (["strange.csv", "one.csv"], 3, "no stage of the arm"),

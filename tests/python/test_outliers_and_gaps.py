@@ -90,7 +90,7 @@ def test_missing_samples_are_refused_with_the_way_out() -> None:
         run_of(u, y, missing="fill")
     first = u.copy()
     first[0] = np.nan
-    with pytest.raises(ftlm.DataError, match=r"no value before which there is none to hold"):
+    with pytest.raises(ftlm.DataError, match=r"no value, and there is no earlier value to hold"):
         run_of(first, y, missing="hold")
     with pytest.raises(ftlm.DataError, match=r"2 values, 3 are needed"):
         run_of(u, np.where(np.arange(y.size) < 2, y, np.nan), missing="weight")
@@ -172,7 +172,7 @@ def test_methods_that_cannot_leave_samples_out_refuse_them() -> None:
     for method in ("instrumental-variables", "least-squares", "multi-innovation"):
         with pytest.raises(ftlm.DataError, match=r"output 'y' of run 'run' holds no value in .* method='output-error'"):
             ftlm.identify(run, ftlm.equation(FREE), method=method)
-    with pytest.raises(ftlm.DataError, match=r"cannot leave them out"):
+    with pytest.raises(ftlm.DataError, match=r"requires all samples"):
         ftlm.search_orders(run, ftlm.equation("D^alpha y = a y + b u"))
     pair = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"x": holes(y), "y": y}, step=STEP, missing="weight")
     driven = ftlm.equation("D^2 y = c D y + a y + b x")
@@ -201,7 +201,7 @@ def test_rows_that_a_regular_time_lacks_are_missing(tmp_path) -> None:
     given = {"outputs": {"y": y[kept]}, "time": t[kept]}
     with pytest.raises(ftlm.DataError, match=r"gap of 0.3 s where 0.1 s is usual, .* missing='hold'"):
         ftlm.Run.from_arrays(inputs={"u": u[kept]}, **given)
-    with pytest.raises(ftlm.DataError, match=r"4 rows are missing of a regular grid of 0.1 s, the first before row 30"):
+    with pytest.raises(ftlm.DataError, match=r"4 rows are missing in a regular grid of 0.1 s, the first before row 30"):
         ftlm.Run.from_arrays(inputs={"u": u[kept]}, missing="weight", **given)
     run = ftlm.Run.from_arrays(inputs={"u": u[kept]}, missing="hold", **given)
     assert (run.length, run.step) == (ROWS, STEP)

@@ -494,7 +494,7 @@ def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification)
     with pytest.raises(ftlm.ModelError, match="intervals='profile' needs a cost"):
         ftlm.identify(bent, structure, method=ftlm.OutputError(intervals="profile", reference="r"))
     looped = replace(found, settings={**found.settings, "reference": "r"})
-    with pytest.raises(ftlm.ModelError, match="has no cost to profile"):
+    with pytest.raises(ftlm.ModelError, match="has no cost function to profile"):
         looped.profile()
 
 

@@ -239,7 +239,7 @@ def test_existing_files_are_kept(tmp_path, identified):
 
 
 def test_a_folder_that_cannot_be_written_is_said_before_any_work(tmp_path, identified, monkeypatch):
-    with pytest.raises(ftlm.DataError, match="is not a folder; make it first"):
+    with pytest.raises(ftlm.DataError, match="is not a folder; create it first"):
         identified.report(tmp_path / "nowhere" / "p.html")
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(ftlm.DataError, match="is read-only; choose another folder"):
@@ -808,7 +808,7 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
     assert "–" in below.svg
     for bad, message in (
         ([], "at least one model"),
-        ([("one", [("estimation", own)]), ("two", [("validation", own)])], "compare like with like"),
+        ([("one", [("estimation", own)]), ("two", [("validation", own)])], "give comparisons on the same runs"),
     ):
         with pytest.raises(ftlm.errors.DataError, match=message):
             compared_bars(bad)

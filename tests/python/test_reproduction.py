@@ -545,9 +545,9 @@ def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduc
     ("words", "code", "message"),
     [
         (["-o", "there.html"], 3, "there.html exists; choose another name"),
-        (["-o", "no/folder.html"], 3, "no is not a folder; make it first"),
+        (["-o", "no/folder.html"], 3, "no is not a folder; create it first"),
         (["--save", "full"], 3, "full/square.csv exists (1 such files); choose another folder, or --force"),
-        (["--save", "there.html"], 3, "there.html cannot be made"),
+        (["--save", "there.html"], 3, "there.html cannot be created"),
         (["--sine", "strange.csv"], 2, "--sine is given without --square"),
         (["--square", "strange.csv"], 3, "a stage of the arm needs I1, theta11 and theta12"),
         (["--square", "whole.csv", "--sine", "strange.csv"], 3, "lacks I1, theta12, which the square run"),

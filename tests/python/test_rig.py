@@ -365,7 +365,7 @@ def test_the_stock_filter_of_a_record_is_that_of_a_model():
         ({"input": "chirp", "band": (5.0, 1.0)}, "not two rising frequencies"),
         ({"input": "csv"}, "needs a file"),
         ({"ramp": 20.0}, "outside [0, 10] s"),
-        ({"watchdog": 0.0}, "would leave the motors running"),
+        ({"watchdog": 0.0}, "the motors would keep running"),
         ({"watchdog": 5.0}, "outside [0.01, 1]"),
         ({"rig": "q9"}, "'q9' is not known"),
         ({"parameters": "effectiv"}, "did you mean 'effective'?"),

@@ -515,7 +515,7 @@ def test_by_the_boards_rule_outputs_stay_where_they_were_without_tristate(tmp_pa
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, 2.0, float("nan")])
 def test_a_watchdog_that_would_not_help_is_refused(bench, seconds):
-    with pytest.raises(ftlm.ModelError, match="would leave the motors running"):
+    with pytest.raises(ftlm.ModelError, match="the motors would keep running"):
         bench.rig(watchdog=seconds)
 
 
@@ -582,7 +582,7 @@ def test_a_command_that_is_no_number_writes_zero_and_latches(bench, value):
 def test_no_command_is_written_after_the_time_limit(bench):
     with bench.rig(limit=0.5) as link:
         link.run(drive(250))
-        with pytest.raises(ftlm.RigFault, match=r"time limit of 0\.5 s is over"):
+        with pytest.raises(ftlm.RigFault, match=r"time limit of 0\.5 s is reached"):
             link.run(drive(250))
     assert max(at for at, volts in bench.writes if volts != (0.0, 0.0)) <= 352
     bench.assert_safe()
@@ -595,7 +595,7 @@ def test_no_command_is_written_after_the_time_limit(bench):
 @pytest.mark.parametrize(
     ("what", "channel", "number", "words", "rows"),
     [
-        ("dead encoder", 0, 0.0, "encoder 1 has not counted for 0.50 s under 0.25 A or more", 551),
+        ("dead encoder", 0, 0.0, "encoder 1 has not changed for 0.50 s under 0.25 A or more", 551),
         ("dead encoder", 1, 0.0, "encoder 2 has not counted", 551),
         ("saturated gauge", 0, 0.0, "strain gauge 1 is saturated at 10.00 V", 301),
         ("saturated gauge", 1, 0.0, "strain gauge 2 is saturated", 301),

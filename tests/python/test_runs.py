@@ -514,7 +514,7 @@ def test_rename_select_and_intersample():
     assert run.with_intersample({"u": "foh"}).intersample == {"u": "foh", "v": "foh"}
     bad = [
         (lambda: run.rename({"w": "x"}), "'w' is not in run"),
-        (lambda: run.rename({"u": "v"}), "two signals would be called 'v'"),
+        (lambda: run.rename({"u": "v"}), "two signals would have the name 'v'"),
         (lambda: run.rename({"u": "=1"}), "cannot name a signal"),
         (lambda: run.select(["u"]), "no output is left"),
         (lambda: run.select(["y", "z"]), "'z' is not in run"),

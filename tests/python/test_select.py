@@ -364,7 +364,7 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(runs, [second] * 10_001)
     with pytest.raises(ftlm.DataError, match="has 40 rows, too few to be cut into 4 blocks"):
         ftlm.select(runs[0].window(0, 0.8), second)
-    with pytest.raises(ftlm.ModelError, match="motor 1 is also an estimation run, so it validates nothing"):
+    with pytest.raises(ftlm.ModelError, match="motor 1 is also an estimation run, so it does not validate the model"):
         ftlm.select(runs, second, validation=runs[1])
     idle = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": 1e-3 * np.sin(np.arange(300.0))})
     with pytest.raises(ftlm.DataError, match="u is 0 in all rows"):

@@ -169,7 +169,7 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
     with pytest.raises(ftlm.DataError, match="cannot be opened: No such file"):
         ftlm.select(runs, [FIRST], store=tmp_path / "no" / "such.ftlm")
     with pytest.raises(
-        ftlm.DataError, match="is the store of a selection, not of a search; resume it with the call that began it"
+        ftlm.DataError, match="is the store of a selection, not of a search; resume it with the call that created it"
     ):
         ftlm.resume_search(place)
     with pytest.raises(ftlm.DataError, match=r"^.*other\.ftlm is the store of a selection, not of a search"):

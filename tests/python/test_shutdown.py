@@ -278,7 +278,7 @@ def test_a_gauge_that_stands_at_zero_is_a_fault(monkeypatch, tmp_path, stage):
         return 1
 
     hardware.hooks["reading"] = dead
-    with pytest.raises(ftlm.RigFault, match=f"strain gauge {stage + 1} has stood at 0.0000 V for 0.50 s"):
+    with pytest.raises(ftlm.RigFault, match=f"strain gauge {stage + 1} has not changed from 0.0000 V for 0.50 s"):
         rig.record(board, arm=True, duration=2.0, out=tmp_path / "run.csv")
 
 

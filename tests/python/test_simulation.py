@@ -170,7 +170,7 @@ def test_measured_and_simulated_coupling_of_the_truth_agree():
 
 def test_measured_coupling_needs_the_other_output():
     run = zeros_run(outputs=("y",))
-    with pytest.raises(ftlm.DataError, match="run 'run' has no signal 'z', which the equation of y reads as measured"):
+    with pytest.raises(ftlm.DataError, match="run 'run' has no signal 'z', which enters the equation of y as measured"):
         model(TWO, "measured").simulate(run)
     assert model(TWO, "simulated").simulate(run).outputs == ("y", "z")
 

@@ -232,7 +232,7 @@ def test_an_offset_that_friction_holds_moves_nothing():
     [
         ({"coulomb": -0.1}, "Coulomb friction = -0.1 is outside [0, ∞) A"),
         ({"coulomb": float("nan")}, "Coulomb friction = NaN is outside [0, ∞) A"),
-        ({"g": 0.0}, "motor 2 does not turn its hub"),
+        ({"g": 0.0}, "motor 2 does not move its hub"),
         ({"r": 1.0}, "r = 1.0 of stage 2 is not above 1"),
         ({"gamma": -0.2}, "order"),
         ({"mu": 2.3}, "order"),
@@ -248,8 +248,8 @@ def test_a_stage_that_cannot_be_is_refused(changes, words):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"reach": 20.0}, "a kinetic energy that is not positive"),
-        ({"inertia_ratio": 0.2}, "its leading matrix is singular or worse"),
+        ({"reach": 20.0}, "the kinetic energy of the arm is not positive"),
+        ({"inertia_ratio": 0.2}, "not positive definite"),
         ({"inertia_ratio": -0.1}, "inertia_ratio = -0.1 is outside [0, inf]"),
         ({"reach": float("nan")}, "reach = nan is outside [0, inf]"),
         ({"rotating_share": 1.5}, "rotating_share = 1.5 is outside [0, 1]"),

@@ -188,7 +188,7 @@ def export_text(
         raise ModelError(f"{setting('to')} {to!r} is not known; use 'control', 'matlab' or 'json'")
     if band is None:
         raise ModelError(
-            "python-control has no fractional orders: give the band of frequencies, as in "
+            "python-control has no fractional orders; give the frequency band of an approximation, as in "
             f"{parameter('band', (0.1, 100))}"
         )
     return control_text(model, band=band, order=order)
@@ -323,7 +323,7 @@ def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...]
     behind = next((name for name in inputs if name in sensor.signals), None)
     if behind is not None:
         raise ModelError(
-            f"the input {behind} has a sensor filter, whose inverse is not a transfer function; leave the filter out"
+            f"the input {behind} has a sensor filter, whose inverse is not a transfer function; remove the filter"
         )
     return tuple(sensor.signals), _coefficients(sensor.numerator), _coefficients(sensor.denominator)
 
@@ -359,7 +359,7 @@ def _sample_system(
     expm = importlib.import_module("scipy.linalg").expm
 
     def hold(column: Floats, seconds: float) -> tuple[Floats, Floats]:
-        """Return the transition over some seconds, and the effect of a constant input."""
+        """Return the state-transition matrix over some seconds, and the effect of a constant input on the states."""
         whole = expm(np.block([[a, column], [np.zeros((1, a.shape[0] + 1))]]) * seconds)
         return whole[:-1, :-1], whole[:-1, -1:]
 
@@ -405,7 +405,8 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     """Return the structure that corresponds to a python-control system; see :meth:`ftlm.Model.from_control`."""
     if getattr(system, "dt", None) not in (0, None):
         raise ModelError(
-            f"the system is sampled (dt = {system.dt}); an equation is in continuous time: give a continuous system"
+            f"the system is sampled (dt = {system.dt}); an equation is in continuous time; give a continuous-time "
+            "system"
         )
     if hasattr(system, "A"):
         parts = _from_state_space(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))

@@ -45,7 +45,7 @@ def check_no_input_nonlinearity(model: Model, what: str) -> None:
 def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
     """Return the names of the inputs of a response: all signals but the outputs.
 
-    For equations that are not coupled, other outputs are inputs too.
+    If equations are not coupled, the other outputs are inputs, too.
     """
     if coupled:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
@@ -163,7 +163,9 @@ def transfer_functions(model: Model, *, coupling: str = "simulated") -> Transfer
         matrix = [lhs for lhs, _ in rows]
         bottom = determinant(matrix)
         if not bottom:
-            raise ModelError(f"the equations of {', '.join(names)} are dependent (determinant 0); change one of them")
+            raise ModelError(
+                f"the equations of {', '.join(names)} are linearly dependent (determinant 0); change one of them"
+            )
         for j, output in enumerate(names):
             denominator[output] = _coefficient_pairs(bottom)
             for signal in inputs:
@@ -327,7 +329,7 @@ def parameter_vector(model: Model) -> Floats:
 
 
 def with_parameter_vector(model: Model, numbers: Floats) -> Model:
-    """Return the model with other orders and coefficients, given as in :func:`parameter_vector`."""
+    """Return the model with orders and coefficients from a vector, in the sequence of :func:`parameter_vector`."""
     at = iter(numbers.tolist())
     equations = []
     for item in model.equations:
@@ -355,7 +357,7 @@ def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Ite
 def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
     """Return an equation with other orders and terms, without range checks.
 
-    Numerical derivatives at a limit of the range require it.
+    Numerical derivatives at a limit of the range need orders beyond the limit.
     """
     new = copy.copy(item)
     vars(new).update(order=order, terms=terms)
@@ -392,7 +394,7 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
     check_no_input_nonlinearity(model, "a step response")
     t = as_floats("time", time)
     if t.ndim != 1 or t.size < 3 or not np.all(np.isfinite(t)) or t[0] != 0:
-        raise DataError("time must be a vector of at least three instants [s] that begins with 0, such as numpy.arange")
+        raise DataError("time is not a vector of at least three sample times [s] from 0; use numpy.arange")
     step = float(t[-1]) / (t.size - 1)
     off = np.abs(t - step * np.arange(t.size)) > 1e-6 * step
     if step <= 0 or np.any(off):

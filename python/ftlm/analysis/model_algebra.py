@@ -229,7 +229,7 @@ def _channel_of(name: str) -> Channel:
 
 
 def _linearized_equation(item: Equation, values: Mapping[Channel, float]) -> Equation:
-    """Return an equation in which every nonlinear term is replaced by its first-order terms, without constants."""
+    """Return an equation in which every non-linear term is replaced by its first-order terms, without constants."""
     if not item.nonlinear_terms:
         return item
     terms = [t for t in item.terms if t.nonlinear is None]

@@ -227,8 +227,8 @@ def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
         expected, on_cut = right_zeros(polynomial, math.pi)
         if not on_cut and len(poles) != expected:
             raise ModelError(
-                f"{len(poles)} of {expected:.0f} {what} were found (counted by the argument principle); round the"
-                " orders to multiples of 0.01"
+                f"only {len(poles)} of {expected:.0f} {what} were found (number by the argument principle); round the "
+                "orders to multiples of 0.01"
             )
     return poles
 
@@ -300,10 +300,10 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
 
 
 def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
-    """Return the number of zeros with a positive real part, by the argument principle, and whether one is on the axis.
+    """Return the number of zeros with a positive real part, and True if a zero is on the imaginary axis.
 
-    With another `angle` [rad], the zeros with a smaller argument are counted. On the Riemann surface of ln s the angle
-    may exceed pi.
+    The argument principle counts them. With another `angle` [rad], the zeros with a smaller argument are counted. On
+    the Riemann surface of ln s the angle may exceed pi.
     """
     lowest, highest = min(polynomial), max(polynomial)
     if highest - lowest < POWER_TOLERANCE:
@@ -463,7 +463,7 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
 def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
     """Return the mode of a zero w = ln s.
 
-    `spread` has the standard deviations of Re w, Im w and ln abs(Re s).
+    `spread` contains the standard deviations of Re w, Im w and ln abs(Re s).
     """
     size, angle = math.exp(w.real), w.imag
     # Of a pole that hardly anything tells nobody may say that it is real, let alone that it dies away.
@@ -485,7 +485,7 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
 
 
 def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
-    """Return zeros beyond the principal sheet as ln s: up to arg s = 2 pi, or up to the first zero if it is farther."""
+    """Return zeros outside the principal sheet as ln s, up to arg s = 2 pi or the first zero, whichever is farther."""
     powers = np.array(list(polynomial))
     gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
     zeros = zeros_of(polynomial, max(MAX_SHEET_ANGLE_RAD, math.pi / gap) + REAL_AXIS_ANGLE_RAD)

@@ -212,7 +212,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     early = next((name for name, delay in delays.items() if delay < 0.0), None)
     if early is not None:
         raise ModelError(
-            f"{early} acts {-delays[early]:g} s before it is logged, and no linear system answers before its input; "
+            f"{early} acts {-delays[early]:g} s before it is logged, and no linear system responds before its input; "
             "shift the rows of that input, and identify again"
         )
     reach = (low / BAND_EXTENSION_FACTOR, high * BAND_EXTENSION_FACTOR)

@@ -289,8 +289,8 @@ def parse_structures(recipe: FitRequest) -> list[Structure]:
         raise ModelError("no structure is given; write an equation, or use a suggested one")
     if recipe.way != "fit" and recipe.settings():
         raise ModelError(
-            f"{', '.join(recipe.settings())}: a choice of structures is by output error, with its own offset; leave it "
-            "at its default"
+            f"{', '.join(recipe.settings())}: a structure selection uses output error and decides on the offset; "
+            "leave these options at their defaults"
         )
     if not 0.0 <= recipe.share <= 0.8:
         raise ModelError(f"share = {recipe.share!r} of the run for validation; keep from 0 to 0.8")

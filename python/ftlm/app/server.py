@@ -1,4 +1,4 @@
-"""HTTP server on 127.0.0.1: opening of its socket, start and end."""
+"""HTTP server on 127.0.0.1: socket, start and shutdown."""
 
 from __future__ import annotations
 

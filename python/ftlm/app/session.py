@@ -203,7 +203,7 @@ class Session:
                     stream.write(chunk)
         except OSError as error:
             self.remove_file(file.key)
-            raise DataError(f"{safe_name(name)!r} cannot be kept: {error.strerror}; is the disk full?") from None
+            raise DataError(f"{safe_name(name)!r} cannot be stored ({error.strerror}); check the disk space") from None
         except BaseException:
             self.remove_file(file.key)
             raise
@@ -318,7 +318,7 @@ class Session:
             raise DataError(f"{MAX_QUEUED_MODELS} models are already in the queue; stop one of them, or wait")
 
     def resume(self, key: str) -> Model:
-        """Continue a stopped model, and return it.
+        """Continue the computation of a stopped model, and return the model.
 
         A structure selection continues from its checkpoint, a fit from the beginning.
 

@@ -1,4 +1,4 @@
-"""Worker processes from the side of the server: their start, messages and end."""
+"""Worker processes that the server starts: start, messages and end."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Task:
             async with asyncio.timeout(seconds):
                 return await self._read_answer(process)
         except TimeoutError:
-            raise TaskError(f"it took more than {seconds:g} s and was ended; take a smaller file") from None
+            raise TaskError(f"the task took more than {seconds:g} s and was stopped; use a smaller file") from None
         finally:
             self._kill()
             await process.wait()

@@ -65,7 +65,7 @@ def json_response(content: object, status: int = 200, headers: Mapping[str, str]
 
 
 async def read_json(request: Request) -> dict[str, Any]:
-    """Return the body of a request as a JSON object; raise an HTTP error if it is none."""
+    """Return the body of a request as a JSON object; raise an HTTP error for other content."""
     body = b""
     async for chunk in request.stream():
         body += chunk
@@ -162,19 +162,19 @@ class WebApplication:
             if len(headers.getlist(name)) > 1:
                 raise HTTPException(400, f"the header {name} is given twice")
         if headers.get("host", "").lower() not in self._hosts:
-            raise HTTPException(403, "this page answers to its own address alone")
+            raise HTTPException(403, "this page only accepts requests to its own address")
         method, origin = scope["method"], headers.get("origin")
         if origin is not None and origin not in {f"http://{host}" for host in self._hosts}:
-            raise HTTPException(403, "another page asks; this one answers to itself alone")
+            raise HTTPException(403, "the request comes from another page; only this page may send requests")
         if method not in ("GET", "HEAD") and (
             origin is None or headers.get("sec-fetch-site", "same-origin") != "same-origin"
         ):
-            raise HTTPException(403, "only the page itself may change what is on it")
+            raise HTTPException(403, "only the page itself may change its content")
         first, slash, rest = scope["path"].removeprefix("/").partition("/")
         if method == "GET" and first == "open" and slash and "/" not in rest:
             self._redeem_key(rest)
         if not secrets.compare_digest(first.encode("utf-8", "replace"), self._token.encode()):
-            raise HTTPException(404, "there is nothing here; use the address that ftlm app printed")
+            raise HTTPException(404, "there is no page at this address; use the address that ftlm app printed")
         if scope["query_string"].count(b"&") >= MAX_QUERY_FIELDS:
             raise HTTPException(400, "the address has too many fields")
         if not slash and method in ("GET", "HEAD"):
@@ -186,13 +186,15 @@ class WebApplication:
         return HTTPException(303, headers={"location": f"/{self._token}/"})
 
     def _redeem_key(self, key: str) -> None:
-        """Redirect the first visitor who has the one-time key; reject later ones.
+        """Redirect the first request with the one-time key; reject later requests with it.
 
         The key is visible in the command line of the browser.
         """
         good = bool(self._key) and secrets.compare_digest(key.encode("utf-8", "replace"), self._key.encode())
         if not good:
-            raise HTTPException(404, "this address was good once; the one that lasts is in the terminal of ftlm app")
+            raise HTTPException(
+                404, "this address was valid once; use the permanent address in the terminal of ftlm app"
+            )
         self._key = ""
         raise self._redirection()
 
@@ -207,7 +209,7 @@ class WebApplication:
 
     async def _upload(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
-            raise HTTPException(415, "a file is sent as it is (application/octet-stream), not as a form")
+            raise HTTPException(415, "a file must be sent as application/octet-stream, not as a form")
         header = request.headers.get("content-length")
         # Of more digits than Python reads none is a size; what comes is counted whatever is said.
         size = (
@@ -254,7 +256,7 @@ class WebApplication:
         """Return a file of a model; no part of its path comes from the request."""
         model = _find(self._desk.models, request, "model")
         if model.state != STATE_MADE or model.description is None:
-            raise HTTPException(404, "this model is not made yet")
+            raise HTTPException(404, "this model is not finished yet")
         what = request.url.path.rpartition("/")[2]
         ending, media_type = MODEL_FILES[what]
         if what == "script":
@@ -264,7 +266,7 @@ class WebApplication:
             try:
                 content = (self._desk.folder / f"{model.key}.{suffix}").read_bytes()
             except OSError:
-                raise HTTPException(404, "its file is no longer there") from None
+                raise HTTPException(404, "the file of this model was removed") from None
         headers = {"content-security-policy": REPORT_POLICY}
         if what != "page":
             stem = Path(model.recipe.estimation.file).stem

@@ -61,7 +61,7 @@ class Reports(Progress):
 
 
 def main() -> None:
-    """Run the task on standard input."""
+    """Run the task that is read from standard input."""
     # What anything prints must not stand between the answers.
     stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

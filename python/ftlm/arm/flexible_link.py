@@ -336,7 +336,7 @@ def flexible_link(
         coupling = "measured" if form == "lagrange" else "simulated"
     if friction == "stribeck" and coupling != "simulated":
         raise ModelError(
-            f"{parameter('friction', 'stribeck')} needs the simulated velocity; use "
+            f"{parameter('friction', 'stribeck')} requires the simulated velocity; use "
             f"{parameter('coupling', 'simulated')}, or {parameter('friction', 'coulomb')}"
         )
     if friction and coupling == "simulated" and form != "lagrange":
@@ -498,11 +498,12 @@ def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equati
 
 
 def link_structure(stage: Literal[1, 2, "both"], *, both: bool, filtered: bool = True, rate: bool = True) -> Structure:
-    """Deflection by (15) with the measured hub as input: elasticity and damping of any order, gauge and cable.
+    """Return the structure of a deflection by equation (15), with the measured hub angle as input.
 
-    With the angles of the other stage it includes their accelerations, by the energies of the planar arm, and the rate
-    of the other deflection, an observer's gain (``rate``). Initial terms are Caputo's. A history would give fractional
-    orders more parameters on the validation run than integer ones.
+    Elasticity and damping have any order, and the strain gauge and its cable are included. With the angles of the
+    other joint it includes their accelerations, by the energies of the planar arm, and the rate of the other
+    deflection with the gain ``rate``. Initial terms are Caputo's. A history would give fractional orders more
+    parameters on the validation run than integer orders.
     """
     structure = flexible_link(
         stage=stage,

@@ -1,6 +1,6 @@
 """Command line: results on standard output, progress on standard error, exit codes for scripts.
 
-Help of the options that commands share, by panel; docstrings of commands and of their option groups have the others.
+The sections below are the help of options that several commands share, by panel.
 
 Arguments
 ---------

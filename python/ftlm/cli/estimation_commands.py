@@ -123,7 +123,7 @@ def select_structure(
 
 
 def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
-    """Return the expected time [s] of output-error fits of all parameters, among which the runs are distributed."""
+    """Return the expected time [s] of output-error fits of all parameters; each run belongs to one of the fits."""
     samples = sum(run.length for run in runs) * len(structure.outputs)
     numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
     return estimate_duration(fits * output_error_cost(samples // max(fits, 1), numbers), check_threads(threads))
@@ -246,7 +246,7 @@ def search(
     threads: int | None = None,
     as_json: bool = False,
 ) -> None:
-    """Rank the orders of each equation, or of a stage under its order law, and account for every candidate.
+    """Search the orders of each equation, or of a joint under an order law, and count every outcome.
 
     Method
     ------

@@ -1,4 +1,4 @@
-"""Framework of the command line: commands made from functions, help in panels, values, errors and exit codes."""
+"""Framework of the command line: commands from functions, help in panels, option values, errors and exit codes."""
 
 from __future__ import annotations
 

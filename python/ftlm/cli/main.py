@@ -1,4 +1,4 @@
-"""Program `ftlm`: its commands, in the sequence of the help."""
+"""Program `ftlm` with its commands, in the sequence of the help."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ class StructureOptions:
     offset: Offset | None = None
 
     def structure(self, text: str, *, alone: bool = False) -> Structure:
-        """Return the structure of `text` with the options applied; ``alone`` omits the other stage."""
+        """Return the structure of `text` with the options applied; ``alone`` omits the other joint."""
         if text.startswith("flexible-link"):
             built = self._flexible_link(text)
         elif re.fullmatch(r"arm(:\w*)?", text):
@@ -153,7 +153,7 @@ class StructureOptions:
             )
 
     def _flags(self, *names: str) -> list[str]:
-        """Return the flags of those of some options that the user set."""
+        """Return the flags of the named options that the user has set."""
         return [flag_of(name) for name in names if getattr(self, name)]
 
     def _sensor(self) -> SensorFilter | None:

@@ -100,17 +100,17 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
             if not np.isfinite(matrix).all():
                 raise ModelError(f"{name} is not finite")
         if not 0 < size <= MAX_POLES + 1:
-            raise ModelError(f"{size} states are not 1 to {MAX_POLES + 1}")
+            raise ModelError(f"the number of states, {size}, is not from 1 to {MAX_POLES + 1}")
         if not 0 < len(self.poles) <= size:
-            raise ModelError(f"{len(self.poles)} poles are not those of {size} states")
+            raise ModelError(f"{len(self.poles)} poles do not match {size} states")
         absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
         if absent:
             raise ModelError(f"{absent[0]} is not one of its outputs")
         if not (self.rate > 0 and len(self.noise) == count):
-            raise ModelError("its rate is not above 0, or not every measured output has its noise")
+            raise ModelError("the rate is not above 0, or a measured output has no noise level")
         lists = (self.gain_error_db, self.phase_error_degrees, self.deviations)
         if any(len(one) != len(self.outputs) for one in lists):
-            raise ModelError("not every output has its errors")
+            raise ModelError("an output has no approximation errors")
         gain, phase, deviations = (dict(zip(self.outputs, one, strict=True)) for one in lists)
         realisation = Realisation(
             tuple(self.outputs),
@@ -286,8 +286,7 @@ class JointControllers:
         rates = [loop.rate for loop in self.loops if loop is not None]
         if len(rates) == 2 and not same_rate(*rates):
             raise ModelError(
-                f"the controllers have the rates {rates[0]:g} and {rates[1]:g} Hz; make both for one rate, that of the "
-                "rig"
+                f"the controllers have the rates {rates[0]:g} and {rates[1]:g} Hz; design both for the rate of the rig"
             )
         #: Sampling rate of both controllers [Hz]; None without a controller.
         self.rate = rates[0] if rates else None

@@ -32,7 +32,7 @@ MAX_RESIDUAL_SHARE = 0.5
 
 
 class Loop(Protocol):
-    """Protocol of a loop design, which gives the responses that inverse dynamics requires."""
+    """Protocol of a loop design with the frequency responses that inverse dynamics requires."""
 
     @property
     def rate(self) -> float:
@@ -100,9 +100,9 @@ class Trajectory:
 def point_to_point(
     distance: float, duration: float, rate: float = 500.0, *, dwell_before: float = 0.3, dwell_after: float = 1.2
 ) -> Floats:
-    """Return a point-to-point path: a polynomial of degree 7 whose derivatives are zero at both ends.
+    """Return a point-to-point path: a polynomial of degree 7 in time.
 
-    Velocity, acceleration and jerk are zero there. The path has shape (N,).
+    Velocity, acceleration and jerk are zero at both ends. The path has shape (N,).
 
     Parameters
     ----------
@@ -177,7 +177,8 @@ def inverse_dynamics(
         If the path is invalid.
     ModelError
         If the command exceeds the limit, the reference would start before the first row of the path, or the model is
-        too uncertain: the residual vibration may exceed half of that with the path itself as reference.
+        too uncertain. It is too uncertain if the residual vibration may exceed half of the vibration with the path
+        itself as reference.
 
     Notes
     -----
@@ -221,14 +222,14 @@ def inverse_dynamics(
     off = float(np.max(np.abs(reference[:1] - rows[0])))
     if off > MAX_INITIAL_OFFSET_SHARE * move:
         raise ModelError(
-            f"the reference has to begin before the path does: at its first row it is {off:.3g} away from rest, more "
-            f"than {MAX_INITIAL_OFFSET_SHARE:g} of the move; let the path rest longer before its move"
+            f"the reference would have to begin before the path: at its first row it differs from rest by {off:.3g}, "
+            f"more than {MAX_INITIAL_OFFSET_SHARE:g} of the move; let the path stay at rest longer before the move"
         )
     effort = inverse_transform(needed * command)
     if not np.max(np.abs(reference - rows[0])) < MAX_REFERENCE_RATIO * move:
         raise ModelError(
-            "the reference diverges: the output first moves the other way, more slowly than the path; give the path "
-            "more time, or choose another output"
+            "the reference diverges, because the output first moves in the wrong direction (non-minimum phase); give "
+            "the path more time, or choose another output"
         )
     if np.max(np.abs(effort)) > most:
         at = int(np.argmax(np.abs(effort)))
@@ -245,10 +246,10 @@ def inverse_dynamics(
     worst = float(np.quantile(errors, 0.975)) if errors else None
     if worst is not None and not worst <= MAX_RESIDUAL_SHARE * plain:
         raise ModelError(
-            f"the intervals are too wide to design on: within them {worst:.2g} may be off the path after its end, and "
-            f"the path itself as the reference leaves {plain:.2g}; "
-            f"{least_certain_parameter(design.plants[0].model)}; identify "
-            "from a longer or richer run (ftlm design-input lays it out)"
+            "the intervals are too wide to design on: within them the deviation after the end of the path may be "
+            f"{worst:.2g}, and {plain:.2g} with the path itself as reference; "
+            f"{least_certain_parameter(design.plants[0].model)}; identify from a longer or richer run (ftlm "
+            "design-input lays it out)"
         )
     ways = {n: inverse_transform(needed * line) for n, line in zip(names, outputs, strict=True)}
     return Trajectory(reference, rows, effort, ways, worst, plain)

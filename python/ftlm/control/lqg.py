@@ -87,7 +87,7 @@ class Observer:
         if abs(run.step * self.realisation.rate - 1.0) > 1e-6:
             raise DataError(
                 f"run {run.name} has a step of {run.step:g} s, and the observer one of "
-                f"{1.0 / self.realisation.rate:g} s; make it for {parameter('rate')}{1.0 / run.step:g}"
+                f"{1.0 / self.realisation.rate:g} s; design it with {parameter('rate')}{1.0 / run.step:g}"
             )
         a, b, c = self.matrices
         y = np.array([run[n] for n in self.measured])
@@ -578,5 +578,8 @@ def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
     try:
         equilibrium = np.linalg.solve(matrix, np.eye(size + 1)[-1])
     except np.linalg.LinAlgError:
-        raise ModelError(f"{tracked} cannot be held at a value by {realisation.input}: its steady gain is 0") from None
+        raise ModelError(
+            f"{tracked} cannot follow a constant reference, because its steady-state gain from {realisation.input} is "
+            "0; choose another output"
+        ) from None
     return np.asarray(equilibrium, dtype=np.float64)

@@ -144,8 +144,8 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     gain, phase = max(best.gain_error.values()), max(best.phase_error.values())
     if not (gain <= COARSE_DB and phase <= COARSE_DEGREES):
         raise ModelError(
-            f"{best.states} states are off by up to {gain:.2g} dB and {phase:.2g} degrees between {low:.3g} and "
-            f"{high:.3g} rad/s, so nothing is designed on them; use a narrower band"
+            f"a realization with {best.states} states has errors of up to {gain:.2g} dB and {phase:.2g} degrees "
+            f"between {low:.3g} and {high:.3g} rad/s, so nothing is designed on them; use a narrower band"
             + ("" if poles is None else ", or more poles")
         )
     return best

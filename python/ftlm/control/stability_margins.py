@@ -178,8 +178,8 @@ class Plant:
         if grows != 0:
             why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
             raise ModelError(
-                f"the model is not stable ({why}), so margins say nothing about its loop; stabilize the machine "
-                "first, and identify the stabilized one"
+                f"the model is not stable ({why}), so stability margins of its loop are meaningless; stabilize the "
+                "machine first, and identify the stabilized machine"
             )
 
     def samples(self, count: int, seed: int) -> list[Plant]:

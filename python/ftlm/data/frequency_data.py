@@ -156,7 +156,7 @@ class FrequencyData:
         is_inside = (self.frequency >= ends[0]) & (self.frequency <= ends[1])
         if not is_inside.any():
             raise DataError(
-                f"{self.name}: nothing was measured from {ends[0]:g} to {ends[1]:g} rad/s; it reaches from "
+                f"{self.name}: there are no data from {ends[0]:g} to {ends[1]:g} rad/s; the data cover "
                 f"{self.frequency.min():.5g} to {self.frequency.max():.5g} rad/s"
             )
         deviation = None if self.deviation is None else self.deviation[is_inside]

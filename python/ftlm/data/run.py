@@ -91,7 +91,7 @@ class Run:
     unmasked_run: Run | None = None
 
     def __init__(self) -> None:
-        raise TypeError("a Run is made by Run.from_arrays, Run.from_frame or ftlm.load")
+        raise TypeError("a Run cannot be created directly; use Run.from_arrays, Run.from_frame or ftlm.load")
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
         raise AttributeError(f"a Run never changes; {name!r} cannot be set")
@@ -456,7 +456,7 @@ class Run:
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run with the mean or the least-squares line of some signals subtracted.
 
-        The mean of a run that does not end where it began contains part of the response. An offset in the structure
+        If a run does not end at its initial value, its mean contains part of the response. An offset in the structure
         (``+ c``) estimates a constant offset without this bias. `warnings` records what was subtracted.
 
         Parameters
@@ -522,7 +522,7 @@ class Run:
         return self._with(_data={**self._data, **checked}, sample_times=readings)
 
     def with_unmasked_run(self, run: Run) -> Run:
-        """Return this run, whose outputs are masked, with the original run attached, which gives the initial state."""
+        """Return this run, whose outputs are masked, with a reference to the original run for the initial state."""
         return self._with(unmasked_run=run)
 
     def _checked_samples(self, argument: str, values_by_name: object, length: int) -> dict[str, Floats]:
@@ -562,7 +562,7 @@ class Run:
         names = list(renamed.values())
         for index, name in enumerate(names):
             if name in names[:index]:
-                raise DataError(f"rename: two signals would be called {name!r}; give every signal its own name")
+                raise DataError(f"rename: two signals would have the name {name!r}; give every signal its own name")
         return self._with(
             inputs=tuple(renamed[name] for name in self.inputs),
             outputs=tuple(renamed[name] for name in self.outputs),
@@ -683,8 +683,8 @@ class Run:
             samples = drop_missing(values)
             if samples.size == 0:
                 raise DataError(
-                    f"output {name!r} of run {self.name!r}: all of its {values.size} rows are missing; use a part "
-                    "of the record in which it was read"
+                    f"output {name!r} of run {self.name!r}: all of its {values.size} samples are missing; use a part "
+                    "of the record in which it was measured"
                 )
             if is_constant(values):
                 thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(samples[0])!r}"

@@ -299,7 +299,7 @@ def regular_step(
 
 
 def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
-    """Return the shortest decimal step consistent with the sample times, or the mean step."""
+    """Return the step with the fewest decimals that is consistent with the sample times, or the mean step."""
     for digits in range(12):
         short = float(f"{mean:.{digits}e}")
         drift = abs(short - mean) * count

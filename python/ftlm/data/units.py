@@ -102,12 +102,12 @@ def time_unit_of(name: str, label: str, choice: str | None) -> tuple[str, tuple[
         if choice is None:
             raise DataError(
                 f"{label}: its header states the unit {unit_in_header!r}, which is unknown; the known ones are "
-                f"{join_names(TIME_UNITS)}; say with {parameter('time_unit')} in which the numbers are"
+                f"{join_names(TIME_UNITS)}; give the unit of the numbers with {parameter('time_unit')}"
             )
         return choice, ()
     if choice is not None and TIME_UNITS[choice] != TIME_UNITS[unit_in_header]:
         raise DataError(
-            f"{label}: its header states {unit_in_header!r}, and {parameter('time_unit', choice)} is asked for; leave "
+            f"{label}: its header states {unit_in_header!r}, and {parameter('time_unit', choice)} is given; leave "
             f"{parameter('time_unit')} out, or rename the column"
         )
     return unit_in_header, () if unit_in_header == "s" else (
@@ -187,7 +187,7 @@ def _multiply_units(first: Mapping[str, float], second: Mapping[str, float]) -> 
 def nonlinear_coefficient_unit(
     units: Mapping[str, str], output: str, alpha: float, expression: Expression, order: float
 ) -> str:
-    """Return the unit of the coefficient of a nonlinear term, such as ``s^-2 rad^-2``.
+    """Return the unit of the coefficient of a non-linear term, such as ``s^-2 rad^-2``.
 
     The term is D^order of an expression, in the equation of D^alpha of the output.
 

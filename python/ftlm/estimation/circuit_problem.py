@@ -190,7 +190,7 @@ class CircuitProblem(ResponseProblem):
 
 
 def _positive_least_squares(table: Floats, goal: Floats) -> Floats:
-    """Return a positive least-squares solution; components that would be negative get 0.001 of the largest."""
+    """Return a least-squares solution in which negative components are replaced by 0.001 of the largest component."""
     lengths = np.linalg.norm(table, axis=0)
     scaled = table / lengths
     is_active = np.ones(lengths.size, dtype=bool)

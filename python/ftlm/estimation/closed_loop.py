@@ -47,8 +47,8 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     """
     if reference in structure.signals:
         raise ModelError(
-            f"{parameter('reference', reference)} is a signal of the model; a reference drives the loop from "
-            "outside, and the model does not read it"
+            f"{parameter('reference', reference)} is a signal of the model; a reference is an external signal of the "
+            "loop that is not in the model; give such a signal"
         )
     for run in runs:
         if run.sample_times is not None:

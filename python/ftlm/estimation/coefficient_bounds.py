@@ -22,7 +22,7 @@ FitType = TypeVar("FitType")
 
 
 def check_intervals(bounds: object, *, finite: bool = False) -> None:
-    """Raise ModelError unless bounds are pairs (lower, upper) by name, lower < upper; finite ones if `finite`."""
+    """Raise ModelError unless bounds are pairs lower < upper by name; with `finite` they must be finite."""
     if not isinstance(bounds, Mapping):
         raise ModelError(f"bounds = {bounds!r} is not a mapping; write {{name: (low, high)}}")
     for name, pair in bounds.items():
@@ -81,8 +81,8 @@ def fit_within_bounds(
 ) -> tuple[FitType, list[Finding]]:
     """Return the fit of a structure with its coefficients within bounds, and a finding on each active bound.
 
-    An active-set method fixes coefficients beyond their bounds at the bounds. Then it releases each of them in turn and
-    fits again from the bound; the refit is kept if it satisfies all bounds. `fit` takes a structure and the only
+    An active-set method fixes coefficients beyond their bounds at the bounds. Then it frees each of them in turn and
+    fits again from the bound. The refit is kept if it satisfies all bounds. `fit` takes a structure and the only
     initial guess, or None for automatic ones, and returns a fit and its estimates by name.
     """
 

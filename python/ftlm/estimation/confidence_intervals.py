@@ -103,7 +103,7 @@ def with_intervals(
 
 @dataclass(frozen=True)
 class ProfileResult:
-    """Profile-likelihood intervals, and any lower optimum found on the way.
+    """Profile-likelihood intervals, and any lower optimum found during the search.
 
     Parameters
     ----------
@@ -203,8 +203,8 @@ def result_profiles(
     """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
     if "reference" in result.settings:
         raise ModelError(
-            f"a fit with {parameter('reference')} makes residuals orthogonal to instruments, and has no cost to "
-            "profile; use its standard errors"
+            f"a fit with {parameter('reference')} solves instrument equations and has no cost function to profile; "
+            "use its standard errors"
         )
     if "noise_model" in result.settings:
         raise ModelError(f"a fit with {parameter('noise', 'ar')} has no profile; use its standard errors")
@@ -228,7 +228,7 @@ def result_profiles(
     )
     if profile.lower_optimum is not None:
         raise ConvergenceError(
-            "the profile leads to an optimum below this fit's, so its estimates are not the likeliest; identify again "
-            f"with {parameter('intervals', 'profile')}, which goes on from there"
+            "the profile leads to an optimum with a lower cost than this fit, so the fit is not the best; identify "
+            f"again with {parameter('intervals', 'profile')}, which continues from that optimum"
         )
     return profile.intervals

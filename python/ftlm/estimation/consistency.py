@@ -333,7 +333,10 @@ def consistency(
     estimator = resolve_method(method)
     options = [n for n in ("store", "start") if getattr(estimator, n, None) is not None]
     if options:
-        raise ModelError(f"{parameter(options[0])} is of one identification, and each part has its own; leave it out")
+        raise ModelError(
+            f"{parameter(options[0])} applies to a single identification, but each segment is identified separately; "
+            "leave it out"
+        )
     pieces = split_run(every[0], count or DEFAULT_SEGMENTS) if len(every) == 1 else list(every)
     names = _segment_names(pieces)
     results: list[Identification] = []

@@ -61,8 +61,8 @@ def fit_with_instruments(
 ) -> JointFit:
     """Return a joint fit whose output-error residuals are uncorrelated with instruments from noise-free inputs.
 
-    `joint` is the initial fit, to the runs in `answers`. Those are the measured `runs` with each input replaced by the
-    part that the reference explains, which contains no noise.
+    `joint` is the initial fit, to the runs in `answers`. They are the measured `runs` in which each input is replaced
+    by the noise-free part that the reference explains.
 
     The residuals are those of the measured runs. The instruments are the sensitivities of the outputs to the
     parameters, computed with `answers`. Orthogonality of both removes the bias caused by feedback of noise, whatever
@@ -187,8 +187,8 @@ def estimate_output_error(
     """Estimate orders and coefficients together by joint output error.
 
     `answers` are runs with the part of each input that a reference explains; they serve as instruments. `begin` is an
-    additional initial guess, completed by the values in `more`; with `alone` it is the only one. `joint_fit` is a joint
-    fit of the same task, if one was computed before.
+    additional initial guess, completed by the values in `more`. With `alone` it is the only guess. `joint_fit` is a
+    joint fit of the same task, if one was computed before.
     """
     # An order with one value is known.
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
@@ -331,7 +331,7 @@ def fit_at_best_orders(
 def prior_findings(
     task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
 ) -> list[Finding]:
-    """Return a finding on each order search in which the prior covariance makes the best simulation nearly zero."""
+    """Return a finding on each order search in which a small prior covariance makes the best simulation near zero."""
     if settings.coefficients != "multi-innovation" or settings.prior_covariance is None:
         return []
     if settings.criterion != "output-error":
@@ -389,9 +389,9 @@ def run_order_searches(
 def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: SearchResult) -> int:
     """Return the rank of the table row whose orders give the most likely simulation of all equations together.
 
-    The order search ranks candidates by simulations in which measured outputs enter each equation. Those hardly
-    distinguish neighboring orders. The criterion here is the sum of ln NR over outputs, which is the negative log
-    likelihood of white noise of unknown variance up to constants.
+    The order search ranks candidates by simulations in which measured outputs enter each equation. Such simulations
+    hardly distinguish neighboring orders. The criterion here is the sum of ln NR over outputs, which is the negative
+    log likelihood of white noise of unknown variance up to constants.
     """
     best, rank = math.inf, 1
     for row in search.table:

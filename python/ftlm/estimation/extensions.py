@@ -160,11 +160,11 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     raises it. An extension is reported only if its own residuals depend neither on an input nor on the direction of
     motion.
 
-    Residuals that are rounding and discretization errors show nothing.
+    Residuals at the level of rounding and discretization errors are not tested.
 
     Structures with friction, saturation, dead zone or free delays are not tested. Structures of several equations or
-    with a coefficient law are tested only for drift and intersample behavior. Structures with other nonlinear terms are
-    tested only for intersample behavior.
+    with a coefficient law are tested only for drift and intersample behavior. Structures with other non-linear terms
+    are tested only for intersample behavior.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
     large = [o for o in tests.outputs.values() if not o.nr <= NEGLIGIBLE_RESIDUAL_SHARE]
@@ -252,7 +252,7 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 
 
 def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:
-    """Return extensions by a constant, if the structure has no level, and by a drift; [] if nonlinear or given offsets.
+    """Return extensions by a constant, if the structure has no level, and by a drift; [] for non-linear structures.
 
     If the fit explains little (`is_poor`), the optimum with a constant may be far away. It is then also sought from
     automatic initial guesses.

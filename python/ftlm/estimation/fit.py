@@ -1,4 +1,4 @@
-"""Result of one estimator, without the assessment that `identify` adds."""
+"""Result of one estimator, without the residual tests and findings that `identify` adds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ProgressCallback = Callable[[int, int], None] | None
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of one estimator, without the assessment that `identify` adds.
+    """Result of one estimator, without the residual tests and findings that `identify` adds.
 
     Parameters
     ----------

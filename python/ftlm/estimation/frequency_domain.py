@@ -188,7 +188,7 @@ def _fit_response(
     *,
     alone: bool,
 ) -> FrequencyIdentification:
-    """Fit a response problem from automatic initial guesses and the user's; with `alone`, only from the user's."""
+    """Fit a response problem from automatic guesses and the user's guess; with `alone`, only from the user's guess."""
     count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
     if count <= numbers:
         raise DataError(
@@ -261,7 +261,7 @@ def _structure(
     Raises
     ------
     ModelError
-        If it has nonlinear terms, an offset, a sensor filter or a coefficient law.
+        If it has non-linear terms, an offset, a sensor filter or a coefficient law.
     """
     target = equation(structure) if isinstance(structure, str) else structure
     if not isinstance(target, Structure):
@@ -281,7 +281,7 @@ def _structure(
         raise ModelError("the structure has a sensor filter; divide the data by its response, and leave it out")
     if target.coefficient_law:
         raise ModelError(
-            f"the structure has a law of its coefficients, which this fit does not keep; leave {parameter('laws')} out"
+            f"the structure has a coefficient law, which this fit does not impose; leave {parameter('laws')} out"
         )
     if not (target.order_names or target.coefficient_names or target.free_inputs):
         raise ModelError(
@@ -312,7 +312,7 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
             if not own[side]:
                 if len(names) > 1:
                     raise DataError(
-                        f"{record.name} does not say its {side}, and the equations have {', '.join(names)}; say "
+                        f"{record.name} does not name its {side}, and the equations have {', '.join(names)}; give "
                         f"{parameter(side)} when loading it"
                     )
                 own[side] = names[0]

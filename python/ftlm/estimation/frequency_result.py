@@ -592,7 +592,7 @@ def assign_signals(model: Model | Circuit, record: FrequencyData) -> FrequencyDa
             out[side] = names[0]
         if out[side] not in names:
             raise DataError(
-                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(names)}; say "
+                f"{record.name} has the {side} {out[side]!r}, and the model {', '.join(names)}; give "
                 f"{parameter(side)} when loading it"
             )
     return replace(record, output=out["output"], input=out["input"])

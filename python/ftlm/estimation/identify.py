@@ -138,7 +138,7 @@ def fit_with_offset_decision(
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Functions that fit a structure under several initial conditions, of which one is chosen.
+    """Functions that fit a structure with different initial conditions, and complete the fit that is chosen.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ class Hypotheses:
     complete: Callable[[Structure, JointFit | None], Fit] | None = None
 
     def take(self, structure: Structure, fit: Fit) -> Fit:
-        """Return the fit of the chosen hypothesis with all its confidence intervals."""
+        """Return the chosen fit with all requested confidence intervals."""
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
@@ -176,7 +176,7 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     restart = _fit_in_motion(fit, structure, hypotheses)
     if restart is not None:
         return restart
-    # In a nonlinear model a constant has no constant sensitivity: it determines where a body rests.
+    # In a non-linear model a constant has no constant sensitivity: it determines where a body rests.
     if fit.task.structure.offset != "none" or not structure.is_linear:
         return hypotheses.take(structure, fit)
     suggests_level = _suggests_level(fit)
@@ -504,7 +504,7 @@ def identify_pieces(
     """Identify an unstable plant under control from pieces of its runs, each with its own initial values.
 
     The simulation of an unstable model diverges, but its error cannot grow beyond one piece. White measurement noise in
-    the feedback does not bias output error if the plant has a delay of a sample.
+    the feedback does not bias output-error estimates if the plant has a delay of one sample.
 
     Parameters
     ----------

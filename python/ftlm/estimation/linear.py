@@ -65,7 +65,7 @@ def estimate_coefficients(
 ) -> CoefficientFit:
     """Return the coefficients at given orders, estimated by the linear method that `settings` name.
 
-    Nonlinear terms contain derivatives of measured signals. They are computed from the raw and from smoothed signals,
+    Non-linear terms contain derivatives of measured signals. They are computed from the raw and from smoothed signals,
     and the estimate with the better simulation is returned.
     """
     if settings.coefficients == "instrumental-variables":
@@ -87,7 +87,7 @@ def _estimate_coefficients(
 ) -> tuple[CoefficientFit, list[Record]]:
     """Return the coefficients at given orders, and the block-pulse records that they were estimated from.
 
-    With `smooth`, derivatives in nonlinear terms are those of smoothed signals.
+    With `smooth`, derivatives in non-linear terms are those of smoothed signals.
     """
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar, smooth=smooth)
     fit = CoefficientFit(records[0].m, records[0].initial)

@@ -123,7 +123,7 @@ def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
 
 
 def whiten(run: Run, colour: Floats) -> Run:
-    """Return a run filtered by A(q). The first output samples are missing, because their past is unknown."""
+    """Return a run filtered by A(q). The first output samples are then missing."""
     past = colour.size - 1
 
     def whitened_samples(values: Floats) -> Floats:
@@ -193,7 +193,7 @@ class EstimationMethod(Protocol):
         threads: int | None,
         progress: ProgressCallback,
     ) -> Fit:
-        """Fit a structure, whose offset is decided, to checked runs; other arguments are those of `identify`."""
+        """Fit a structure with a fixed choice of offset to checked runs; other arguments are those of `identify`."""
 
 
 @check_arguments
@@ -328,7 +328,7 @@ class OutputError:
 
     @property
     def hypothesis(self) -> OutputError | None:
-        """Return this method without profile likelihood, for fits of which only one is completed.
+        """Return this method without profile likelihood, for several preliminary fits.
 
         None if `fit` cannot complete such a fit: with bounds, a noise model or a reference.
         """
@@ -407,7 +407,7 @@ class LeastSquares(OrderSearchMethod):
     Raises
     ------
     ModelError
-        A value that :func:`ftlm.search_orders` refuses.
+        A value that :func:`ftlm.search_orders` does not accept.
     """
 
     name: ClassVar[str] = "least-squares"
@@ -428,7 +428,7 @@ class InstrumentalVariables(OrderSearchMethod):
     Raises
     ------
     ModelError
-        A value that :func:`ftlm.search_orders` refuses.
+        A value that :func:`ftlm.search_orders` does not accept.
     """
 
     name: ClassVar[str] = "instrumental-variables"
@@ -455,7 +455,7 @@ class MultiInnovation(OrderSearchMethod):
     Raises
     ------
     ModelError
-        A value that :func:`ftlm.search_orders` refuses.
+        A value that :func:`ftlm.search_orders` does not accept.
     """
 
     name: ClassVar[str] = "multi-innovation"

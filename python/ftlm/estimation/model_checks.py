@@ -375,12 +375,11 @@ def _simulated_speeds(samples: Floats, residuals: Floats) -> Floats:
 
 
 def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
-    """Return a robust standard deviation of the residuals for each sample, from which outliers are judged.
+    """Return a robust standard deviation of the residuals for each sample, by which outliers are detected.
 
-    It is that of all samples, or that of samples with similar speed if larger.
-
-    Residuals that grow with speed, such as those of timing or gain errors, are therefore not outliers. Nor are all
-    moving samples outliers if the machine rests during most of the run.
+    It is the deviation of all samples, or that of samples with similar speed if that is larger. Residuals that grow
+    with speed, such as those of timing or gain errors, are therefore not outliers. If the machine is at rest during
+    most of the run, samples in motion are not outliers either.
     """
     usual = np.full(residuals.size, robust_deviation(drop_missing(residuals)))
     finite_rows = np.flatnonzero(~np.isnan(residuals))
@@ -579,7 +578,7 @@ def mode_sampling_findings(model: Model, runs: Sequence[Run]) -> list[Finding]:
 
 
 def has_growing_mode(model: Model, coupling: str) -> bool:
-    """Whether the model has a significantly unstable mode, at 99 %; True if modes or their errors are unknown.
+    """Whether the model has a significantly unstable mode (99 %); True if modes or their errors are unknown.
 
     `coupling` selects the poles, as in :func:`ftlm.modes`.
 

@@ -1,4 +1,4 @@
-"""Findings on nonlinear terms: their range in the data, their share of the motion, and chaotic sensitivity."""
+"""Findings on non-linear terms: their range in the data, their share of the motion, and chaotic sensitivity."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RELATIVE_CHANGE = 1e-7
 
 
 def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSamples]) -> list[Finding]:
-    """Return findings on the nonlinear terms of a model on its runs; [] for a linear model."""
+    """Return findings on the non-linear terms of a model on its runs; [] for a linear model."""
     finite = all(np.isfinite(samples.outputs).all() for samples in free)
     if not model.structure.has_nonlinear_terms or not finite or any(run.sample_times is not None for run in runs):
         return []
@@ -73,7 +73,7 @@ def _term_values(term: Term, values: dict[str, Floats], step: float) -> Floats:
 
 
 def _term_findings(item: Equation, runs: Sequence[Run], values: Sequence[dict[str, Floats]]) -> Iterator[Finding]:
-    """Yield a note on each nonlinear term: its size relative to the highest derivative, and its signals' range."""
+    """Yield a note on each non-linear term: its size relative to the highest derivative, and its signals' range."""
     pairs = list(zip(values, (run.step for run in runs), strict=True))
     whole = [sum((_term_values(t, v, h) for t in item.terms), np.zeros(1)) for v, h in pairs]
     size = _rms(whole)

@@ -104,8 +104,8 @@ class OffsetTest:
     def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = NEGLIGIBLE_RESIDUAL_SHARE) -> bool:
         """Whether the statistic is significant at `level` and the effect is larger than `size`.
 
-        An effect larger than the standard deviation of the output counts as significant: noise of whatever color cannot
-        explain it.
+        An effect larger than the standard deviation of the output counts as significant, because noise of any color
+        cannot explain it.
         """
         significant = self.size > 1.0 or self.statistic > chi_squared(self.degrees, level)
         return self.degrees > 0 and self.size > size and significant
@@ -271,8 +271,9 @@ def _prediction_ratio(few: Floats, many: Floats, residuals: Floats, blocks: list
     """Return the decrease of the noise criterion from the columns `few` to the columns `many`, at least 0.
 
     For equal autoregressions it is twice the logarithm of the likelihood ratio of their one-step prediction errors.
-    Predictions are compared because a random walk has a mean as large as itself, but white increments. Each set has its
-    own order: that which is needed without the constants can imitate them. Both are evaluated on the same rows.
+    Predictions are compared because a random walk has a large mean, but white increments. Each set of columns has its
+    own autoregression order, because the order needed without constants can imitate a constant. Both sets are evaluated
+    on the same rows.
     """
     outputs = [[slice(*own[k]) for own in blocks] for k in range(len(blocks[0]))]
     shortest = [min(p.stop - p.start for p in places) for places in outputs]
@@ -317,7 +318,7 @@ def _noise_criterion(
 
 @dataclass(frozen=True)
 class _Autoregression:
-    """Autoregression without a constant: whitening filter, deviation and criterion of prediction errors."""
+    """Autoregression without a constant: whitening filter, and deviation and criterion of its errors."""
 
     filter: Floats
     deviation: float
@@ -328,7 +329,7 @@ class _Autoregression:
         return self.filter.size - 1
 
     def whiten(self, columns: Floats, start: int) -> Floats:
-        """Return prediction errors of columns, in their standard deviations, from a row on."""
+        """Return prediction errors of columns from a row on, divided by their standard deviation."""
         rows = columns[start - self.order :].T
         return np.stack([np.convolve(row, self.filter, "valid") for row in rows], axis=1) / self.deviation
 
@@ -337,9 +338,9 @@ def _fit_autoregression(series: Sequence[Floats], most: int) -> _Autoregression:
     """Return the autoregression of lower criterion: of the series, or of their increments, whose root is fixed at 1.
 
     Both are fitted by least squares from row ``most`` of each series on. Orders minimize Akaike's criterion, because
-    white noise on a random walk needs many lags. That of the series pays a further log(rows): an estimated root near 1
-    is biased downward, so that a random walk would pass for stationary noise about a mean. Series are not centered,
-    because their mean is what is tested.
+    white noise on a random walk needs many lags. The criterion of the series has an additional penalty log(rows). An
+    estimated root near 1 is biased downward, so a random walk would otherwise count as stationary noise about a mean.
+    Series are not centered, because their mean is tested.
     """
     factor = np.zeros((most + 1, most + 1))
     for windows in (np.lib.stride_tricks.sliding_window_view(e, most + 1) for e in series):
@@ -358,7 +359,7 @@ def _nested_regression(factor: Floats, rows: int, difference: Floats, penalty: f
     """Return the autoregression of the order that minimizes rows log(power) + 2 order + `penalty`.
 
     The triangular `factor` has the lags first and the predicted value last: regression on the first k columns leaves
-    the last column from row k on. `difference` is the filter that the series passed before, and part of the result.
+    the last column from row k on. `difference` is the filter that was applied to the series; the result includes it.
     """
     last = factor[:, -1]
     powers = np.maximum(np.cumsum(last[::-1] ** 2)[::-1] / rows, np.finfo(np.float64).tiny)
@@ -412,9 +413,9 @@ def fit_with_initial_conditions(
     """Fit a structure to runs with unknown initial conditions, and select the initial terms.
 
     `start` are the initial conditions suggested by the data. A fit with a history (powers of t that represent past
-    inputs) is kept unless the fewer Caputo initial terms leave equally small residuals. A fit from rest is kept unless
-    a history improves it significantly. The result names the fitted terms in ``initial``. With `alone`, the first of
-    `guesses` is the only initial guess.
+    inputs) is kept unless Caputo initial terms, which are fewer, give equally small residuals. A fit from rest is kept
+    unless a history improves it significantly. The result names the fitted terms in ``initial``. With `alone`, the
+    first of `guesses` is the only initial guess.
     """
 
     def fit_initial_terms(

@@ -49,7 +49,7 @@ def search_orders(
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Search the orders of an equation over a grid, or of coupled equations under an order law; all are compared.
+    """Search the orders of an equation, or of coupled equations under an order law, over all points of a grid.
 
     For each candidate, the coefficients are estimated from the equation error, and the candidate gets a score (Table 2
     of the paper, steps 5-7). The table of best candidates equals that of a full evaluation of every candidate. It is
@@ -193,7 +193,7 @@ def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]
 
 
 def _independent_samples(residuals: Floats) -> float:
-    """Return the number of independent samples that carry as much information as a series of correlated ones."""
+    """Return the number of independent samples with the same information as a series of correlated samples."""
     samples = drop_missing(residuals)
     if samples.size < 2 or is_constant([samples]):
         return float(samples.size)

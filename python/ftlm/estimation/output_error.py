@@ -98,7 +98,7 @@ OUTLIER_DEVIATIONS = 5.0
 
 @dataclass(frozen=True)
 class RobustLossSummary:
-    """Numbers of residuals with reduced weight and of outliers in a fit with a robust loss.
+    """Counts of a fit with a robust loss: residuals with reduced weight, and outliers.
 
     Parameters
     ----------

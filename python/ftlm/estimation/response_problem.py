@@ -46,7 +46,9 @@ class ResponseRecord:
 
 
 class ResponseProblem:
-    """Estimation problem of a structure from measured responses, in a time unit in which parameters are near 1.
+    """Estimation problem of a structure from measured frequency responses, in scaled time.
+
+    The time unit is chosen so that parameters are near 1.
 
     The time unit is 1/`unit` seconds. Parameter vectors have the order of `names`: free orders, free coefficients, free
     delays.
@@ -386,7 +388,7 @@ def halton(count: int, width: int) -> Floats:
 
 
 def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Floats]:
-    """Return promising initial guesses: grid points to which linear least squares add the coefficients.
+    """Return the best initial guesses: grid points with coefficients by linear least squares.
 
     The equations are solved one after another, and the points are sorted by their total cost.
     """
@@ -413,8 +415,8 @@ def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Float
 def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
     """Return one corner frequency for each grid point, at which the slowest output term is fixed.
 
-    It is NaN for the `first` points. Each entry of `slow` has several further points, with corner frequencies spread
-    over the measured band.
+    It is NaN for the `first` points. Each row of `slow` gives several additional points, with corner frequencies
+    distributed over the measured band.
 
     If noise hides a small arc of an impedance, iteratively reweighted least squares are biased, and the coefficients of
     output terms are far too small or too large. If the slowest output term is fixed, the remaining bias is small.

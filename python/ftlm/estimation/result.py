@@ -112,7 +112,7 @@ def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> d
         stages.append(stage)
         amount = real_number(name, value)
         if not 0 < amount < math.inf:
-            raise ModelError(f"{name} = {value!r} is not positive")
+            raise ModelError(f"{name} = {value!r} is not positive; give a positive value")
         h = 2 * stage - 1
         ratio = f"j{stage}" if f"j{stage}" in joint.coefficients else f"r{stage}"
         needed = [f"a{h}", f"b{h}", f"d{h}", f"g{h}", ratio]
@@ -231,8 +231,8 @@ class Identification:
     def standard_errors(self) -> dict[str, float]:
         """Standard errors of the parameters by name; {} for methods that give none.
 
-        Output error and instrumental variables give standard errors that are robust to colored residuals. If no order
-        is free, instrumental variables give those of the coefficients.
+        Standard errors of output error and instrumental variables are robust to colored residuals. Instrumental
+        variables give standard errors of the coefficients, and only if no order is free.
         """
         if self.joint is None:
             return dict(self.coefficient_errors)

@@ -257,7 +257,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
 
 
 def _free_runs(result: Identification) -> Iterator[Finding]:
-    """Yield findings about the simulation: overflow, instability, a poor fit, an unstable plant."""
+    """Yield findings about the simulation: overflow, instability, poor fit, unstable plant."""
     plant = [f for f in result.findings if f.code in UNSTABLE_PLANT_CODES]
     yield from plant
     if plant and plant[0].code != "plant_needs_pieces":
@@ -272,7 +272,7 @@ def _free_runs(result: Identification) -> Iterator[Finding]:
 
 
 def _unstable_poles(model: Model) -> Iterator[Finding]:
-    """Yield findings about unstable poles and undamped modes; none for a nonlinear model.
+    """Yield findings about unstable poles and undamped modes; none for a non-linear model.
 
     A pole at the origin is an integrator, which is common in machines and gives no finding.
     """
@@ -310,7 +310,7 @@ def have_common_value(intervals: Any) -> bool:
 def improves_prediction(
     gains: Sequence[float], intervals: Mapping[str, Mapping[str, tuple[float, float]]], whole: Mapping[str, float]
 ) -> bool | None:
-    """Whether fractional orders improve the prediction of other runs; None if this is not decided.
+    """Whether fractional orders improve the prediction of other runs; None if the test is inconclusive.
 
     `gains` are the gains of fit on validation runs, `intervals` the confidence intervals of orders by run and name, and
     `whole` the integer orders by name.

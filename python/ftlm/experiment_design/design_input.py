@@ -393,8 +393,8 @@ def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
         raise ModelError("the model has no input to design; give a model with an input")
     if fit.problem.structure.all_filtered:
         raise ModelError(
-            "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the "
-            "filter on outputs alone"
+            "an input of the model was measured through the sensor filter, but the command to a rig is not filtered; "
+            "identify the model with the filter on outputs only"
         )
     if reference_run is None:
         return
@@ -510,9 +510,9 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
         pass
     band = f"{low:.2g}:{max(high, 2 * low):.2g}"
     raise ModelError(
-        f"the intervals are too wide to design on ({why}): what is best for this model may be bad for the machine. "
-        f"First record a run that excites the whole band, such as a multisine of {band} Hz (ftlm record --input "
-        f"multisine --band {band}), and identify again from both runs"
+        f"the intervals are too wide to design on ({why}): an input that is optimal for this model may be poor for "
+        f"the machine. First record a run that excites the whole band, such as a multisine of {band} Hz (ftlm record "
+        f"--input multisine --band {band}), and identify again from both runs"
     )
 
 

@@ -69,8 +69,8 @@ def exchange_holds(
     Source: Fedorov, Theory of Optimal Experiments, 1972. `hold` is the length of a hold in samples.
 
     The Fisher information is quadratic in the commands, so convolutions give its change by every exchange exactly. The
-    best feasible exchange is made until none improves the score. The result is a local optimum with respect to changes
-    of one hold, and to opposite changes of two neighboring holds.
+    best feasible exchange is made until no exchange improves the score. The result is a local optimum with respect to
+    changes of one hold, and to opposite changes of two neighboring holds.
     """
     inputs, rows = begin.commands.shape
     starts = np.arange(0, rows, hold)

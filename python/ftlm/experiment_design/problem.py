@@ -68,7 +68,10 @@ class Criterion:
         return np.where(np.isfinite(spread[..., 0, 0]), scores, -np.inf)
 
     def smooth_score(self, information: Floats) -> float:
-        """Return a differentiable upper bound of the score: for E, Kiefer's mean replaces the longest axis."""
+        """Return a differentiable upper bound of the score.
+
+        For criterion E, Kiefer's mean over all axes of the confidence ellipsoid replaces the longest axis.
+        """
         if self.kind == "D":
             return float(self.score(information))
         axes = np.linalg.eigvalsh(self._inverse(information))
@@ -161,7 +164,7 @@ def per_signal_values(
             if name not in names:
                 near = nearest(name, names) if isinstance(name, str) else ""
                 raise ModelError(
-                    f"{what} names {short_repr(name)}{near}, which is none of {', '.join(names) or 'nothing'}; "
+                    f"{what} names {short_repr(name)}{near}, which is not one of {', '.join(names) or 'nothing'}; "
                     "name one of them"
                 )
     elif values is not None:
@@ -297,9 +300,8 @@ def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weig
 class Sensitivities:
     """Sensitivities of the outputs to parameters for one zero-order-hold sample of each input.
 
-    Convolution gives those for any input.
-
-    This is exact, because all equations are linear in their inputs and start at rest.
+    A convolution gives the sensitivities for any input. It is exact, because all equations are linear in their inputs
+    and start at rest.
 
     Parameters
     ----------
@@ -386,7 +388,7 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
     structure = fit.problem.structure
     drives = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
-        raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not decided; identify it again")
+        raise ModelError(f"{setting('offset')} {structure.offset!r} of the model is not resolved; identify it again")
     if not drives:
         return np.zeros((0, len(fit.outputs) * rows))
     names = {*structure.signals, *structure.coefficient_names, *structure.order_names}

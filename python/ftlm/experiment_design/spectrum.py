@@ -25,7 +25,7 @@ OPTIMALITY_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class SpectralLines:
-    """Fisher information, and use of each limit, per unit of power at each spectral line of each input.
+    """Fisher information, and share of each limit that is used, per unit of power at each spectral line.
 
     Parameters
     ----------
@@ -143,10 +143,10 @@ def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, s
 def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
     """Return the spectrum with the optimal power of each line under all limits.
 
-    With a dual variable (price) for each limit, the problem becomes one of weights that sum to one, which
-    Titterington's multiplicative algorithm solves (Silvey, Titterington & Torsney, 1978). For any prices, its optimum
-    is an upper bound of the original problem. The equivalence theorem of Kiefer & Wolfowitz bounds the distance of a
-    design from this optimum. Prices are adapted to the use of the limits.
+    Each limit has a dual variable (price). With fixed prices, the problem is an optimization of weights that sum to
+    one, solved by Titterington's multiplicative algorithm (Silvey, Titterington & Torsney, 1978). For any prices, its
+    optimum is an upper bound of the original problem. The equivalence theorem of Kiefer & Wolfowitz bounds the distance
+    of a design from this optimum. Prices are adapted to the use of the limits.
     """
     limits, points = lines.costs.shape
     price = np.full(limits, 1.0 / limits)

@@ -5,11 +5,11 @@ never imports it. KIND is mat, hdf5, parquet, feather, numpy or sheet, and OPTIO
 sheet. For every file the reader writes one line of JSON to standard output, followed by the numbers:
 
 ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays as
-little-endian float64, column after column; or only ``{"error": reason, "way_out": remedy}``. An array may
-have a ``"unit"``. An array of timestamps has ``"since"``, the reference time in integer nanoseconds since 1970 for its
-values in nanoseconds. Columns that do not come from matrices have ``"text": true``; a run written by ftlm has
-``"ftlm-run"``, its header. A sheet has ``"sheet"``, its name, ``"others"``, the names of empty sheets, and ``"bytes"``,
-the number of bytes of UTF-8 text that follow: one line per row, tabs between cells.
+little-endian float64, column after column; or only ``{"error": reason, "way_out": remedy}``. An array may have a
+``"unit"``. An array of timestamps has ``"since"``, the reference time in integer nanoseconds since 1970 for its values
+in nanoseconds. Columns that do not come from matrices have ``"text": true``; a run written by ftlm has ``"ftlm-run"``,
+its header. A sheet has ``"sheet"``, its name, ``"others"``, the names of empty sheets, and ``"bytes"``, the number of
+bytes of UTF-8 text that follow: one line per row, tabs between cells.
 """
 
 from __future__ import annotations
@@ -363,7 +363,7 @@ def _gather(hdf5: Any, group: Any, prefix: str, arrays: Arrays, depth: int) -> N
         matlab = item.attrs.get("MATLAB_class")
         kind = matlab.decode(errors="replace") if isinstance(matlab, bytes) else "" if matlab is None else str(matlab)
         if len(arrays.header["skipped"]) > MAX_ARRAYS:
-            raise UnreadableError(f"it holds more than {MAX_ARRAYS} things that are not arrays", "save a part of it")
+            raise UnreadableError(f"it has more than {MAX_ARRAYS} items that are not arrays", "save a part of it")
         if isinstance(item, hdf5.Group):
             if kind or key.startswith("#") or depth >= MAX_GROUP_DEPTH:
                 arrays.header["skipped"][name] = kind or "of MATLAB's own"
@@ -423,7 +423,7 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
             filled[name] = sheet_object
     if not filled:
         raise UnreadableError(
-            f"{'its sheets are' if len(names) > 1 else 'its sheet is'} empty", "choose a file that holds a record"
+            f"{'its sheets are' if len(names) > 1 else 'its sheet is'} empty", "choose a file with data"
         )
     if len(filled) > 1:
         raise UnreadableError(

@@ -213,7 +213,7 @@ class Timestamps:
 
     @classmethod
     def read(cls, cells: Sequence[str]) -> Timestamps | None:
-        """Return the timestamps of all cells; None if a cell is none, or has another notation than the first cell."""
+        """Return the timestamps of all cells; None if a cell has no timestamp or another notation."""
         spans = [_DURATION_PATTERN.fullmatch(cell) for cell in cells]
         if all(span is not None for span in spans) and cells:
             clock = np.array([_duration_ns(*span.groups("")) for span in spans if span is not None], np.int64)
@@ -234,7 +234,7 @@ class Timestamps:
 
     @classmethod
     def concatenate(cls, pieces: Sequence[Timestamps]) -> Timestamps | None:
-        """Return the blocks of one column as one; None if they differ in notation."""
+        """Return the blocks of a column concatenated; None if they differ in notation."""
         if len({piece.notation for piece in pieces}) > 1:
             return None
         parts, clock = (np.concatenate([getattr(p, name) for p in pieces]) for name in ("parts", "clock"))
@@ -295,12 +295,12 @@ class Timestamps:
             return {"ymd": (0, 1, 2), "dmy": (2, 1, 0), "mdy": (2, 0, 1)}[order]
         if first > 12:
             raise DataError(
-                f"{thing}: {self.first!r} may begin with the year or with the day; say "
+                f"{thing}: {self.first!r} may begin with the year or with the day; give "
                 f"{layout_parameter(dates='ymd')} or {layout_parameter(dates='dmy')}"
             )
         raise DataError(
-            f"{thing}: {self.first!r} may begin with the day or with the month; say {layout_parameter(dates='dmy')} or "
-            f"{layout_parameter(dates='mdy')}"
+            f"{thing}: {self.first!r} may begin with the day or with the month; give {layout_parameter(dates='dmy')} "
+            f"or {layout_parameter(dates='mdy')}"
         )
 
 

@@ -300,7 +300,7 @@ def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: st
     if repeated is not None:
         raise DataError(
             f"{source}: line {repeated} repeats the line of names; save the lines from {repeated} on as a second file, "
-            "and give both files as two runs, or remove that line if the record goes on"
+            "and give both files as two runs, or remove that line if the record continues"
         )
     if not rows.ragged:
         # float() accepts underscores between digits; numbers in files must not have them.
@@ -338,8 +338,8 @@ def _check_remark(line: str, at: int, dialect: TableDialect, source: str) -> Non
         and (numbers or error or dialect.separator is not None)
     ):
         raise DataError(
-            f"{source}: line {at} begins with # and has as many cells as a row ({line.strip()[:40]!r}), so it may be a "
-            "remark or a row; remove that line, or write a number in its first cell"
+            f"{source}: line {at} begins with # and has as many cells as a row ({line.strip()[:40]!r}), so it may be "
+            "a comment or a row; remove that line, or write a number in its first cell"
         )
 
 
@@ -415,9 +415,9 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
             at = head[: error.start].count(b"\n") + 1
             zipped = ": it begins as workbooks do, whose names end in .xlsx or .ods" if head[:2] == b"PK" else ""
             raise DataError(
-                f"{path.name}: line {at} is not UTF-8 text (byte {head[error.start]:#04x}), and other bytes are of no "
-                f"text at all{zipped}; say {layout_parameter(encoding=Placeholder('NAME'))}, or pass a csv, text or "
-                ".mat file"
+                f"{path.name}: line {at} is not UTF-8 text (byte {head[error.start]:#04x}), and other bytes are not "
+                f"text in any encoding{zipped}; give {layout_parameter(encoding=Placeholder('NAME'))}, or pass a csv, "
+                "text or .mat file"
             ) from None
         words = f"no UTF-8 (byte {head[error.start]:#04x}), taken for cp1252 of Windows, which numbers do not depend on"
         otherwise = layout_parameter(encoding=Placeholder("NAME"))

@@ -1,6 +1,6 @@
-"""Reading of binary files in a separate process, from the side of the parent process.
+"""Reading of binary files in a separate process: the code of the parent process.
 
-See :mod:`ftlm.io.binary_reader` for the side of the child process.
+See :mod:`ftlm.io.binary_reader` for the code of the child process.
 """
 
 from __future__ import annotations

@@ -195,7 +195,7 @@ def run_from_tables(
         # A column with a word among its numbers is no signal by its name.
         words = next((f"; {c.problem}" for c in pool.columns if c.problem is not None and not c.blank), "")
         raise DataError(
-            "no output is named, and the names of the columns do not say which they are; name the signals with "
+            "no output is named, and the roles of the columns are not clear from their names; name the signals with "
             f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}, or in a file for "
             f"{parameter('columns')}; {pool.describe()}{words}"
         )
@@ -479,7 +479,7 @@ def _apply_header(selection: ColumnSelection, header: Header) -> None:
         unit = selection.units.get(name)
         if file_unit and unit and unit != file_unit:
             raise DataError(
-                f"{parameter('units')}: {unit!r} is asked for signal {name!r}, and the file itself says {file_unit!r}; "
+                f"{parameter('units')}: {unit!r} is given for signal {name!r}, but the file states {file_unit!r}; "
                 "leave the unit out for a file written by ftlm"
             )
         if file_unit and not unit:

@@ -69,7 +69,7 @@ HEADERLESS_PARTS = ("frequency", "real", "imag")
 
 @dataclass(frozen=True)
 class _ResponseColumn:
-    """Column of a frequency response: which part it is, its unit, and whether its name inverts the sign."""
+    """Column of a frequency response: part, unit, and whether its name inverts the sign."""
 
     column: Column
     part: str
@@ -260,7 +260,7 @@ def _phase_unit(unit: str) -> str | None:
 
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
-    """Return what a column is by its name, such as ``Re(Z)`` or ``dB`` with or without unit; None if unknown."""
+    """Return the part of a response that a column name denotes, such as ``Re(Z)`` or ``dB``; None if unknown."""
     whole, file_unit = column.name.strip(), column.file_unit
     own = whole if _unit_kind(whole) else file_unit if _unit_kind(file_unit) else ""
     for text, unit in ((whole, own), _split_name_and_unit(column)):
@@ -371,8 +371,8 @@ def _polar(
     elif np.any(values < 0):
         bad = values < 0
         raise DataError(
-            f"column {size.column.name!r}: a size is negative, first at row {int(np.argmax(bad))}, {int(bad.sum())} in "
-            f"all; say {parameter('magnitude_unit', 'dB')} if these are decibels"
+            f"column {size.column.name!r}: a magnitude is negative, first at row {int(np.argmax(bad))}, "
+            f"{int(bad.sum())} in all; say {parameter('magnitude_unit', 'dB')} if these are decibels"
         )
     turned = angle.is_negated if negated is None else _truth("negated", negated)
     if turned and negated is None:

@@ -181,19 +181,19 @@ class Model:
     def linearized(self, at: Mapping[str, float]) -> Model:
         """Return the linear model of small deviations from an operating point.
 
-        Every nonlinear term is replaced by its first-order expansion. Constants are dropped, so signals of the linear
+        Every non-linear term is replaced by its first-order expansion. Constants are dropped, so signals of the linear
         model are deviations from the operating point.
 
         Parameters
         ----------
         at
-            Values of the signals in nonlinear terms, such as ``{"y": 0.3, "u": 1.0}``. Derivatives are 0 unless given,
+            Values of the signals in non-linear terms, such as ``{"y": 0.3, "u": 1.0}``. Derivatives are 0 unless given,
             as in ``{"y": 0.3, "D y": 0.1}``.
 
         Raises
         ------
         ModelError
-            If a signal has no value, a name is in no nonlinear term, or a term has no derivative at the point.
+            If a signal has no value, a name is in no non-linear term, or a term has no derivative at the point.
         """
         from ftlm.analysis.model_algebra import linearize
 

@@ -23,7 +23,7 @@ from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import error_text
 
 #: Schema versions: base, offset, profile likelihood intervals or sensor filters of signals that are not outputs,
-#: friction, input nonlinearities, Stribeck friction, free parameters of the fit, findings as records, levels,
+#: friction, input non-linearities, Stribeck friction, free parameters of the fit, findings as records, levels,
 #: non-linear terms.
 BASE_SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
 STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA, NONLINEAR_SCHEMA, PIECES_SCHEMA = 7, 8, 9, 10, 11, 12
@@ -32,9 +32,9 @@ STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA, NONLINEAR_SCHEMA, PIE
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
     """Term of an equation in a model file.
 
-    The coefficient is stored without its factor, with the name of the parameter that it was.
+    The coefficient is stored without its factor, with the name of the parameter.
 
-    A nonlinear term is stored with the text of its expression.
+    A non-linear term is stored with the text of its expression.
     """
 
     signal: str
@@ -169,7 +169,9 @@ class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
         that it names.
         """
         if isinstance(self.signals, UnsetType) == isinstance(self.outputs, UnsetType):
-            raise ModelError("its sensor filter has neither signals nor outputs, or both; one of them names them")
+            raise ModelError(
+                "its sensor filter has neither signals nor outputs, or both; exactly one of them is expected"
+            )
         if not isinstance(self.signals, UnsetType):
             return SensorFilter(self.signals, self.numerator, self.denominator)
         names = () if isinstance(self.outputs, UnsetType) else self.outputs
@@ -250,7 +252,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             count = sum(e.count for e in self.equations)
             rows = self.estimate.covariance
             if len(rows) != count or any(len(row) != count for row in rows):
-                raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
+                raise ModelError(f"its covariance does not have {count} by {count} elements, as its equations require")
         return Model(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 

@@ -63,10 +63,10 @@ class SearchProblem(ABC, Generic[Table]):
     @property
     @abstractmethod
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core that follow the records."""
+        """Arguments of the core after the records."""
 
     def core(self, *more: Any) -> tuple[Any, ...]:
-        """Return all arguments of the core; `more` are appended."""
+        """Return all arguments of the core, with `more` at the end."""
         return list(self.runs), *self.core_arguments, *more
 
     @abstractmethod
@@ -98,7 +98,7 @@ class EquationProblem(SearchProblem["_core._Found"]):
 
     @property
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core that follow the records."""
+        """Arguments of the core after the records."""
         return self.orders, self.inputs, self.fixed, self.initial, self.settings.core_arguments(self.threads)
 
     def search(self, progress: ProgressCallback | None) -> _core._Found:
@@ -140,7 +140,7 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
 
     @property
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core that follow the records."""
+        """Arguments of the core after the records."""
         return (
             self.axes,
             self.laws,
@@ -238,7 +238,7 @@ class CandidateBlock:
 
 
 def worker_count(executor: Executor) -> int:
-    """Return the number of tasks that an executor runs concurrently, as far as its attributes reveal it."""
+    """Return the number of tasks that an executor runs concurrently; a default if it cannot be determined."""
     count = getattr(executor, "_max_workers", None)
     client = getattr(executor, "_client", None)
     if count is None and client is not None:
@@ -249,7 +249,7 @@ def worker_count(executor: Executor) -> int:
 
 @dataclass
 class Throughput:
-    """Evaluation time per round or candidate, as measured, from which the size of a task follows."""
+    """Evaluation time per round or candidate, as measured; it determines the size of a task."""
 
     seconds_each: float = 0.0
     min_count: int = 1
@@ -322,7 +322,7 @@ def _result(future: Future[Any], block: CandidateBlock) -> tuple[float, Any] | N
         block.with_problem = True
         return None
     if not isinstance(timed, tuple) or len(timed) != 2:
-        raise _executor_error(TypeError(f"a task came back with {type(timed).__name__}"))
+        raise _executor_error(TypeError(f"a task returned {type(timed).__name__}"))
     return timed
 
 
@@ -344,7 +344,7 @@ Save = Callable[[int, int, Checkpoint | None], None]
 
 
 class SearchState(ABC, Generic[Frame, Table]):
-    """State of an order search in progress: numbers of candidates done and in total, and the current batch."""
+    """State of an order search in progress: number of evaluated candidates, total number, and current batch."""
 
     #: Whether a search begun by an earlier version can be resumed.
     can_resume = True
@@ -385,7 +385,10 @@ class SearchState(ABC, Generic[Frame, Table]):
 
     @abstractmethod
     def add_block(self, frame: Frame) -> int:
-        """Add a block to the current batch; return how many of its candidates need further evaluation, if known."""
+        """Add the result of a block to the current batch.
+
+        Return the number of its candidates without a complete score, which may need further evaluation.
+        """
 
     @abstractmethod
     def table(self) -> Table:
@@ -453,7 +456,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         return Rounds(number, block.first, block.last, piece)
 
     def add_block(self, frame: Rounds) -> int:
-        """Add a block of rounds to the current batch."""
+        """Add the result of a block to the current batch; return 0, because every candidate is completely evaluated."""
         self._parts.append(frame.part)
         self.done += finished_count(frame.part[1])
         return 0
@@ -513,7 +516,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
     def _cut(self, block: CandidateBlock) -> list[Span]:
         """Return the candidates of a block as spans (ranges) of candidate indices.
 
-        A block is counted through all spans of the batch.
+        Indices of a block count the candidates of all spans of the batch.
         """
         cut, at = [], self._first
         for equation, start, end, limit in self._spans:
@@ -528,7 +531,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         return Verdicts(number, block.first, block.last, *piece)
 
     def add_block(self, frame: Verdicts) -> int:
-        """Add a block of results to the current batch."""
+        """Add the result of a block to the current batch; return the number of stopped or bounded candidates."""
         self._wave.append(frame)
         self.done += len(frame.kinds)
         return frame.kinds.count(1) + frame.kinds.count(2)

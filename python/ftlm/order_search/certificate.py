@@ -45,15 +45,15 @@ def certify_orders(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
-    """Compute a lower bound of the equation error over all orders in the intervals of a grid, on it or between.
+    """Compute a lower bound of the equation error over all real orders in the intervals of an order grid.
 
-    It certifies that no orders have an error much smaller than the best one found.
+    It certifies that no orders have an error much smaller than the smallest error found.
 
-    Branch and bound halves boxes of orders. It stops when the RMS equation error has a lower bound in every box, for
-    the best coefficients at all its orders, of at least ``1 - tolerance`` times the smallest error found. The
-    certificate covers only squared equation errors, equations at rest, and free coefficients. No such certificate is
-    known for simulations; a finding reports if the simulation at the best orders is unstable or explains little of the
-    output.
+    Branch and bound halves boxes of orders. It stops when every box has a lower bound of at least ``1 - tolerance``
+    times the smallest error found. The bound is that of the RMS equation error at all orders of the box, with the best
+    coefficients. The certificate covers only squared equation errors, equations at rest, and free coefficients. No such
+    certificate is known for output errors. A finding reports if the simulation at the best orders is unstable or
+    explains little of the output.
 
     Parameters
     ----------
@@ -179,7 +179,8 @@ def _check_certifiable(job: Job) -> None:
     """Raise ModelError if no certificate can be computed for a search."""
     if job.structure.has_order_law:
         raise ModelError(
-            "there is no certificate over all orders of a stage under its law; take its equations one by one"
+            "there is no certificate over the orders of coupled equations under an order law; certify the equations "
+            "one by one"
         )
     check_linear(job.structure.equations, "a certificate")
     item = job.structure.equations[0]
@@ -200,7 +201,8 @@ def _check_tolerance(tolerance: float) -> float:
     share = real_number("tolerance", tolerance)
     if not 0 < share < 1:
         raise ModelError(
-            f"{parameter('tolerance', tolerance)} is outside (0, 1); 0.05 asks that nothing be better by more than 5 %"
+            f"{parameter('tolerance', tolerance)} is outside (0, 1); 0.05 means that no orders may be better by more "
+            "than 5 %"
         )
     return share
 

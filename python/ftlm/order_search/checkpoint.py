@@ -118,8 +118,8 @@ class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
     ``failures`` is None if unchanged.
 
-    If the block was restarted, its earlier records are void. ``order`` is the digest of the sequence in which
-    candidates are visited; 0 in older files, which have none.
+    If the block was restarted, its earlier records are invalid. ``order`` is the digest of the sequence in which
+    candidates are evaluated; 0 in files of older versions.
     """
 
     search: Natural
@@ -349,8 +349,8 @@ class Store:
             return
         if not recover:
             raise DataError(
-                f"store {self.path} is damaged: {corruption}; what follows cannot be trusted: resume with "
-                f"{parameter('recover', True)} to keep what stands before and compute the rest again"
+                f"store {self.path} is damaged: {corruption}; later records are unreliable; resume with "
+                f"{parameter('recover', True)} to keep the records before the damage and compute the rest again"
             )
         copy = self._file.recover(payloads)
         self._file = CheckpointFile(self.path, "search", "resume")

@@ -185,7 +185,7 @@ class SearchSettings:
         top = whole_number(self.top)
         if top is None or not 1 <= top <= MAX_TOP:
             raise ModelError(
-                f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; keep as many rows as you will read"
+                f"{setting('top')} {self.top!r} is outside [1, {MAX_TOP}]; choose the number of rows in the table"
             )
         length = check_integer("innovation_length", self.innovation_length, 1)
         covariance_value = self.prior_covariance

@@ -78,7 +78,7 @@ class OrderCertificate:
 
     @property
     def beatable(self) -> tuple[bool, ...]:
-        """Whether each `start` point may be beaten by other orders by more than the requested tolerance."""
+        """Whether other orders may have an error below that of each `start` point by more than the tolerance."""
         return tuple(self.lower_bound < (1 - self.requested_tolerance) * error for error in self.start_errors)
 
     @property
@@ -92,7 +92,7 @@ class OrderCertificate:
 
     @property
     def proved_tolerance(self) -> float:
-        """Fraction by which other orders may at most be better, as proved; 1 if nothing is proved."""
+        """Largest fraction by which the error of other orders can be smaller, as proved; 1 without a proof."""
         return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:
@@ -191,7 +191,7 @@ class SearchResult:
     excluded_by_box
         Number of candidates, counted as "bound", that were excluded together with a whole box of orders.
     free_runs
-        Number of candidates with nonlinear terms that were simulated, the best ones by equation error; 0 for linear
+        Number of candidates with non-linear terms that were simulated, the best ones by equation error; 0 for linear
         equations, for which the search is exhaustive.
     verdict, model_findings
         Verdict and findings of :func:`ftlm.identify` at the orders of rank 1. None and empty for a search resumed from

@@ -77,7 +77,7 @@ def record_run(rec: Record, structure: Structure) -> Run:
 
 
 def record_structure(rec: Record, structure: Structure) -> Structure:
-    """Return the structure for a run made from a record, without the delays and nonlinearities already applied."""
+    """Return the structure for a run made from a record, without the delays and non-linearities already applied."""
     return replace(
         structure, delay={}, free_delays={}, input_nonlinearities=UNSET, initial=rec.initial, offset=rec.offset
     )
@@ -145,7 +145,7 @@ Failures = list[tuple[dict[str, float], str]]
 
 @dataclass(frozen=True)
 class Job:
-    """Order search that is ready to run: validated arguments and block-pulse records."""
+    """Order search with validated arguments and block-pulse records."""
 
     runs: tuple[str, ...]
     units: Mapping[str, str]
@@ -184,9 +184,9 @@ class Job:
         structure = replace(request.structure, offset=records[0].offset if records else "none")
         signals = record_signals(structure)
         if not records or (len(structure.equations) != 1 and not structure.has_order_law):
-            raise ModelError("it is not the search of one equation, or of some under a law, on a record")
+            raise ModelError("it is neither a search of one equation nor of equations under an order law, with records")
         if any(r.signals != signals or r.inputs != records[0].inputs for r in records):
-            raise ModelError("its records do not hold the signals of its equation")
+            raise ModelError("its records lack a signal of its equation")
         if any(n not in request.values for n in structure.order_names):
             raise ModelError("an order has no values")
         return cls(
@@ -243,7 +243,10 @@ class Job:
                 squares = sum(float(((r.of(output) - r.of(output).mean()) ** 2).sum()) for r in self.records)
             spread = math.sqrt(squares / points)
             if not 0 < spread < math.inf:
-                raise ModelError(f"the deviation of {output} is {spread:g}; scale it so that its squares are numbers")
+                raise ModelError(
+                    f"the deviation of {output} is {spread:g}; scale the signal so that its squares neither overflow "
+                    "nor underflow"
+                )
             spreads.append(spread)
         return spreads
 
@@ -267,7 +270,7 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
 
     `number` is the index of the search in the checkpoint file.
 
-    Candidates with nonlinear terms are ranked by equation error first, and the best of them by simulations.
+    Candidates with non-linear terms are ranked by equation error first, and the best of them by simulations.
     """
     settings = job.settings
     if job.structure.has_nonlinear_terms and settings.criterion == "output-error":

@@ -68,7 +68,7 @@ def comparison_charts(
             y_label=with_unit(symbol(name), units, name),
             points=points,
             slider=True,
-            bands=_behind_measured(bands_by_output[name]) if name in bands_by_output else (),
+            bands=_bands_of_lines(bands_by_output[name]) if name in bands_by_output else (),
             caption=f"Simulation: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
             + (" Shade: 95 % confidence band of the simulation." if name in bands_by_output else ""),
         )
@@ -77,8 +77,8 @@ def comparison_charts(
     ]
 
 
-def _behind_measured(band: Band) -> list[Band]:
-    """Return the bands of a chart of measured and simulated output; the measured line has an empty band."""
+def _bands_of_lines(band: Band) -> list[Band]:
+    """Return a list of two bands for the measured and the simulated line of a chart; the first band is empty (NaN)."""
     none = np.full(band[0].size, np.nan)
     return [(none, none), band]
 
@@ -183,7 +183,9 @@ def compared_bars(
     outputs = list(first[1][0][1].output_error) if first[1] else []
     for name, parts in compared:
         if [kind for kind, _ in parts] != kinds or any(list(c.output_error) != outputs for _, c in parts):
-            raise DataError(f"model {name!r} has other outputs or data than {first[0]!r}; compare like with like")
+            raise DataError(
+                f"model {name!r} has other outputs or data than {first[0]!r}; give comparisons on the same runs"
+            )
     return [
         BarChart(
             [name for name, _ in compared],

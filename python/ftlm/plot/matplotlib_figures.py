@@ -255,7 +255,7 @@ def fit(
     Raises
     ------
     ModelError
-        A model without runs, inputs without runs, something that is not a result, axes that are none or too many or
+        A model without runs, inputs without runs, something that is not a result, invalid axes or too many or
         few, or no matplotlib.
     DataError
         Runs that do not fit the model.
@@ -317,7 +317,7 @@ def run(run: Run, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is not a run, axes that are none or too many or few, or no matplotlib.
+        Something that is not a run, an invalid or wrong number of axes, or no matplotlib.
     """
     charts = [[signal_chart(run, name)] for name in (*run.outputs, *run.inputs)]
     return draw_figure(charts, ax, row=ROW_HEIGHT_INCH * 0.6)
@@ -375,7 +375,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     Raises
     ------
     ModelError
-        An identification without a search, or without that one; fewer than two free orders; no matplotlib.
+        An identification without an order search of this output, fewer than two free orders, or no matplotlib.
     """
     if not isinstance(result, Identification):
         surface: Landscape | None = result
@@ -446,7 +446,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is not a model, one with friction or without poles, axes that are none, or no matplotlib.
+        Something that is not a model, a model with friction or without poles, invalid axes, or no matplotlib.
     """
     charts = pole_charts(_model_of(model))
     if not charts:
@@ -475,9 +475,9 @@ def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: An
     Raises
     ------
     ModelError
-        Something that is not a model, one whose input saturates or has a dead zone, axes that are none, no matplotlib.
+        Something that is not a model, a model with a saturation or dead zone of an input, invalid axes, no matplotlib.
     DataError
-        Instants that are not regular from 0.
+        Sample times that are not uniform from 0.
     """
     return _response_figure(_model_of(model).step(time), ax)
 
@@ -515,7 +515,8 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        Something that is not an identification, one without a joint covariance, axes that are none, or no matplotlib.
+        ``result`` is not an identification or has no joint covariance, axes are invalid, or matplotlib is not
+        installed.
     """
     if result.joint is None:
         raise ModelError(
@@ -544,7 +545,7 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
     Raises
     ------
     ModelError
-        Something that is not a result, axes that are none or too many or few, or no matplotlib.
+        Something that is not a result, an invalid or wrong number of axes, or no matplotlib.
     """
     comparison = result.comparison if isinstance(result, Identification) else result
     units = result.model.units if isinstance(result, Identification) else {}
@@ -571,7 +572,7 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     Raises
     ------
     ModelError
-        No model, something that is not a comparison, models with other outputs, axes that are none, or no matplotlib.
+        No model, something that is not a comparison, models with other outputs, invalid axes, or no matplotlib.
     """
     if not compared:
         raise ModelError("bars need at least one model; give comparisons by name, such as {'integer': a, 'free': b}")

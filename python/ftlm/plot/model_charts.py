@@ -73,7 +73,7 @@ def curve_charts(omega: Floats, curves: Sequence[BodeCurve]) -> list[LineChart]:
 
 
 def pole_points(model: Model) -> tuple[float, Complex]:
-    """Return the order q of the plane s^q, and the poles in this plane; empty for a nonlinear model."""
+    """Return the order q of the plane s^q, and the poles in this plane; empty for a non-linear model."""
     q = plane_order(model)
     model_modes = modes(model) if model.structure.is_linear else ()
     points = []

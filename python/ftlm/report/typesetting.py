@@ -120,7 +120,7 @@ def _number_math(value: float | Exact) -> Markup:
 
 
 def _short(value: float) -> Exact:
-    """Return a number of an input, rounded to six digits, in a form that is printed in full."""
+    """Return a delay or limit rounded to six significant digits, in a form that tables print in full."""
     return Exact(f"{value:.6g}")
 
 

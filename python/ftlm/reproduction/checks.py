@@ -76,16 +76,16 @@ class ClaimVerdict:
 
 
 def case(holds: bool, **factors: str) -> Case:
-    """Build a case from factors by keyword; an underscore stands for a space."""
+    """Return a case: whether the claim holds, and the level of each factor; "_" in a keyword stands for a space."""
     return holds, {name.replace("_", " "): level for name, level in factors.items()}
 
 
 def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> ClaimVerdict:
     """Return the verdict over all cases.
 
-    A claim holds if it holds in every case, and does not hold if it holds in none. Otherwise it depends on those
-    factors whose change alone changes the outcome. A claim about the machine is not decidable by simulation if it
-    depends on the arm, or if there is only one arm.
+    A claim holds if it holds in every case, and does not hold if it holds in none. Otherwise it depends on each factor
+    whose change, with all others fixed, changes the outcome. A claim about the machine is not decidable by simulation
+    if it depends on the arm, or if there is only one arm.
     """
     holding = sum(holds for holds, _ in cases)
 
@@ -273,7 +273,7 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
 
 
 def recomputed_tables(reproduction: Reproduction) -> Evidence:
-    """Return whether Tables 4 and 5 follow from what the paper says."""
+    """Return whether Tables 4 and 5 follow from the data and methods that the paper states."""
     tables = reproduction.as_printed
     settings = (f"{symbol(o)} {t.reading}, with K0 = 1 {t.ratio_at_unit_prior:.3g}" for o, t in tables.items())
     return _of_angles({o: t.is_close for o, t in tables.items()}), {
@@ -294,7 +294,7 @@ def printed_orders(reproduction: Reproduction) -> Evidence:
 
 
 def error_falls(t: Trial) -> bool:
-    """Whether the error (45) never rises with p, and is smaller at the largest p than at the first."""
+    """Whether the error, paper (45), never increases with p, and is smaller at the largest p than at the first."""
     e = [t.errors[p] for p in INNOVATION_LENGTHS]
     return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - RULE_NUMBERS["difference"] / 100) * e[0]
 
@@ -329,7 +329,7 @@ def convergence(reproduction: Reproduction) -> Evidence:
 
 
 def weak_prior(reproduction: Reproduction) -> Evidence:
-    """Return whether a larger p gives a smaller error where the data alone decide."""
+    """Return whether a larger p gives a smaller error with a weak prior."""
     weak = [t for t in reproduction.panel.trials if t.prior == WEAK_PRIOR]
     ruling = _of_trials(weak, error_falls)
     ratios = [t.errors[LAST_P] / e for t in weak if math.isfinite(e := t.errors[FIRST_P]) and e]
@@ -350,7 +350,7 @@ def weak_prior_variation(each: Mapping[int, Mapping[str, float]]) -> float:
 
 
 def beats(error: float, seeds: Iterable[float]) -> bool:
-    """Whether an error is finite and below the median over seeds; the best seed would depend on their number."""
+    """Whether an error is finite and below the median over seeds; the minimum would depend on the number of seeds."""
     return math.isfinite(error) and error < statistics.median(seeds)
 
 
@@ -379,7 +379,7 @@ def optimizers(reproduction: Reproduction) -> Evidence:
 
 
 def manual(reproduction: Reproduction) -> Evidence:
-    """Return whether p = 7 is closer to the run than the manual's model; only as far as the arms agree."""
+    """Return whether p = 7 is closer to the run than the manual's model, if the simulated arms agree."""
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
     return _of_trials(reproduction.panel.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
         "errors": _by_prior(reproduction, lambda t: (t.manual, t.nr)),
@@ -388,7 +388,7 @@ def manual(reproduction: Reproduction) -> Evidence:
 
 
 def fractional_orders(reproduction: Reproduction) -> Evidence:
-    """Return whether fractional orders earn their place; only as far as the arms agree."""
+    """Return whether fractional orders improve the fit significantly, if the simulated arms agree."""
     freed = reproduction.panel.order_comparisons
     verdicts = [(f, o, earns) for f in freed for o in f.free_nr if (earns := f.earns(o)) is not None]
     cases = [case(earns, the_arm=f.arm, the_angle=symbol(o)) for f, o, earns in verdicts]
@@ -414,7 +414,7 @@ def close_orders(reproduction: Reproduction) -> Evidence:
 
 
 def published_form(reproduction: Reproduction) -> Evidence:
-    """Return whether the published form finds the orders of an arm with links that move with their hubs."""
+    """Return whether the published form recovers the orders of an arm whose links move with their hubs."""
     cases: list[Case] = []
     away: list[str] = []
     fits: dict[str, list[float]] = {}
@@ -536,7 +536,7 @@ def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduc
 
 
 def checks(reproduction: Reproduction) -> list[Check]:
-    """Compare the claims of the paper, and its errors, with computed numbers; claims without numbers are left out."""
+    """Compare the claims of the paper, and its errors, with computed numbers; claims without numbers are omitted."""
     texts = read_texts("claims")
     return [
         make_check(check, reproduction)

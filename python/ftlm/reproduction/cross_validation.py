@@ -1,4 +1,4 @@
-"""Cross-validation of fractional against integer orders on the links of a measured arm, with its page."""
+"""Cross-validation of fractional against integer orders on the links of a measured arm, with its HTML page."""
 
 from __future__ import annotations
 
@@ -168,12 +168,12 @@ class Deflection:
         return gains
 
     def worse(self, kind: str) -> list[str]:
-        """Runs on which a fit is worse than that of integer orders, which its structure contains."""
+        """Runs on which a fit is worse than the fit of integer orders, a special case of its structure."""
         both = ((run, each, self.fits[INTEGER_KIND][run]) for run, each in self.fits[kind].items())
         return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MIN_FIT_GAIN]
 
     def intervals(self, kind: str) -> dict[str, dict[str, tuple[float, float]]]:
-        """Return 95 % intervals of the free orders, by order, then by estimation run."""
+        """Return the 95 % intervals of the free orders, by order name, then by estimation run."""
         return {
             name: {run: each.estimates[name][1:] for run, each in self.fits[kind].items()}
             for name in self.structure.order_names
@@ -226,7 +226,7 @@ class Deflection:
 
 
 def _range(low: float, high: float) -> str:
-    """Format an interval; unbounded ends are left out."""
+    """Format an interval; unbounded ends are omitted."""
     ends = [f"{v:.2f}".replace("-", "−") if math.isfinite(v) else "" for v in (low, high)]
     if all(ends):
         return " to ".join(ends)
@@ -274,7 +274,7 @@ class OrderCrossValidation:
 
 
 def dead_channel_notes(runs: Sequence[Run], stages: Sequence[StageNumber]) -> list[str]:
-    """Return notes on angles that stay constant for a part of a run, which every fit takes as measured."""
+    """Return notes on angles that stay constant for a part of a run, which every fit uses as measured."""
     notes = []
     for stage in stages:
         structure = link_structure(stage, both=len(stages) == 2, filtered=False)
@@ -293,11 +293,12 @@ def cross_validate_orders(
 ) -> OrderCrossValidation:
     """Fit every deflection of the arm to each run with integer and fractional orders, and validate it on all others.
 
-    A link is (15) with the terms that a real arm needs: the measured hub motion, the accelerations of the other stage
-    and the rate of its deflection if both stages were measured, hub angles in the gauge, and an offset of the gauge per
-    run. All structures have the same terms and differ in the orders of the link's elasticity (integer 0) and damping
-    (integer 1). If both stages were measured, everything is repeated without the rate of the other deflection
-    (``Deflection.without_rate``): an order that improves the prediction only there compensates for the missing term.
+    A link has equation (15) with the terms that a real arm needs: the measured hub motion, the accelerations of the
+    other stage and the rate of its deflection if both stages were measured, hub angles in the gauge, and an offset of
+    the gauge per run. All structures have the same terms and differ in the orders of the link's elasticity (integer 0)
+    and damping (integer 1). If both stages were measured, everything is repeated without the rate of the other
+    deflection (``Deflection.without_rate``): an order that improves the prediction only there compensates for the
+    missing term.
 
     Parameters
     ----------
@@ -327,7 +328,7 @@ def cross_validate_orders(
     if len(runs) < 2:
         raise DataError(f"cross-validation needs at least two runs, and there is {len(runs)}; give two or more")
     if len({run.name for run in runs}) < len(runs):
-        raise DataError(f"runs {join_names(r.name for r in runs)} do not all have names of their own; rename a file")
+        raise DataError(f"runs {join_names(r.name for r in runs)} do not have distinct names; rename a file")
     stages = stages_in(runs)
     both = len(stages) == 2
     structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
@@ -360,7 +361,7 @@ def cross_validate_orders(
                     fits[kind][run.name] = RunFit(result, {other.name: result.model.compare(other) for other in own})
                 except FtlmError as error:
                     if kind == INTEGER_KIND:
-                        raise ModelError(f"{output}, whole orders, fitted to {run.name}: {error}") from error
+                        raise ModelError(f"{output}, integer orders, fitted to {run.name}: {error}") from error
                     failed[kind, run.name] = str(error)
         return Deflection(output, structure, fits, failed)
 
@@ -400,7 +401,7 @@ def verdict_sentence(output: str, verdict: Verdict) -> str:
 
 
 def _structures(result: OrderCrossValidation) -> list[tuple[str, Deflection]]:
-    """Return every structure with its heading; those without the rate follow those with it."""
+    """Return (heading, deflection) of every structure, with and then without the rate of the other deflection."""
     both = [(o, suffix, d) for o, full in result.deflections.items() for suffix, d in _with_and_without(full)]
     return [(f"{symbol(o)}{suffix}", d) for o, suffix, d in both]
 

@@ -1,4 +1,4 @@
-"""Demonstration: identification of a simulated arm from end to end, a short reproduction on a coarse order grid."""
+"""Demonstration: simulation and identification of an arm, a short reproduction on a coarse order grid."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
 
 
 def _stage_section(demo: Demo, stage: int) -> Section:
-    """Section of a stage; findings of the model to be used come first."""
+    """Section of a joint; findings on the recommended model come first."""
     results = demo.results[stage]
     best = results["output error"]
     compared = {

@@ -1,6 +1,6 @@
-"""Values printed in the paper's Tables 3 to 7, for comparison only, the tables recomputed, and the models simulated.
+"""Values printed in the paper's Tables 3 to 7, with recomputed tables and simulations of the printed models.
 
-Wang, Li, Li, Liang, Gao, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072. Digits are the paper's.
+Wang, Li, Li, Liang, Gao, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072. All printed digits are included.
 """
 
 from __future__ import annotations
@@ -230,7 +230,7 @@ class Row:
 
 @dataclass(frozen=True)
 class AsPrinted:
-    """Columns of one angle in Tables 4 and 5, by the interpretation closest to the printed values.
+    """Columns of one angle in Tables 4 and 5, recomputed by the interpretation closest to the printed values.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ class AsPrinted:
 
     @property
     def is_close(self) -> bool:
-        """Whether all coefficients have the printed sign and are, as NR is, within 25 % of the printed values."""
+        """Whether coefficients have the printed sign, and coefficients and NR are within 25 % of the printed values."""
         return all(
             1.0 / MAX_COEFFICIENT_RATIO <= q <= MAX_COEFFICIENT_RATIO for column in self.ratios.values() for q in column
         )
@@ -310,7 +310,7 @@ class _Angle:
         self._transforms: dict[tuple[str, float], tuple[Floats, Floats]] = {}
 
     def integral(self, signal: str, order: float) -> tuple[Floats, Floats]:
-        """Fractional integral I^order of a signal, in time and in Haar coordinates."""
+        """Return the fractional integral I^order of a signal, in time and in Haar coordinates."""
         key = signal, round(order, 6)
         if key not in self._transforms:
             kernel = block_pulse_kernel(order, self.m, step=self.step)
@@ -319,12 +319,12 @@ class _Angle:
         return self._transforms[key]
 
     def places(self, terms: str) -> list[str]:
-        """Signal in each of the terms a, b, d, g."""
+        """Return the signal of each of the terms a, b, d, g."""
         _, hub, deflection = TERM_INTERPRETATIONS[terms]
         return (hub if self.output.endswith("1") else deflection).split()
 
     def regressors(self, terms: str, orders: Mapping[str, float]) -> tuple[Floats, Floats]:
-        """Columns a, b, d, g of (42)."""
+        """Return the regressor columns a, b, d, g of equation (42), in time and in Haar coordinates."""
         names = ("gamma", "beta", "mu") if terms == "a and b exchanged" else ("beta", "gamma", "mu")
         etas = [*(orders["alpha"] - orders[n] for n in names), orders["alpha"]]
         parts = [self.integral(s, eta) for s, eta in zip(self.places(terms), etas, strict=True)]
@@ -424,7 +424,7 @@ def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) ->
 def _rank_orders(
     angle: _Angle, reading: Interpretation, orders: Mapping[str, float]
 ) -> tuple[int, int, dict[str, float]]:
-    """Rank of the printed orders among all neighboring ones at the largest p, their number, and the best orders."""
+    """Rank of the printed orders among the neighboring orders at the largest p, number of these, and best orders."""
     count = round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1
     values = [round(MIN_GRID_ORDER + k * GRID_INCREMENT, 9) for k in range(count)]
     varied = ("beta", "gamma", "mu")
@@ -492,7 +492,7 @@ class PrintedModelRun:
 
 
 def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Orders and coefficients of a stage's two printed equations, by the names of (22)-(25)."""
+    """Return orders and coefficients of the two printed equations of a joint, by the names in (22)-(25)."""
     rows = {o: FRACTIONAL_ROWS[o][p] for o in ANGLE_NAMES if stage_of(o) == stage}
     orders = {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.orders.items()}
     return orders, {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.coefficients.items()}
@@ -507,7 +507,7 @@ def printed_model(stage: StageNumber, p: int) -> Model:
 
 
 def one_angle(output: str, p: int) -> Model:
-    """Model of the printed row by (26): every term but the current's contains the angle itself."""
+    """Return the model of a printed row by (26), in which all terms except the current's contain the angle itself."""
     row = FRACTIONAL_ROWS[output][p]
     terms = [Term(output, Order(float(row.orders[o])), float(row.coefficients[c])) for c, o in ORDER_OF.items()]
     terms.append(Term(f"I{stage_of(output)}", Order(), float(row.coefficients["g"])))
@@ -550,7 +550,7 @@ def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[P
 def _reidentify(
     run: Run, single: Structure, orders: dict[str, float], p: int, threads: int | None
 ) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
-    """Coefficients at the model's own orders, and for the largest p the best orders around them, by K0."""
+    """Return coefficients at the orders of the model, and for the largest p the best neighboring orders, by K0."""
     own = {n: [orders[n]] for n in single.order_names}
     near = {n: neighboring_values(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}
     wide = {n: v if n.startswith("alpha") else [w for w in near[n] if w < 2.0] for n, v in own.items()}

@@ -1,6 +1,6 @@
-"""HTML page and terminal summary of the reproduction: tables with computed values beside the printed ones, sections.
+"""HTML page and terminal summary of the reproduction: sections, and tables of computed and printed values.
 
-Their texts are in page.toml.
+The texts are in page.toml.
 """
 
 from __future__ import annotations
@@ -105,7 +105,10 @@ def reference_label(*, simulated: bool) -> str:
 def fit_chart(
     models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
 ) -> LineChart:
-    """Chart of an angle and its simulations by some models, without far excursions."""
+    """Return a chart of an angle and its simulations by some models.
+
+    Simulations are cut far outside the range of the angle.
+    """
     first = models[0][1]
     reference, time = first.measured[output][0], pulse_times(first)
     middle = float(np.mean(reference))
@@ -125,7 +128,10 @@ def fit_chart(
 
 
 def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
-    """Charts of the printed hub models under the paper's current, beside an angle of the implied standard deviation."""
+    """Return charts of the printed hub models under the paper's current.
+
+    Each chart also has an angle of the implied standard deviation.
+    """
     charts: list[Figure] = []
     for output in dict.fromkeys(r.output for r in reproduction.ran if r.output.endswith("1")):
         rows = [r for r in reproduction.ran if r.output == output]
@@ -178,7 +184,7 @@ def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> L
 def _fits_chart(
     models: Mapping[str, Candidate], output: str, place: str, *, sine: bool, simulated: bool
 ) -> list[Figure]:
-    """Charts of the models' fits on one input; empty without that run."""
+    """Return charts of the fits of the models on one run; empty without the run."""
     compared = {label: c.validation if sine else c.estimation for label, c in models.items()}
     present = [(label, c) for label, c in compared.items() if c is not None]
     if not present:
@@ -192,7 +198,7 @@ def _fits_chart(
 
 
 def _beside_integer(stage: Stage) -> dict[str, Candidate]:
-    """Models of Figures 6, 9 and 10; Euler's method needs a start at rest."""
+    """Return the models of Figures 6, 9 and 10; Euler's method is included if the run starts at rest."""
     manual = "integer, Euler" if stage.traces else "integer, exact"
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
     labels = {"integer, manual": manual, last: last, "output error": "output error"}
@@ -200,7 +206,7 @@ def _beside_integer(stage: Stage) -> dict[str, Candidate]:
 
 
 def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
-    """Figures 4-6 or 7-9."""
+    """Return the charts of Figures 4 to 6, or 7 to 9, of the paper."""
     first = 4 if stage.number == 1 else 7
     errors = [(f"p = {p}", stage.candidates[f"p = {p}"].estimation) for p in printed.INNOVATION_LENGTHS]
     figures: list[Figure] = []
@@ -221,7 +227,7 @@ def _place(figure: int, output: str) -> str:
 
 
 def sine_figures(reproduction: Reproduction) -> list[Figure]:
-    """Figure 10."""
+    """Return the charts of Figure 10 of the paper."""
     return [
         figure
         for stage, output in reproduction.angles
@@ -232,7 +238,7 @@ def sine_figures(reproduction: Reproduction) -> list[Figure]:
 
 
 def rival_figures(reproduction: Reproduction) -> list[Figure]:
-    """Figure 11, on the validation run, or on the estimation run without one."""
+    """Return the charts of Figure 11 of the paper, on the validation run or else on the estimation run."""
     names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
     figures = []
     for output, rival in reproduction.rivals.items():
@@ -245,7 +251,7 @@ def rival_figures(reproduction: Reproduction) -> list[Figure]:
 
 
 def flow_chart() -> Figure:
-    """Figure 2: from the physics to the model, a drawing for wide and one for narrow screens."""
+    """Return Figure 2 of the paper, from the physics to the model, as drawings for wide and for narrow screens."""
     files = (Path(__file__).with_name(f"flow_chart_{screen}.svg") for screen in ("wide", "narrow"))
     drawings = (Markup(file.read_text(encoding="utf-8")) for file in files)  # our own files
     return StaticFigure("Figure 2. From the physics to the identified model", *drawings)
@@ -315,13 +321,13 @@ def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, f
 
 
 def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
-    """Cells under `NUMBER_HEADS`: orders to the four decimals of the paper's Table 6, coefficients as estimates."""
+    """Return table cells under `NUMBER_HEADS`: orders with four decimals, as in Table 6, and coefficients."""
     cells = [Exact(round(orders[n], 4) + 0.0) if n in orders else None for n in ORDER_LETTERS]
     return [*cells, *map(coefficients.get, COEFFICIENT_LETTERS)]
 
 
 def criteria_cells(figures: Metrics | None) -> list[Cell]:
-    """Cells under `CRITERION_HEADS`."""
+    """Return the table cells of the criteria, under `CRITERION_HEADS`."""
     return [None] * 3 if figures is None else [figures.error, figures.rmse, figures.nr]
 
 
@@ -337,7 +343,10 @@ def printed_cells(words: str, row: printed.PublishedRow, *, criteria: bool = Tru
 
 
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
-    """Orders, and coefficients at least as large as their standard errors, of one equation."""
+    """Return cells of the orders of one equation, and of its significant coefficients.
+
+    A coefficient is significant if it is at least as large as its standard error.
+    """
     orders, coefficients = letters_of(candidate.model, output)
     errors = {} if candidate.result is None else candidate.result.standard_errors
     identifiable = {n: v for n, v in coefficients.items() if not errors.get(parameter_name(n, output), 0.0) > abs(v)}
@@ -345,7 +354,7 @@ def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
 
 
 def model_table(stage: Stage) -> Table:
-    """Table 4 or 5, with computed and printed rows."""
+    """Return Table 4 or 5 of the paper, with computed and printed rows."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
         beside = {"integer, Euler": printed.INTEGER_ROWS[output]}
@@ -359,7 +368,7 @@ def model_table(stage: Stage) -> Table:
 
 
 def fits_table(stage: Stage) -> Table:
-    """Table of both errors of every model, and its fits on both runs by the method's inputs and by the current."""
+    """Return a table of both errors of every model, and of its fits on both runs."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
         for label, c in stage.candidates.items():
@@ -372,7 +381,7 @@ def fits_table(stage: Stage) -> Table:
 
 
 def description_tables() -> list[Table]:
-    """Tables 1 and 2: symbols, and every step with its function."""
+    """Return Tables 1 and 2: symbols, and every step of the method with its function."""
     steps = [
         [
             f"{k}. {each['step']}",
@@ -398,7 +407,7 @@ def parameter_tables() -> list[Table]:
 
 
 def saturation_table(reproduction: Reproduction) -> Table:
-    """Coefficient a by innovation length p, with the paper's prior and with a weak one."""
+    """Return a table of coefficient a by innovation length p, with the paper's prior and with a weak prior."""
 
     def rows(stage: Stage, output: str) -> Iterator[list[Cell]]:
         name = parameter_name("a", output)
@@ -415,7 +424,7 @@ def saturation_table(reproduction: Reproduction) -> Table:
 
 
 def optimizer_tables(reproduction: Reproduction) -> list[Table]:
-    """Tables 6 and 7 at equal budgets, and the error (45) of each optimizer and seed."""
+    """Return Tables 6 and 7 at equal budgets of evaluations, and the error (45) of each optimizer and seed."""
     rivals = reproduction.rivals
     seeds = list(dict.fromkeys(seed for rival in rivals.values() for seed in rival.optimizers["genetic"].errors))
     best: list[list[Cell]] = []
@@ -450,7 +459,7 @@ def optimizer_tables(reproduction: Reproduction) -> list[Table]:
 
 
 def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
-    """Table 4 or 5 as the paper computed it: recomputed, printed, and their ratio."""
+    """Return Table 4 or 5 with the paper's method: recomputed values, printed values, and their ratio."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
         for p, row in reproduction.as_printed[output].rows.items():
@@ -490,7 +499,7 @@ def printed_runs_table(reproduction: Reproduction) -> Table:
 
 
 def case_tables(reproduction: Reproduction) -> list[Table]:
-    """Tables of error and steps by p, arm, K0 and angle, first record of each arm, and of integer and free orders."""
+    """Return tables of error and steps by p, arm, K0 and angle, and of integer and free orders."""
     rows: dict[tuple[str, str, float], list[Cell]] = {}
     for t in reproduction.panel.trials:
         steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
@@ -555,7 +564,7 @@ def _stage_section(reproduction: Reproduction, stage: Stage) -> Section:
 
 
 def _sections(reproduction: Reproduction) -> list[Section]:
-    """All sections in their order; those without content are left out."""
+    """Return all sections in their order; sections without content are omitted."""
     simulated, stages = reproduction.simulated, list(reproduction.stages.values())
     near = [
         fit_chart(
@@ -639,7 +648,7 @@ def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], 
 
 
 def table_text(table: Table, label: int, widths: Sequence[int]) -> list[str]:
-    """Lines of a table with columns of these widths, the first of `label`; numbers lose digits in narrow ones."""
+    """Return a table as text lines, with given column widths and the first column of width `label`."""
     plain, all_widths, at, head = [Markup(head).striptags() for head in table.columns], (label, *widths), 0, ""
     for words, count in table.groups:
         width = sum(all_widths[at : at + count])
@@ -670,7 +679,7 @@ def _fit_to_width(value: Cell, width: int) -> str:
 
 
 def fits_text(models: Mapping[str, Candidate]) -> list[str]:
-    """Table of the fits of the free runs in percent as text, one line per model."""
+    """Return a table of the fits of the simulations in percent as text, one line per model."""
     outputs = next(iter(models.values())).estimation.output_error
     heads = ["", *(f"{o} {run}" for o in outputs for run in ("square", "sine"))]
     rows = [[n, *("–" if math.isnan(v) else f"{v:.2f}" for v in c.fits)] for n, c in models.items()]

@@ -1,4 +1,4 @@
-"""Reproduction of the paper's section 5: tables and figures beside the printed ones, verdicts."""
+"""Reproduction of the paper's section 5: computed and printed tables and figures, and verdicts."""
 
 from __future__ import annotations
 
@@ -192,11 +192,12 @@ def reproduce(
     noise, seed
         Noise of the virtual rig's angles, see :func:`ftlm.reproduction.demo_run`.
     genetic
-        Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
-        as 20 000 evaluations an angle allow, each with as many evaluations as the compared order grid has candidates.
-        Its order grid and its norm are those of the comparison and must not be given.
+        Seeds and evaluations of the genetic algorithm and of differential evolution. By default there are ten seeds, or
+        as many as 20 000 evaluations per angle allow. Each seed has as many evaluations as the compared order grid has
+        candidates. Order grid and norm are those of the comparison and must not be given.
     rivals_increment
-        Smallest increment of that grid, on every arm; the paper's 0.05 takes sixteen times as long.
+        Smallest increment of the order grid on which multi-innovation, the genetic algorithm and differential
+        evolution are compared. The paper's 0.05 takes sixteen times as long as the default.
     arms
         Simulated arms for verdicts besides the first: keys of `ARM_VARIANTS`, by default all. For a measured run there
         are none.
@@ -311,7 +312,7 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
 def run_jobs(
     jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
 ) -> list[StageOutcome]:
-    """Run all jobs in parallel and return their results; single-core fits overlap with parallel searches."""
+    """Run all jobs in parallel and return their results."""
     stop, whole = threading.Event(), TotalProgress(seconds, progress)
 
     def done_by(job: Job) -> StageOutcome:

@@ -63,12 +63,12 @@ PAPERS_ARM = _integer_order_arm(friction=True, coupling=0.0)
 
 
 def letter_of(name: str) -> str:
-    """Strip the index of a name: alpha1 becomes alpha."""
+    """Return a name without its index: alpha1 becomes alpha."""
     return name.rstrip("0123456789")
 
 
 def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
-    """Model of one stage of the demonstration's arm: effective coefficients, fractional orders, order law.
+    """Return the model of one joint of the demonstration's arm, with fractional orders and an order law.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def demo_run(
     seed: int = DEFAULT_SEED,
     parameters: ArmParameters = DEMO_PARAMETERS,
 ) -> Run:
-    """Run of the virtual rig under the paper's inputs: linear arm with encoders, and noise on every angle.
+    """Return a run of a simulated linear arm under the paper's inputs, with encoders and noise on every angle.
 
     The links move with their hubs, (14)-(15), as in a real arm, unlike the paper's equations (22)-(25).
 

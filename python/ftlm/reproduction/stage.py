@@ -1,4 +1,4 @@
-"""Results of one stage: models by every method of section 5, optimizer comparisons, cases behind the verdicts."""
+"""Results of one joint: models by every method of section 5, optimizer comparisons, and the cases for verdicts."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ INTEGER_FIT_SAMPLES = 1250
 
 
 def published_structure(stage: StageNumber, **changes: Any) -> Structure:
-    """Return the paper's (22)-(25) of a stage, every equation by itself, with zero initial conditions."""
+    """Return the paper's equations (22)-(25) of a joint, uncoupled and with zero initial conditions."""
     structure = flexible_link(
         stage=stage, form="published", coupling="measured", laws=(), parameters="effective", offset="none"
     )
@@ -90,13 +90,13 @@ def integer_orders(structure: Structure) -> Structure:
 
 
 def are_usable(*candidates: Candidate) -> bool:
-    """Whether all fits may be used; a comparison with another one says nothing."""
+    """Whether all fits may be used; otherwise comparisons with them are meaningless."""
     return not any(c.result is not None and is_degenerate(c.result) for c in candidates)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Model of a stage with its errors on both runs.
+    """Model of a joint with its errors on both runs.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class Candidate:
 
     @property
     def fits(self) -> list[float]:
-        """Fit of the free run in percent, for each output on both runs; NaN without a run."""
+        """Fit of the simulation in percent, for each output on both runs; NaN without a run."""
         runs = self.estimation, self.validation
         return [math.nan if c is None else c.output_error[o].fit for o in self.estimation.output_error for c in runs]
 
@@ -186,7 +186,7 @@ class DroppedDerivative:
 
 @dataclass(frozen=True)
 class Stage:
-    """Results of one stage.
+    """Results of one joint (stage) of the arm.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ class Stage:
 
     @property
     def outputs(self) -> tuple[str, str]:
-        """Hub angle and deflection."""
+        """Names of the hub angle and the deflection."""
         return f"theta{self.number}1", f"theta{self.number}2"
 
     @property
@@ -252,7 +252,7 @@ def compare_optimizers(
 ) -> Rival:
     """Compare multi-innovation with a genetic algorithm and differential evolution at equal budgets per seed.
 
-    The result has no models yet.
+    The result does not contain the models.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def compare_optimizers(
 
 @dataclass(frozen=True)
 class Trial:
-    """Multi-innovation with all p on one angle of one record, with one K0.
+    """Multi-innovation estimates with all p for one angle of one record and one K0.
 
     Parameters
     ----------
@@ -385,7 +385,7 @@ class OrderComparison:
         return cls(arm, stage, nr, free_nr, orders, gains, not are_usable(integer, free))
 
     def earns(self, output: str) -> bool | None:
-        """Whether free orders earn their place on an angle by the rule of ``ftlm orders``; None if it is not known."""
+        """Whether free orders improve the fit of an angle significantly, as in ``ftlm orders``; None if unknown."""
         if self.is_degenerate or output not in self.gains:
             return None
         intervals = {n: {self.arm: (low, high)} for n, (_, low, high) in self.orders.items()}
@@ -409,7 +409,7 @@ class OrderComparison:
 
 @dataclass(frozen=True)
 class Panel:
-    """All cases behind the verdicts."""
+    """All cases on which the verdicts are based."""
 
     trials: tuple[Trial, ...] = ()
     contests: tuple[Contest, ...] = ()
@@ -422,7 +422,7 @@ class Panel:
 
 
 def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
-    """First step from which an error stays within a share of a final error; infinite if never."""
+    """Return the first step from which an error stays close to a final error; infinite if it never does."""
     with np.errstate(invalid="ignore"):
         away = np.flatnonzero(~(trace.error <= (1.0 + CONVERGENCE_MARGIN) * end))
     if not away.size:
@@ -462,7 +462,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
 def traces_of(
     run: Run, single: Structure, models: Mapping[int, Model], prior: float, every: int
 ) -> dict[int, MultiInnovationTrace]:
-    """Convergence of one equation with every p, at the orders of the model of that p."""
+    """Return the convergence of the recursion for one equation with every p, at the orders of the model of that p."""
     traces = {}
     for p, model in models.items():
         structure = single.with_orders({n: model.orders[n] for n in single.order_names})
@@ -480,9 +480,9 @@ def compare_orders(
     *,
     validation: Run,
 ) -> OrderComparison:
-    """Fit integer and free orders of one stage of a simulated arm, which starts at rest, on a decimated run.
+    """Fit integer orders and free orders of one joint of a simulated arm to a decimated run that starts at rest.
 
-    Both are compared on a validation run.
+    Both fits are compared on a validation run.
 
     Raises
     ------
@@ -506,7 +506,7 @@ def compare_orders(
 
 
 def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
-    """Return the cases of one run and its stage results; trials only for runs that start at rest."""
+    """Return the cases of one run and the results of its joint; trials only for runs that start at rest."""
     freed = OrderComparison.of(
         arm, stage.number, stage.candidates["integer, identified"], stage.candidates["output error"]
     )
@@ -541,7 +541,7 @@ def simulated_panel(
 ) -> Panel:
     """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
 
-    The main arm has trials alone: its first record is the estimation run, whose cases :func:`panel_of` returns.
+    For the main arm only trials are computed, because :func:`panel_of` returns the other cases of its first record.
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
@@ -606,7 +606,7 @@ class StageWork:
             )
 
     def begin(self, words: str, step: str) -> None:
-        """Announce the next step and its share of the whole."""
+        """Report the start of the next step and its processor time."""
         self.log(f"stage {self.number}: {words}")
         if isinstance(self.progress, WorkerProgress):
             self.progress.begin(self.preset.seconds_of(step))
@@ -695,7 +695,7 @@ class StageWork:
         return candidates
 
     def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
-        """Return the best orders of each equation by itself, without the statistics of an identification."""
+        """Return the model with the best orders of each equation, without the statistics of an identification."""
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = {}
         for output in self.measured.outputs:
@@ -718,8 +718,8 @@ class StageWork:
     def _best_orders(self, single: Structure, own: OrderGrid, options: Mapping[str, Any]) -> SearchResult:
         """Return the best candidate of an order grid.
 
-        With K0 = 1 a deflection hardly moves. The errors of all candidates are close to those of a zero output, so no
-        bound excludes any, and each would have to be simulated completely.
+        With K0 = 1 the simulated deflection is nearly zero. The errors of all candidates are then close to that of a
+        zero output. No bound excludes a candidate, and each would have to be simulated completely.
         """
         work: dict[str, Any] = {"threads": self.threads, "progress": self.progress, **options}
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
@@ -736,7 +736,7 @@ class StageWork:
         return min(ends, key=lambda end: end.score)
 
     def instrumental(self, start: Candidate) -> Candidate:
-        """Search by instrumental variables on the part of the grid around the orders of another model."""
+        """Return the best model of a search by instrumental variables around the orders of another model."""
         self.begin("orders by instrumental variables", "instrumental")
         grid = self.preset.order_grid
         axes = {}
@@ -749,7 +749,7 @@ class StageWork:
     def joint(
         self, label: str, structure: Structure, words: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
-        """Fit by joint output error, to the whole run or to a decimated one."""
+        """Return a model fitted by joint output error, to the whole run or to a decimated run."""
         self.begin(words, step)
         run = self.on
         if step == "whole orders" and run.length >= 2 * INTEGER_FIT_SAMPLES:
@@ -776,7 +776,10 @@ class StageWork:
     def best(
         self, label: str, structure: Structure, what: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
-        """Fit by joint output error from the current alone, or with the measured other angle if that fails."""
+        """Return a model fitted by joint output error from the current alone.
+
+        If that fails, it is fitted with the measured other angle.
+        """
         words = f"{what}, by output error"
         try:
             return self.joint(label, structure, words, step, near)
@@ -787,7 +790,7 @@ class StageWork:
     def traces(
         self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]
     ) -> dict[str, dict[int, MultiInnovationTrace]]:
-        """Convergence of every equation with every p, at the orders of the model of that p."""
+        """Return the convergence of the recursion for every equation and p, at the orders of the model of that p."""
         parts = {o: self.measured.equation(o) for o in self.measured.outputs}
         return {o: traces_of(self.on, each, models, prior, self.preset.trace_every) for o, each in parts.items()}
 

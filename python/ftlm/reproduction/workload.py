@@ -1,4 +1,4 @@
-"""Work of the reproduction: processor time of its steps, and progress of its workers."""
+"""Processor time expected for the steps of the reproduction, and progress of its workers."""
 
 from __future__ import annotations
 
@@ -101,13 +101,13 @@ class WorkerProgress(Stoppable):
         self._whole, self._before, self._step, self._within = whole, 0.0, 0.0, 0.0
 
     def begin(self, seconds: float) -> None:
-        """Finish the previous step, and start one with this processor time."""
+        """Finish the previous step, and start a step with the given processor time [s]."""
         super().__call__(0, 0)
         self._before, self._step, self._within = self._before + self._step, seconds, 0.0
         self._whole.report(self, self._before)
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
-        """Report progress within the step; a restarted count continues at half of the remainder."""
+        """Report progress within the step; if the count restarts, it covers half of the remainder."""
         super().__call__(count, total, pruned)
         share = count / max(total, 1)
         if share < self._within:

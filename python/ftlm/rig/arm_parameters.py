@@ -209,9 +209,8 @@ class ArmParameters:
         # Determinant of the inertia matrix, relative to that of uncoupled joints.
         if not 1.0 + hub * base + arm * carried > 0.0:
             raise ModelError(
-                f"inertia_ratio = {self.inertia_ratio:g} and reach = {self.reach:g} give stage 2 more inertia than "
-                "link 1 carries, and the arm a kinetic energy that is not positive: its leading matrix is singular or "
-                "worse; make them smaller"
+                f"inertia_ratio = {self.inertia_ratio:g} and reach = {self.reach:g} give joint 2 more inertia than "
+                "link 1 carries, so that the kinetic energy of the arm is not positive definite; make them smaller"
             )
         return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
 

@@ -243,7 +243,7 @@ class ControllerSource:
 
 
 def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]:
-    """Return the currents in a controller output, shape (1, 2), and an error text ("" if they are valid)."""
+    """Return the currents [A] of a controller output, shape (1, 2), and an error text ("" if they are valid)."""
     nothing = np.zeros((1, 2))
     if answer is None:
         return nothing, "returned nothing; return both currents [A], such as (0.1, 0.0)"

@@ -1,7 +1,7 @@
 """Q8-USB board, accessed through the vendor's Python package; its blocking read sets the sampling times.
 
-No board was available during development. The module is tested with a substitute that has the names, types, error codes
-and rules of the package. See docs/rig.md before the first run on hardware.
+No board was available during development. The module is tested with a substitute for the package with the same names,
+types, error codes and rules. See docs/rig.md before the first run on hardware.
 """
 
 from __future__ import annotations
@@ -330,7 +330,7 @@ class QuanserBoard:
         with self._translate_errors("reading", guard=guard) as hil:
             count = hil.task_read(self._task, 1, self._analog, self._counts, self._digital, None)
             if count < 1:
-                guard.fail("Q8-USB: the board's task stopped and handed over no sample: samples were lost")
+                guard.fail("Q8-USB: the sampling task of the board stopped without a sample: samples were lost")
                 self._write((0.0, 0.0))
                 return None
         since = self.clock() - self._samples / self._rate

@@ -329,7 +329,7 @@ class CommandSource(Protocol):
         """Return the commands [A] that follow the measured rows; empty at the end of the run."""
 
     def explain_fault(self, fault: str) -> str:
-        """Return a fault message, extended by what this source contributed to the fault."""
+        """Return a fault message, extended by the contribution of this source to the fault."""
 
 
 @dataclass(frozen=True)
@@ -408,8 +408,8 @@ class Experiment:
         paced = setup.real_time or board.hardware or bool(getattr(board, "real_time", False))
         if board.hardware and not setup.arm:
             raise ModelError(
-                f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
-                f"with {parameter('arm', True)}"
+                f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and "
+                f"confirm with {parameter('arm', True)}"
             )
         check_thread(board)
         if not is_run_name(self.name):
@@ -558,7 +558,7 @@ class _Recorder:
     def collect(self, rig: Rig) -> Floats:
         """Store and return the rows recorded since the last call.
 
-        Signals are deferred meanwhile, so that no row is lost.
+        Signals are deferred during the call, so that no row is lost.
         """
         self.taken.append(rig.take())
         return self.taken[-1]
@@ -611,8 +611,8 @@ def _check_target(target: Path, *, force: bool) -> None:
     # Rows would be written to the target of a dangling link.
     if os.path.lexists(partial) and not force:
         raise DataError(
-            f"{str(partial)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
-            f"overwrite it with {parameter('force', True)}"
+            f"{str(partial)!r} contains the recording of a program that was interrupted; load it, rename or remove "
+            f"it, or overwrite it with {parameter('force', True)}"
         )
 
 
@@ -646,7 +646,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
 
 
 def _column_of(name: str) -> int:
-    """Return the index of the column in a row of the rig that has a signal of the live structure."""
+    """Return the index of the column of the rig that contains a signal of the live structure."""
     if name not in RIG_COLUMNS:
         raise ModelError(
             f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(RIG_COLUMNS)}"

@@ -57,7 +57,7 @@ class InterruptWatch:
     """Thread that stops the motors on a termination signal if their run is not in the main thread.
 
     Python calls signal handlers only in the main thread, which may be waiting for the run. :mod:`faulthandler` instead
-    writes within the signal itself, here to a pipe that the thread reads, and then passes the signal to Python.
+    writes to a pipe within the signal itself, and then passes the signal to Python. The thread reads the pipe.
     """
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class InterruptWatch:
             self._boards.remove(board)
 
     def reset(self) -> None:
-        """Clear the state in a forked child process, which has neither the thread nor the motors."""
+        """Clear the state in a forked child process, which has neither the thread nor access to the motors."""
         self._lock = threading.Lock()
         self._boards = []
         self._stop()
@@ -152,11 +152,11 @@ if hasattr(os, "register_at_fork"):
 
 
 def check_thread(board: Board) -> None:
-    """Raise ModelError if hardware would run in a thread in which Ctrl-C cannot stop its motors."""
+    """Raise ModelError if hardware would run in a thread in which Ctrl-C cannot stop the motors."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     if board.hardware and not in_main_thread and not INTERRUPT_WATCH.available:
         raise ModelError(
-            f"the {board.name} is to run in the thread {threading.current_thread().name!r}, where Ctrl-C cannot stop "
+            f"the {board.name} would run in the thread {threading.current_thread().name!r}, where Ctrl-C cannot stop "
             "its motors on this system; run it in the main thread"
         )
 
@@ -539,8 +539,8 @@ class Rig:
         watchdog = real_number("watchdog", watchdog)
         if not low <= watchdog <= high:
             raise ModelError(
-                f"{setting('watchdog')} {watchdog!r} s is outside [{low:g}, {high:g}] s; 0 would leave the motors "
-                "running when the program dies"
+                f"{setting('watchdog')} {watchdog!r} s is outside [{low:g}, {high:g}] s; with 0 the motors would keep "
+                "running if the program crashes"
             )
         if not 0 < limit <= MAX_RUN_DURATION_S:
             raise ModelError(
@@ -619,7 +619,7 @@ class Rig:
         if commands.ndim != 2 or commands.shape[1] != 2:
             raise DataError(f"commands has shape {commands.shape}; give two currents [A] a row, shape (n, 2)")
         if self._samples + len(commands) > self.limit * self.rate + 1.5:
-            self.fail(f"the time limit of {self.limit:g} s is over; ask for a longer one")
+            self.fail(f"the time limit of {self.limit:g} s is reached; give a longer limit")
         self._samples += len(commands)
         try:
             with self._gate.lock:

@@ -1,4 +1,4 @@
-"""Virtual board: the simulated arm behind the access and watchdog rules of the real board."""
+"""Virtual board: the simulated arm with the access and watchdog rules of the real board."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ class VirtualBoard:
                 self._page.set("enabled", 0)
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Write output voltages [V]; 0 V can always be written, after a fault without a heartbeat."""
+        """Write output voltages [V]; 0 V can always be written, also after a fault."""
         with self.gate.lock:
             page, closed = self._page, self.gate.reason is not None
             if volts == (0.0, 0.0) and page is not None and (closed or page.has_expired or self._has_lost_watchdog()):
@@ -242,8 +242,8 @@ class VirtualBoard:
             self.gate.check()
             if self._has_lost_watchdog():
                 raise RigFault(
-                    "virtual rig: the watchdog's process has died, and nothing would stop the motors should the "
-                    "program die too; see what ended it, and start again"
+                    "virtual rig: the watchdog's process has died, so the motors would not be stopped if the program "
+                    "also crashed; find the cause, and start again"
                 )
             self._beat += 1
             page.write_heartbeat(self._beat, volts1, volts2)

@@ -114,8 +114,8 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
         carried = run.length - 1
         if m > carried:
             raise ModelError(
-                f"{setting('m')} {m} is more than run {run.name!r} carries: {run.length} rows are {carried} pulses; "
-                f"take m = {carried} or less"
+                f"{setting('m')} {m} is more than run {run.name!r} allows: {run.length} rows give {carried} pulses; "
+                f"use m = {carried} or less"
             )
     if power_of_two and m & (m - 1):
         below = 1 << (m.bit_length() - 1)
@@ -129,10 +129,10 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
 def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True) -> Record:
     """Return the block-pulse record of a run for a structure, with delays and sensor filter applied.
 
-    It has a row for each signal and each nonlinear term. Outputs are interpolated linearly between samples, inputs by
-    the intersample behavior of the run. More pulses than sampling intervals are allowed only if nothing is compared
-    with measurements. With ``filtered``, the sensor filter is applied to signals that were not measured through it, as
-    the equation error requires. With ``smooth``, signals whose derivatives are in nonlinear terms are smoothed.
+    It has a row for each signal and each non-linear term. Outputs are interpolated linearly between samples, inputs by
+    the intersample behavior of the run. More pulses than sampling intervals are allowed only without a comparison with
+    measurements. With ``filtered``, the sensor filter is applied to signals that were not measured through it, as the
+    equation error requires. With ``smooth``, signals whose derivatives are in non-linear terms are smoothed.
 
     A missing signal, a signal whose squares underflow, a delay of an output or a missing sample of an input raises an
     FtlmError. Missing samples of outputs are interpolated, and must not be fitted.
@@ -286,8 +286,8 @@ def _check_excess_order(signal: str, order: float, output: str, alpha: float) ->
     """
     if signal != output and order > alpha + MAX_IMPROPER_ORDER - ORDER_RESOLUTION:
         raise ModelError(
-            f"order {order:g} of {signal} is {order - alpha:g} above alpha = {alpha:g} of {output}; in the time domain "
-            "an equation carries another signal less than one order above its own output: lower it"
+            f"order {order:g} of {signal} is {order - alpha:g} above alpha = {alpha:g} of {output}; in the time "
+            "domain the order of another signal must be below alpha + 1; lower it"
         )
 
 
@@ -364,7 +364,7 @@ def _check_missing(run: Run, structure: Structure) -> None:
     if structure.all_filtered and any(name in missing for name in outputs):
         raise DataError(
             f"run {run.name!r} has missing samples, and a sensor filter with {parameter('coupling', 'measured')}, or "
-            f"on what drives the run, must see all of them; use {parameter('coupling', 'simulated')}, or a part "
+            f"on an input of the model, requires all samples; use {parameter('coupling', 'simulated')}, or a part "
             "without gaps"
         )
 
@@ -375,7 +375,7 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
         for name, is_missing in run.missing_samples.items():
             raise DataError(
                 f"output {name!r} of run {run.name!r} holds no value in {int(is_missing.sum())} rows, first row "
-                f"{int(np.flatnonzero(is_missing)[0])}: {what} cannot leave them out; use "
+                f"{int(np.flatnonzero(is_missing)[0])}: {what} requires all samples; use "
                 f"{parameter('method', 'output-error')} (identify), a part without gaps, or fill them yourself"
             )
 
@@ -388,14 +388,14 @@ def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float,
     Raises
     ------
     ModelError
-        If the equation has friction or another nonlinear term.
+        If the equation has friction or another non-linear term.
     """
     check_frictionless([item], "what is linear in its coefficients")
     return linear_tuple(item, signals)
 
 
 def check_linear(equations: Sequence[Equation], what: str) -> None:
-    """Raise ModelError if an equation has friction or a nonlinear term; `what` names the analysis."""
+    """Raise ModelError if an equation has friction or a non-linear term; `what` names the analysis."""
     check_frictionless(equations, what)
     for item in equations:
         for term in item.nonlinear_terms:
@@ -423,7 +423,7 @@ def check_frictionless(equations: Sequence[Equation], what: str) -> None:
 def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
     """Return an equation without friction in the form that the core takes.
 
-    Nonlinear terms are further rows of the record.
+    Non-linear terms are further rows of the record.
     """
     index = {name: i for i, name in enumerate(signals)}
     if any(t.column not in index for t in item.nonlinear_terms):
@@ -433,7 +433,7 @@ def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, li
 
 
 def derived_signals(structure: Structure) -> list[_core._Derived]:
-    """Return the expressions of nonlinear terms in the form that the core takes.
+    """Return the expressions of non-linear terms in the form that the core takes.
 
     The core appends their values to the signals of the structure.
     """
@@ -504,7 +504,7 @@ def prepare(
 
     Raise DataError or ModelError for unsuitable data.
 
-    Missing samples raise DataError unless ``gaps`` is True, which an estimator sets that excludes them.
+    Missing samples raise DataError unless ``gaps`` is True. An estimator that excludes missing samples sets ``gaps``.
     """
     check_offset_resolved(structure.offset)
     if not gaps:

@@ -55,7 +55,7 @@ SQUARES_WEIGHT = 0.25
 
 @dataclass(frozen=True)
 class StartSettings:
-    """Thresholds for the choice of initial conditions, set on simulated records and verified on other records.
+    """Thresholds for the choice of initial conditions, tuned on simulated records and verified on others.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]
 
 
 def _starts_slowly(outputs: Sequence[Floats]) -> bool:
-    """Whether no output moves noticeably at first, although one of them does so at most later times."""
+    """Whether all outputs are nearly constant at first, although one of them varies at most later times."""
     conclusive = False
     for samples in outputs:
         noise = START_SETTINGS.sigmas * math.sqrt(2.0) * noise_at_start(samples)
@@ -336,7 +336,7 @@ def resolve_common_initial_conditions(runs: Sequence[Run], structure: Structure)
 
 
 def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Return the excess of residuals with few initial terms over those with many, in units of the noise variance.
+    """Return the excess of squared residuals with few initial terms over those with many, over the noise variance.
 
     If the few terms are sufficient, it has a chi-squared distribution. Its degrees of freedom are the number of
     additional terms.

@@ -1,4 +1,4 @@
-"""Rows of nonlinear terms in a block-pulse record: expressions of measured signals and their derivatives."""
+"""Rows of non-linear terms in a block-pulse record: expressions of measured signals and their derivatives."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ SMOOTHING_POINTS, SMOOTHING_DEGREE = 31, 3
 
 
 def nonlinear_columns(structure: Structure) -> dict[str, Expression]:
-    """Return the expressions of the nonlinear terms, by the name of their row in a record, in order of appearance."""
+    """Return the expressions of the non-linear terms, by the name of their row in a record, in order of appearance."""
     return {t.column: t.nonlinear for e in structure.equations for t in e.terms if t.nonlinear is not None}
 
 
 def record_signals(structure: Structure) -> tuple[str, ...]:
-    """Return the names of the rows of a record: the signals of a structure, then its nonlinear terms."""
+    """Return the names of the rows of a record: the signals of a structure, then its non-linear terms."""
     return (*structure.signals, *nonlinear_columns(structure))
 
 
 def has_derivative_channels(structure: Structure) -> bool:
-    """Whether a nonlinear term contains the derivative of a signal, which the data do not contain."""
+    """Whether a non-linear term contains the derivative of a signal, which the data do not contain."""
     return any(order > 0 for item in nonlinear_columns(structure).values() for _, order in item.channels)
 
 
 def append_columns(run: Run, structure: Structure, means: Floats, step: float, *, smooth: bool) -> Floats:
-    """Return block-pulse means of the signals, with a further row for each nonlinear term.
+    """Return block-pulse means of the signals, with a further row for each non-linear term.
 
     An expression is evaluated at the means of its signals, which is accurate to second order in the step. Derivatives
     are those of the raw means, or with ``smooth`` those of local polynomials. A row is NaN where the expression has no
@@ -63,7 +63,7 @@ def _is_held(run: Run, signal: str, order: float) -> bool:
 
 
 def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], step: float) -> None:
-    """Raise an error if a nonlinear term has no value somewhere, for estimators that need all values.
+    """Raise an error if a non-linear term has no value somewhere, for estimators that need all values.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
             continue
         if structure.sensor_filter is not None:
             raise ModelError(
-                f"{name} does not hold for signals behind a sensor filter; use {parameter('method', 'output-error')}, "
+                f"{name} does not apply to filtered signals; use {parameter('method', 'output-error')}, "
                 "or leave the filter out"
             )
         pair = next(((signal, order) for signal, order in item.channels if _is_held(run, signal, order)), None)

@@ -115,7 +115,7 @@ def output_simulation(
 
     Samples are uniform, or at given `times` [s].
 
-    `initial` are given initial terms; with None they are fitted to the run. For a nonlinear model they are fitted on a
+    `initial` are given initial terms; with None they are fitted to the run. For a non-linear model they are fitted on a
     grid of `state_refinement` block pulses per sampling interval.
     """
     structure, signals = model.structure, record_signals(model.structure)
@@ -218,7 +218,7 @@ def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
 def measured_samples(model: Model, run: Run, every: int) -> Floats:
     """Return the measured samples to compare with a simulation, of shape (outputs, N).
 
-    They are filtered if the equation is. Missing samples of an output are NaN.
+    They are filtered if the equation holds for filtered signals. Missing samples of an output are NaN.
     """
     through = model.structure.is_filtered
     if not model.structure.all_filtered or all(map(through, model.outputs)):
@@ -313,7 +313,7 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
 
 
 def _is_reportable(residuals: StartResiduals) -> bool:
-    """Whether a history explains a run and rest does not, by enough that a finding is worthwhile."""
+    """Whether a history explains a run so much better than rest that a finding is worthwhile."""
     # An overflow is infinite, and nothing is reported where both are.
     with np.errstate(over="ignore", invalid="ignore"):
         ends = [end / residuals.sizes[:, None] for end in (residuals.rest, residuals.history)]

@@ -133,8 +133,8 @@ def fit_history(
 def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
     """Return the posterior mean of the coefficients of some signals (shapes) in a target, under a normal prior.
 
-    The standard deviation of the prior maximizes the likelihood. The remainder of the target is noise, whose variance
-    is increased for autocorrelation.
+    The standard deviation of the prior maximizes the likelihood. The rest of the target is noise, whose variance is
+    increased for autocorrelation.
     """
     u, spread, right = thin_svd(shapes)
     along = projections(u, target)

@@ -75,9 +75,10 @@ def simulate(
     """Simulate the outputs of a model on the inputs of a run, at the sample times of the run.
 
     Models of integer orders are simulated exactly, by the matrix exponential of one sampling interval, if the samples
-    are uniform and the model has no sensor filter, friction or nonlinear term. For all other models, the step is halved
-    until this changes no output by more than ``tolerance`` times its largest value. Inputs follow their intersample
-    behavior (a zero-order hold stays exact), and Richardson extrapolation removes the error terms of powers 2, 3 and 4.
+    are uniform and the model has no sensor filter, friction or non-linear term. For all other models, the step is
+    halved until this changes no output by more than ``tolerance`` times its largest value. Inputs follow their
+    intersample behavior (a zero-order hold stays exact), and Richardson extrapolation removes the error terms of powers
+    2, 3 and 4.
 
     A simulated sample is the value just after the zero-order-hold inputs of its row have changed. It differs from the
     value just before only if the model has direct feedthrough.
@@ -215,7 +216,7 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
     lacking = next((o for o in missing if o in read), None)
     if lacking is not None and model.structure.coupling != "simulated":
         raise DataError(
-            f"run {run.name!r} has no signal {lacking!r}, which the equation of {read[lacking]} reads as measured; "
+            f"run {run.name!r} has no signal {lacking!r}, which enters the equation of {read[lacking]} as measured; "
             f"give it, or use {parameter('coupling', 'simulated')}"
         )
     return run.with_outputs({n: np.zeros(run.length) for n in missing})

@@ -1,1 +1,1 @@
-"""Structures: orders, equations, input nonlinearities, sensor filters and their language."""
+"""Structures: orders, equations, input non-linearities, sensor filters and their language."""

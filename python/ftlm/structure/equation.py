@@ -22,7 +22,7 @@ from ftlm.utils.validation import real_number
 class Term:
     """Term ``factor * coefficient * D^order signal`` on the right-hand side of an equation.
 
-    A nonlinear term has an expression in place of the signal, such as ``y^3`` or ``abs(D y)*D y``.
+    A non-linear term has an expression in place of the signal, such as ``y^3`` or ``abs(D y)*D y``.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Term:
 
     @property
     def nonlinear(self) -> Expression | None:
-        """Expression of a nonlinear term; None if the term is linear."""
+        """Expression of a non-linear term; None if the term is linear."""
         return self.expression if isinstance(self.expression, Expression) else None
 
     @property
@@ -75,7 +75,7 @@ class Term:
         return self.format({self.signal: signal})
 
     def format(self, inputs: Mapping[str, str]) -> str:
-        """Return the term as text; ``inputs`` maps an input to its text with delay and nonlinearity."""
+        """Return the term as text; ``inputs`` maps an input to its text with delay and non-linearity."""
         if isinstance(self.coefficient, str):
             factor = "" if self.factor == 1 else "-" if self.factor == -1 else f"{self.factor!r} "
             text = f"{factor}{self.coefficient} "
@@ -295,7 +295,7 @@ class Equation:
             if term.factor == 0 or not math.isfinite(term.factor):
                 raise ModelError(
                     f"factor {term.factor:g} of {term.coefficient} {term.signal} in the equation of {self.output} "
-                    "makes the coefficient meaningless; give a finite number other than 0"
+                    "is 0 or not finite; give a finite number other than 0"
                 )
             if term.fixed is not None and not math.isfinite(term.fixed):
                 raise ModelError(
@@ -309,7 +309,9 @@ class Equation:
                 continue
             own, alpha, order = term.signal == self.output, self.order.constant, term.order.constant
             if own and not 0 <= order < alpha:
-                raise ModelError(f"own-output order {order:g} of {self.output} is outside [0, {alpha:g}); lower it")
+                raise ModelError(
+                    f"order {order:g} of a term of the output {self.output} is outside [0, {alpha:g}); lower it"
+                )
             if not own and order < MIN_INPUT_ORDER:
                 raise ModelError(f"order {order:g} of {term.signal} is below {MIN_INPUT_ORDER:g}; raise it")
             if not own and order > MAX_ORDER:
@@ -319,7 +321,7 @@ class Equation:
             self._check_friction(self.friction)
 
     def _check_expression(self, term: Term, shape: Expression) -> None:
-        """Raise ModelError if a nonlinear term contains too high a derivative of the output to be simulated."""
+        """Raise ModelError if a non-linear term contains too high a derivative of the output to be simulated."""
         words = f"{term} in the equation of {self.output}"
         if term.order.names or self.order.names:
             return
@@ -370,10 +372,10 @@ class Equation:
     def check_input_orders(self, outputs: Sequence[str]) -> None:
         """Raise ModelError if the order of an input is not below alpha, so that the output jumps with the input.
 
-        Only equations with friction or nonlinear terms are checked; simulated outputs are exempt.
+        Only equations with friction or non-linear terms are checked; simulated outputs are exempt.
 
-        Friction depends on the velocity of the output, and a nonlinear term on its values within a block pulse, so both
-        require a continuous output.
+        Friction depends on the velocity of the output, and a non-linear term on its values within a block pulse, so
+        both require a continuous output.
 
         Raises
         ------
@@ -397,7 +399,7 @@ class Equation:
 
     @property
     def nonlinear_terms(self) -> tuple[Term, ...]:
-        """Nonlinear terms, in order of appearance."""
+        """Non-linear terms, in order of appearance."""
         return tuple(t for t in self.terms if t.nonlinear is not None)
 
     @property
@@ -445,7 +447,7 @@ class Equation:
         return not self.order_names and not self.coefficient_names
 
     def as_text(self, inputs: Mapping[str, str]) -> str:
-        """Return the equation as text; ``inputs`` maps an input to its text with delay and nonlinearity."""
+        """Return the equation as text; ``inputs`` maps an input to its text with delay and non-linearity."""
         right = " + ".join(t.format(inputs) for t in self.terms).replace("+ -", "- ")
         friction = "" if self.friction is None else f" {self.friction.as_text(self.output)}"
         return f"{derivative(self.order, self.output)} = {right}{friction}"

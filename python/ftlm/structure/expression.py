@@ -1,4 +1,4 @@
-"""Expressions of signals in nonlinear terms: construction, text, evaluation and derivatives."""
+"""Expressions of signals in non-linear terms: construction, text, evaluation and derivatives."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class Expression:
         return 1.0, self
 
     def as_text(self, signals: Mapping[str, str] | None = None) -> str:
-        """Return the expression as text; ``signals`` maps an input to its text with delay and nonlinearity."""
+        """Return the expression as text; ``signals`` maps an input to its text with delay and non-linearity."""
         texts = signals or {}
         match self.operation:
             case "constant":

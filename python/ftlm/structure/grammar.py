@@ -50,7 +50,7 @@ from ftlm.structure.order import Order
 from ftlm.utils.parameters import parameter
 
 IDENTIFIER_PATTERN = r"[^\W\d]\w*"
-#: Input nonlinearities with a syntax in equation texts.
+#: Input non-linearities with a syntax in equation texts.
 NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
 #: A term that consists of such a name alone is an offset.
 _OFFSET_PATTERN = re.compile(r"c\d*")
@@ -76,7 +76,7 @@ class ParsedTerm:
 
     ``name`` is None if the coefficient is a number.
 
-    A nonlinear term has an expression; ``signal`` is then its first signal.
+    A non-linear term has an expression; ``signal`` is then its first signal.
     """
 
     factor: float
@@ -210,7 +210,7 @@ class EquationParser:
         return self
 
     def parse_expression(self) -> Expression:
-        """Parse the whole text as the expression of a nonlinear term, and return it."""
+        """Parse the whole text as the expression of a non-linear term, and return it."""
         terms = self._expression()
         if self._peek()[0] != "end":
             raise self._syntax_error("'+', '-', '*' or the end")
@@ -343,7 +343,7 @@ class EquationParser:
                 values = [self._peek(k)[1] for k in range(2, 3 + len(phrase))]
                 if values == [*phrase, ")"]:
                     if self.offset:
-                        raise self._error("the offset stands there twice; write it once")
+                        raise self._error("the offset occurs twice; write it once")
                     self.offset = kind
                     self._position += 3 + len(phrase)
                     return True
@@ -375,7 +375,7 @@ class EquationParser:
         return signs > 0 and not self._is_curved(end) and self._peek(end)[1] not in ("^", "*")
 
     def _is_expression_group(self) -> bool:
-        """Whether the next parentheses, after a number, are a factor of a nonlinear term and not a sum to expand.
+        """Whether the next parentheses, after a number, are a factor of a non-linear term and not a sum to expand.
 
         They are if a power or a product follows, if they contain a constant and a power or function, or if they are
         doubled.
@@ -401,7 +401,7 @@ class EquationParser:
         return False
 
     def _operand(self) -> tuple[Order, str | Expression]:
-        """Parse the operand of a coefficient: return (order, signal), or (order, expression) of a nonlinear term."""
+        """Parse the operand of a coefficient: return (order, signal), or (order, expression) of a non-linear term."""
         begin = self._position
         operator = self._operator()
         if operator is not None and self._sees("("):
@@ -595,8 +595,8 @@ class EquationParser:
     def _check_delay(self, signal: str, delay: Value) -> None:
         if self.delays.setdefault(signal, delay) != delay:
             raise self._error(
-                f"{signal} has two delays; a run holds one signal for each: give the input that comes later a name of "
-                "its own"
+                f"{signal} has two delays; give the input with the longer delay its own name, and its own signal in "
+                "the run"
             )
 
     def _delay(self, signal: str) -> Value:
@@ -683,10 +683,10 @@ class EquationParser:
             )
         if sign > 0:
             shape = "fc*" if near is None else f"fs*exp(-(D {signal}/vs)^2)*"
-            raise self._error(f"friction takes energy, so it is subtracted: write '- {shape}sign(D {signal})'")
+            raise self._error(f"friction dissipates energy, so it is subtracted: write '- {shape}sign(D {signal})'")
         if (self.friction if near is None else self.stribeck) is not None:
             which = "friction" if near is None else "Stribeck friction"
-            raise self._error(f"{which} of D {signal} stands there twice; write it once")
+            raise self._error(f"{which} of D {signal} occurs twice; write it once")
         strength: tuple[str | float, float] = (name, sign * number) if name is not None else (number, sign)
         if near is None:
             self.friction = Friction(*strength), signal

@@ -14,7 +14,7 @@ from ftlm.utils.validation import Floats, real_number
 
 #: Effects on an input: delay, saturation, dead zone.
 InputEffect = Literal["delay", "saturation", "dead_zone"]
-#: Static nonlinearities of an input.
+#: Static non-linearities of an input.
 NonlinearityKind = Literal["saturation", "dead_zone"]
 #: Value of a fixed parameter, or (lower, upper) bound of an estimated one.
 Value = float | tuple[float, float]
@@ -114,12 +114,12 @@ class InputNonlinearity:
         return input_name(self.law, self.signal)
 
     def apply(self, values: Floats) -> Floats:
-        """Return input values after the nonlinearity.
+        """Return input values after the non-linearity.
 
         Raises
         ------
         ModelError
-            If the value of the nonlinearity is free.
+            If the value of the non-linearity is free.
         """
         if isinstance(self.value, tuple):
             raise ModelError(f"the {INPUT_EFFECT_LABELS[self.law]} of {self.signal} is still free; give its value")
@@ -134,14 +134,14 @@ class InputNonlinearity:
 
 
 def sort_nonlinearities(limits: Sequence[InputNonlinearity]) -> list[InputNonlinearity]:
-    """Return nonlinearities in the order in which they act: dead zones first."""
+    """Return non-linearities in the order in which they act: dead zones first."""
     return sorted(limits, key=lambda limit: limit.law == "saturation")
 
 
 def replace_nonlinearities(
     limits: Sequence[InputNonlinearity], law: NonlinearityKind, values: Mapping[str, Value]
 ) -> tuple[InputNonlinearity, ...]:
-    """Return nonlinearities in which those of one kind are replaced by new values, by input."""
+    """Return non-linearities in which those of one kind are replaced by new values, by input."""
     others = [limit for limit in limits if limit.law != law or limit.signal not in values]
     new = [
         InputNonlinearity(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()
@@ -152,7 +152,7 @@ def replace_nonlinearities(
 def check_nonlinearities(
     limits: Sequence[InputNonlinearity], delays: Mapping[str, object], late: Mapping[str, object]
 ) -> None:
-    """Raise ModelError if an input has two nonlinearities of one kind, or more than one free parameter.
+    """Raise ModelError if an input has two non-linearities of one kind, or more than one free parameter.
 
     ``delays`` are the fixed delays and ``late`` the free delays, by input.
     """

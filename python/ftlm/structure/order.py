@@ -73,9 +73,7 @@ class Order:
             ) from error
         # The range of a plain number is checked by the equation.
         if weights and not all(map(math.isfinite, (constant, *weights.values()))):
-            raise ModelError(
-                f"order {text!r:.60} holds a number that is not finite; write 0.5, alpha or alpha1-mu2+0.1"
-            )
+            raise ModelError(f"order {text!r:.60} has a number that is not finite; write 0.5, alpha or alpha1-mu2+0.1")
         return cls(constant, tuple(sorted((n, w) for n, w in weights.items() if w)))
 
     @property
@@ -111,7 +109,7 @@ class Order:
 
 
 def format_shortest(value: float) -> str:
-    """Return a number as text: with six significant digits if these are exact, otherwise with all digits needed."""
+    """Return a number as text: with six significant digits if they are exact, otherwise with all digits."""
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 
@@ -180,9 +178,8 @@ def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
     for low, high in pairwise(values):
         if round(low, 9) == round(high, 9):
             raise ModelError(
-                f"order {name}: values {format_shortest(low)} and {format_shortest(high)} are one order: orders are "
-                "kept to "
-                f"{ORDER_RESOLUTION:g}; leave one out"
+                f"order {name}: values {format_shortest(low)} and {format_shortest(high)} are equal, because orders "
+                f"have a resolution of {ORDER_RESOLUTION:g}; leave one out"
             )
     return tuple(values)
 

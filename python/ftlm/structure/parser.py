@@ -50,7 +50,7 @@ def equation(
         left-hand side. Separate equations by ``;`` or line breaks. A term ``c`` alone (or ``c0``, ``c1``, …) is an
         offset, an unknown constant; write ``1 c`` for a signal of that name. ``- fc*sign(D y)`` in the equation of y is
         Coulomb friction of the simulated velocity, set-valued at rest. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` adds
-        Stribeck friction, with fs and vs > 0 each a name or a number; the breakaway force is then fc + fs. Nonlinear
+        Stribeck friction, with fs and vs > 0 each a name or a number; the breakaway force is then fc + fs. Non-linear
         terms must be linear in their coefficients: ``k3 y^3``, ``e y*u``, ``- w abs(D y)*D y``, ``k sin(2 y)``, ``k
         D^mu (y^3)``, with the functions sin, cos, exp, tanh, abs and sqrt. The first name in a product is its
         coefficient, unless it denotes a signal elsewhere in the equations.
@@ -157,7 +157,7 @@ def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None
         )
     kinds = {has_offset for _, has_offset in pairs}
     if len(kinds) > 1:
-        raise ModelError("one equation has a constant offset and another one that grows; write the same in each")
+        raise ModelError("one equation has a constant offset and another one a ramp; write the same offset in each")
     return check_offset(pairs[0][1] or "none") if pairs else "none"
 
 
@@ -236,8 +236,8 @@ def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlin
     both = next((signal for signal, _ in limits if signal in bare), None)
     if both is not None:
         raise ModelError(
-            f"{both} stands there limited and as it is, but an actuator limits all that it drives; limit it in each "
-            "term, or give the run the limited input as a signal of its own"
+            f"{both} occurs with and without its limit, but an actuator limits all of its effects; limit it in each "
+            "term, or give the limited input as another signal of the run"
         )
     return tuple(sort_nonlinearities([InputNonlinearity(s, law, value) for (s, law), value in limits.items()]))
 

@@ -43,10 +43,10 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         """Validate the signals and the transfer function."""
         if not self.signals:
-            raise ModelError("sensor filter: it names no signal; name those that were measured through it")
+            raise ModelError("sensor filter: it names no signal; name the signals that were measured through it")
         twice = next((s for i, s in enumerate(self.signals) if s in self.signals[:i]), None)
         if twice is not None:
-            raise ModelError(f"sensor filter: it names {twice} twice; a signal passes it once")
+            raise ModelError(f"sensor filter: it names {twice} twice; name each signal once")
         for part, terms in (("numerator", self.numerator), ("denominator", self.denominator)):
             for coefficient, order in terms:
                 if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
@@ -61,7 +61,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if improper is not None:
             raise ModelError(
                 f"sensor filter: order {improper:g} of its numerator is above {highest:g}, the highest of its "
-                "denominator; a filter that can be built is proper"
+                "denominator; give a proper filter"
             )
 
     @property
@@ -75,7 +75,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def holds_answers(self) -> bool:
-        """Whether the filter's transient is a sum of impulse responses: no zeros and only integer orders."""
+        """Whether the transient of the filter is a sum of impulse responses: no zeros and only integer orders."""
         whole = all(order == round(order) for coefficient, order in self.denominator if coefficient)
         return whole and not any(order for coefficient, order in self.numerator if coefficient)
 
@@ -102,6 +102,9 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ModelError(f"sensor filter: signals = {signals!r} is one text; give a list of names, [{signals!r}]")
         for name, value in (("frequency", frequency), ("damping", damping)):
             if not 0 < real_number(f"{name} of the sensor filter", value) < math.inf:
-                raise ModelError(f"{name} of the sensor filter = {value} is not positive; give 2.0 [Hz] and 0.9, say")
+                raise ModelError(
+                    f"{name} of the sensor filter = {value} is not positive; give a positive number, such as 2.0 [Hz] "
+                    "and 0.9"
+                )
         omega = 2 * math.pi * frequency
         return cls(tuple(signals), ((omega**2, 0.0),), ((1.0, 2.0), (2 * damping * omega, 1.0), (omega**2, 0.0)))

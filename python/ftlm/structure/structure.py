@@ -147,8 +147,8 @@ class Structure:
     Raises
     ------
     ModelError
-        If there is no equation, an output or coefficient is repeated, or a delay, nonlinearity or filter has an unknown
-        signal.
+        If there is no equation, an output or coefficient is repeated, or a delay, non-linearity or filter has an
+        unknown signal.
     """
 
     equations: tuple[Equation, ...]
@@ -208,12 +208,12 @@ class Structure:
 
     @property
     def has_nonlinear_terms(self) -> bool:
-        """Whether an equation has a nonlinear term."""
+        """Whether an equation has a non-linear term."""
         return any(e.nonlinear_terms for e in self.equations)
 
     @property
     def is_linear(self) -> bool:
-        """Whether no equation has friction or a nonlinear term."""
+        """Whether no equation has friction or a non-linear term."""
         return not (self.has_friction or self.has_nonlinear_terms)
 
     @property
@@ -244,7 +244,7 @@ class Structure:
             raise ModelError(f"{words}, and a law ties its {names[0]} to other coefficients; leave one of the two out")
         if isinstance(self.initial, History) or self.initial == "history":
             raise ModelError(
-                f"{words}: powers of t for an unknown past would give it velocities that it never had; use "
+                f"{words}: powers of t for unknown past inputs are not used with friction; use "
                 f"{parameter('initial', 'caputo')} (level and velocity at the start), or begin the run at rest"
             )
 
@@ -302,7 +302,7 @@ class Structure:
             through = [o for o in self.outputs if self.is_filtered(o)]
             raise ModelError(
                 f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run starts "
-                "in motion: what such a filter still held is more than answers to impulses; use "
+                "in motion: the transient of such a filter is not a sum of impulse responses; use "
                 f"{parameter('initial', 'rest')} and begin the run at rest, or give the exponents of its initial "
                 "terms"
             )
@@ -497,7 +497,7 @@ class Structure:
         return replace(self, free_delays={}, input_nonlinearities=_or_unset(fixed_limits))
 
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
-        """Return text of inputs with a delay or nonlinearity by name, such as ``sat(u(t - 0.035 s), 0.94)``."""
+        """Return text of inputs with a delay or non-linearity by name, such as ``sat(u(t - 0.035 s), 0.94)``."""
         known = {n: f"{'+' if d < 0 else '-'} {_format(abs(d), digits)}" for n, d in self.delay.items() if d}
         free = {n: f"- {_format(low, digits)}:{_format(high, digits)}" for n, (low, high) in self.free_delays.items()}
         out = {n: f"{n}(t {text} s)" for n, text in {**known, **free}.items()}
@@ -510,7 +510,7 @@ class Structure:
         return "\n".join(f"{e.as_text(inputs)}{self.offset_in_words}" for e in self.equations)
 
     def equation_text(self, item: Equation) -> str:
-        """Return an identified equation as text, with delays, nonlinearities and offset."""
+        """Return an identified equation as text, with delays, non-linearities and offset."""
         return format_equation(item, self.describe_inputs(".6g")) + self.offset_in_words
 
     @property
@@ -533,7 +533,7 @@ def _format(value: float, digits: str) -> str:
 
 
 def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, ...] | UnsetType:
-    """Return the nonlinearities as a tuple, or msgspec's UNSET if there are none, so that they are not written."""
+    """Return the non-linearities as a tuple, or msgspec's UNSET if there are none, so that they are not written."""
     return tuple(limits) or UNSET
 
 

@@ -30,7 +30,7 @@ class Variant:
     offset
         Whether each run has an unknown constant offset.
     inputs
-        Names of its free delays and input nonlinearities. Optional ones that are not named are absent.
+        Names of its free delays and input non-linearities. Optional ones that are not named are absent.
     frictions
         Names of its friction terms, as in :attr:`NestedStructures.frictions`.
     """
@@ -63,7 +63,7 @@ class Change:
 class NestedStructures:
     """Structure whose optional elements define the set of structures nested in it.
 
-    Optional elements are an offset if the structure allows one, free delays, free input nonlinearities, and friction
+    Optional elements are an offset if the structure allows one, free delays, free input non-linearities, and friction
     with a free coefficient. In a single equation without order or coefficient law, terms with a free coefficient are
     also optional. An order that is a single parameter may be fixed to an integer.
     """
@@ -102,7 +102,7 @@ class NestedStructures:
         return out
 
     def _with_frictions(self, item: Equation, rubs: frozenset[str]) -> Equation:
-        """Return an equation with all mandatory friction terms and the given optional ones."""
+        """Return an equation with all mandatory friction terms and the given optional friction terms."""
         friction, own, choices = item.friction, f"friction of {item.output}", self.frictions
         if friction is None:
             return item

@@ -164,7 +164,7 @@ class Folds:
 
     @classmethod
     def of(cls, runs: Run | Sequence[Run], validation: str | Run | Sequence[Run]) -> Folds:
-        """Return the folds of a validation that leaves out runs or blocks in turn, or uses separate validation runs.
+        """Return the folds of a cross-validation over runs or blocks, or of a validation on separate runs.
 
         Raises
         ------
@@ -185,8 +185,8 @@ class Folds:
             for run in others:
                 if any(_same(run, estimation_run) for estimation_run in every):
                     raise ModelError(
-                        f"validation run {run.name} is also an estimation run, so it validates nothing; leave it "
-                        f"out of one of the two, or use {parameter('validation', 'runs')}"
+                        f"validation run {run.name} is also an estimation run, so it does not validate the model; "
+                        f"leave it out of one of the two, or use {parameter('validation', 'runs')}"
                     )
             names = ", ".join(r.name for r in others)
             return cls(every, tuple(Fold(every, run) for run in others), f"{names}, not fitted to")
@@ -325,7 +325,7 @@ def fix_initial_conditions(structure: Structure, runs: Sequence[Run]) -> Structu
     """Return the structure with fixed initial conditions: rest, or Caputo's initial terms.
 
     They replace ``"auto"``, whose history (powers of t for past inputs) has more terms if more orders are free. A
-    richer candidate could then fit more than its model explains.
+    candidate with more free orders could then fit more than its model explains.
     """
     if structure.initial != "auto":
         return structure
@@ -441,9 +441,9 @@ def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, r
 def validation_score_bound(joint: JointFit, folds: Folds) -> float:
     """Return a lower bound of the validation score, from the fit on all runs alone; -inf if there is none.
 
-    Compare the fit without a fold with the full fit. Its sum of squares over all runs cannot be smaller, and over the
-    remaining runs it cannot be larger. On the fold it is therefore at least that of the full fit. For several outputs
-    this holds for the weighted sum of squares, not for each output.
+    A fit without a fold is compared with the fit on all runs. Its sum of squares over all runs cannot be smaller, and
+    over the remaining runs it cannot be larger. On the fold its sum of squares is therefore at least that of the fit on
+    all runs. For several outputs this holds for the weighted sum of squares, not for each output.
     """
     if not joint.converged:
         return -math.inf

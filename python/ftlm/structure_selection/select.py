@@ -272,7 +272,7 @@ def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
 
 @dataclass(frozen=True)
 class Choice:
-    """The best of several ranked trials with the reason for it, and the choices for single outputs that it combines."""
+    """Best of several ranked trials with the reason, and the choices for single outputs that it combines."""
 
     ranked: tuple[Trial, ...]
     winner: Trial
@@ -471,7 +471,7 @@ def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
 
 
 def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
-    """Return the indices of trials that are not less stable, and do not fail more often, than the best one."""
+    """Return the indices of trials that are as stable as the best one and fail on no more parts."""
     best, failures = ranked[0], [len(f) for f in _failed_parts(ranked)]
     return [
         k
@@ -486,9 +486,9 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
     Its residual is at most 1 % larger, or up to 5 % if the difference over folds is not significant.
 
     The best trial is the best of many, so a limit of one standard error would reject a true structure in one case of
-    ten. If one block contains information that the others lack, the true structure predicts this block far worse than 5
-    %. Very strong evidence on all samples then makes it eligible. With too few folds for a t-test, it is eligible only
-    within 5 %.
+    ten. If one block contains information that the others lack, the residual of the true structure on this block is
+    more than 5 % larger. Very strong evidence on all samples then makes it eligible. With too few folds for a t-test,
+    it is eligible only within 5 %.
     """
     differences = np.array(trial.scores) - np.array(best.scores)
     far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - BIC_STRONG_EVIDENCE
@@ -502,7 +502,7 @@ def _predicts_equally(trial: Trial, best: Trial) -> bool:
 
 
 def _eligible_indices(ranked: Sequence[Trial], near: Sequence[int]) -> tuple[list[int], str]:
-    """Return the indices of eligible trials if integer orders are preferred, and text on fractional orders.
+    """Return the indices of eligible trials under a preference for integer orders, and text on fractional orders.
 
     Fractional orders are eligible if their residuals are significantly smaller over the folds, by at least 1 %, than
     those of the best integer orders. They are also eligible if they predict as well and their Schwarz criterion is much

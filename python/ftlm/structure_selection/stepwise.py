@@ -51,7 +51,7 @@ def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: Ta
 
     Each structure is fitted to subsampled records with a limited number of evaluations. It is excluded if its cost
     exceeds the lowest cost by the factor that the multistart uses for successive halving. At least `least` structures
-    remain. All remain if records are too short for subsampling or a structure is nonlinear.
+    remain. All remain if records are too short for subsampling or a structure is non-linear.
     """
     every = list(range(len(starts)))
     decimation = max(1, round(min(run.length - 1 for run in runs) / PRESCREEN_SAMPLES))
@@ -220,9 +220,7 @@ def initial_guesses(
 ) -> list[dict[str, float]]:
     """Return initial guesses of a structure from the estimates `values` of a nested structure.
 
-    `whole` are the integers around which orders that become free start.
-
-    `whole` are the integer values of orders that become free.
+    `whole` contains the integer values near which orders that become free start.
 
     A coefficient that is not in `values` starts at 0; a friction parameter that is not in `values` gets no initial
     value.
@@ -260,13 +258,13 @@ class StepwiseSelection:
     keys: set[str] = field(default_factory=set)
 
     def run(self) -> list[Trial]:
-        """Select structures from the simplest ones upwards, then downwards; return all validated trials in order.
+        """Run forward selection, then backward elimination; return all validated trials in order.
 
-        Each integer value of the highest orders is an initial structure of its own: the best of the simplest structures
-        need not be nested in the best one. With several inputs, one may act as a proxy for the others, so the best
-        structure is also approached from the full structure at integer orders by backward elimination. If there are
-        enough input terms for best-subset screening, selection starts from the best subset. If no term is optional, the
-        structure with all orders free is a second initial structure.
+        Each integer value of the highest orders gives its own initial structure, because the best of the simplest
+        structures need not be nested in the best structure. With several inputs, one may act as a proxy for the others,
+        so the best structure is also approached from the full structure at integer orders by backward elimination. If
+        there are enough input terms for best-subset screening, selection starts from the best subset. If no term is
+        optional, the structure with all orders free is a second initial structure.
         """
         subsets = self.work.best_subsets(self.inside)
         ends_from_subsets = self._select_from_subsets(subsets)
@@ -304,7 +302,7 @@ class StepwiseSelection:
         return list(zip(changes, joints, strict=True))
 
     def _validate_failures(self, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Trial]:
-        """Return the trials of structures none of which can be fitted."""
+        """Return failed trials if none of the structures can be fitted."""
         self.work.trials += [self.work.validate(c.words, self._build(c), joint) for c, joint in pairs]
         return self.work.trials
 
@@ -317,7 +315,7 @@ class StepwiseSelection:
         return self.work.trials
 
     def _select_from_full(self) -> list[Trial]:
-        """Select from integer orders upwards, and from all orders free downwards, for equations without optional terms.
+        """Select orders forward from integer orders and backward from free orders, if no term is optional.
 
         Forward selection from integer orders is skipped if their validation residual far exceeds that with all orders
         free.
@@ -418,7 +416,7 @@ class StepwiseSelection:
         """Evaluate fitted variants on validation data, without those that cannot be the best.
 
         Variants from the first whose lower bound of the score exceeds `limit` are evaluated after those before it. They
-        are skipped if all their bounds exceed the best score so far by more than the margin.
+        are skipped if all their bounds exceed the best score up to then by more than the margin.
         """
 
         def one(candidate: FittedVariant) -> Trial:
@@ -490,7 +488,7 @@ def _is_better(trial: Trial, than: Trial) -> bool:
 
 
 def _is_adjacent_integer(change: Change, at: FittedVariant) -> bool:
-    """Whether each order that a change fixes to an integer moves by less than 1 from its estimate."""
+    """Whether each order that a change fixes to an integer is less than 1 from its estimate."""
     values = at.joint.values_by_name
     return all(abs(v - values[n]) < 1.0 for n, v in change.variant.integer_orders if n in values)
 

@@ -338,7 +338,7 @@ def _dot(x: float, y: float) -> Markup:
 
 
 def _places(plot: PlotArea, values: Sequence[complex] | Complex) -> list[tuple[float, float]]:
-    """Return the pixel coordinates of complex values; those far outside the plot are limited."""
+    """Return the pixel coordinates of complex values; coordinates far outside the plot are limited."""
     points = np.asarray(values, dtype=np.complex128)
     xs, ys = (np.clip(v, -1e4, 1e4).tolist() for v in (plot.x_pixels(points.real), plot.y_pixels(points.imag)))
     return list(zip(xs, ys, strict=True))

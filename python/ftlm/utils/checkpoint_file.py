@@ -9,8 +9,8 @@ The only table has the name of the computation (``search`` or ``selection``) and
 ===========  ========================================================================================================
 
 Records are only appended. The rollback journal of SQLite makes every append complete or void, however the process ends,
-and is deleted at the end of each append, so the file alone contains all records. (After a kill, a write-ahead log would
-contain the last records in a second file.) SQLite does not detect changed bytes of a page. Every digest therefore
+and is deleted at the end of each append, so the database file contains all records. (After a kill, a write-ahead log
+would contain the last records in a second file.) SQLite does not detect changed bytes of a page. Every digest therefore
 covers all records up to its own. A record that was lost, moved or changed is reported as damage, and no later record is
 used.
 """
@@ -161,7 +161,7 @@ class CheckpointFile:
         other: Kind = "selection" if self.kind == "search" else "search"
         if statements == [f"CREATE TABLE {other} {TABLE_COLUMNS}"]:
             raise DataError(
-                f"{self.path} is the store of a {other}, not of a {self.kind}; resume it with the call that began it"
+                f"{self.path} is the store of a {other}, not of a {self.kind}; resume it with the call that created it"
             )
         if statements not in ([], [f"CREATE TABLE {self.kind} {TABLE_COLUMNS}"]):
             raise self._foreign_error()
@@ -183,8 +183,8 @@ class CheckpointFile:
         with contextlib.suppress(OSError), self.path.open("rb") as stream:
             if stream.read(32).startswith((b"ftlm search store 1\n", b"ftlm selection store 1\n")):
                 return DataError(
-                    f"{self.path} is a store of an earlier format; finish it with the version of ftlm that began it, "
-                    f"or start the {self.kind} again in another file"
+                    f"{self.path} is a store of an earlier format; finish it with the version of ftlm that created "
+                    f"it, or start the {self.kind} again in another file"
                 )
         return self._foreign_error()
 
@@ -219,8 +219,8 @@ class CheckpointFile:
             self._connection.execute("BEGIN IMMEDIATE")
         except sqlite3.Error as error:
             raise DataError(
-                f"store {self.path} cannot be written: {error}; what it holds is whole: make room, or move it to "
-                "another folder, and resume it"
+                f"store {self.path} cannot be written: {error}; its stored records are intact; free disk space, or "
+                "move it to another folder, and resume it"
             ) from error
 
     def recover(self, payloads: Sequence[bytes]) -> Path:

@@ -32,7 +32,7 @@ _NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY",
 
 
 def check_new(path: str | os.PathLike[str], *, force: bool) -> Path:
-    """Raise for the name of a folder, or of an existing file without ``force``."""
+    """Return a path; raise DataError if it is a folder, or an existing file without ``force``."""
     file = Path(path)
     if file.is_dir():
         raise DataError(f"{file} is a folder; name a file in it")
@@ -56,14 +56,14 @@ def _link_status(file: Path) -> os.stat_result | None:
 
 
 def check_free(*paths: str | os.PathLike[str] | None, force: bool) -> None:
-    """Raise before the computation for paths that could not be written after it; None is skipped."""
+    """Raise DataError, before a computation, for paths that could not be written after it; None is skipped."""
     for path in paths:
         if path is None:
             continue
         file = check_new(path, force=force)
         folder = file.absolute().parent
         if not folder.is_dir():
-            raise DataError(f"{file.parent} is not a folder; make it first")
+            raise DataError(f"{file.parent} is not a folder; create it first")
         if not os.access(folder, os.W_OK):
             raise DataError(f"{file} cannot be written: {file.parent} is read-only; choose another folder")
 
@@ -73,7 +73,7 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
+        raise DataError(f"{folder} cannot be created: {error.strerror or error}; choose another folder") from error
     names_present = [name for name in names if os.path.lexists(folder / name)]
     if names_present and not force:
         raise DataError(

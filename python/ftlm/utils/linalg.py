@@ -1,7 +1,7 @@
 """Linear algebra of tall-skinny matrices, computed by the core on one thread.
 
-The threads of multithreaded libraries spin for a tenth of a second after each factorization, which is longer than most
-computations here.
+Threads of multithreaded libraries wait actively for a tenth of a second after each factorization. This is longer than
+most computations of this module.
 """
 
 from __future__ import annotations

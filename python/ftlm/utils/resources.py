@@ -136,7 +136,7 @@ def estimate_duration(seconds: float, threads: int) -> float:
 
 
 def duration_bounds(seconds: float, came_to: tuple[float, float] = FIT_TIME_FACTORS) -> tuple[float, float]:
-    """Return the (shortest, longest) expected duration [s] from an estimate and a range of factors."""
+    """Return the (shortest, longest) expected duration [s]: an estimate multiplied by two factors."""
     return came_to[0] * seconds, came_to[1] * seconds
 
 

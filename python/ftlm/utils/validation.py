@@ -185,7 +185,7 @@ def as_mapping(argument: str, value: object, of: str = "array") -> Mapping[str, 
 
 
 def check_known(what: str, names: Iterable[str], choices: Sequence[str]) -> None:
-    """Raise ModelError for a name that is not one of the choices; `what` says what is named."""
+    """Raise ModelError for a name that is not one of the choices; `what` is the kind of object, for the message."""
     for name in names:
         if name not in choices:
             near = difflib.get_close_matches(str(name), choices, 1)
@@ -347,7 +347,7 @@ def apply_along_axis(
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
     samples = np.moveaxis(array, axis, -1)
     if samples.shape[-1] == 0:
-        raise DataError(f"{name} has shape {array.shape} and holds no value; give at least one")
+        raise DataError(f"{name} has shape {array.shape} and no values; give at least one")
     rows = np.ascontiguousarray(samples.reshape(-1, samples.shape[-1]))
     return np.moveaxis(work(rows).reshape(samples.shape), -1, axis)
 

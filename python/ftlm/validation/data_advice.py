@@ -225,7 +225,7 @@ def _quantum(y: Floats) -> float:
 
 
 def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
-    """Whether a signal is steep just before and after an interval of equal values, which shows clipping."""
+    """Whether a signal is steep just before and after an interval of equal values, which indicates clipping."""
     moving = np.abs(np.diff(y))
     typical = float(np.median(moving[moving > 0])) if np.any(moving > 0) else 0.0
     # A slow turning point that ends with an input step is steep on one side only.
@@ -354,7 +354,7 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
     """Yield a finding on each equation with more free parameters than the spectral lines of its inputs identify.
 
     In steady state, one spectral line identifies two parameters of each output that it excites, and a constant level
-    identifies one. Equations with friction or nonlinear terms are skipped, because their response has harmonics of the
+    identifies one. Equations with friction or non-linear terms are skipped, because their response has harmonics of the
     input lines.
     """
     run = run.with_interpolated_gaps()

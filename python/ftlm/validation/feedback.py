@@ -465,8 +465,8 @@ class _Innovations:
     def _present_ratio(self, clipped: Floats) -> float:
         """Return the statistic of the output innovation in the same sample, divided by its limit, with its sign.
 
-        It detects integral control, where the past input already contains the past outputs, so that they explain
-        nothing more.
+        It detects integral control, in which the past input already contains the past outputs, so that past outputs do
+        not improve its prediction.
         """
         size = max(robust_deviation(self.present), 1e-300)
         present = np.clip(self.present / size, -OUTPUT_CLIP, OUTPUT_CLIP)
@@ -507,7 +507,7 @@ class _Innovations:
 
         The explained innovations are filtered by the dependence of the input on its own past.
 
-        The part that is correlated with the residual of the same sample counts as feedback, too.
+        The part that is correlated with the residual of the same sample also counts as feedback.
         """
         now = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
         columns = np.column_stack([columns, now / max(float(np.linalg.norm(now)), 1e-300)])

@@ -463,7 +463,7 @@ def _test_beyond_parameters(
     signs: list[Floats],
     lags: int,
 ) -> OutputResiduals:
-    """Return the tests of an output, in which failures that parameter errors explain count as passed.
+    """Return the tests of an output, in which a failure counts as passed if parameter errors explain it.
 
     Least squares ignores the color of the noise, so errors of the parameters alone can correlate residuals with an
     input, or with the direction of motion. One generalized least-squares step removes that part of the residuals.
