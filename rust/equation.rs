@@ -579,8 +579,8 @@ pub fn check_regular(equations: &[Equation]) -> Result<()> {
         Some((_, value, size)) if value.abs() > 1e-12 * size => Ok(()),
         _ => Err(Error::Structure {
             what:
-                "the leading matrix of the equations is singular: their highest orders cancel each other, so they do \
-                   not tell their outputs apart"
+                "the leading matrix of the equations is singular: their terms of highest order cancel, so they do not \
+                   determine their outputs"
                     .into(),
             remedy: "remove an equation that repeats another one, or change an order or a coefficient".into(),
         }),

@@ -57,7 +57,7 @@ pub enum Error {
         leading: f64,
     },
     /// Linearly dependent regressors.
-    #[error("regressor {index} of {count} is a combination of the others to working precision; remove a term or move its order")]
+    #[error("regressor {index} of {count} is a linear combination of the others to machine precision; remove a term or change its order")]
     Singular {
         /// First dependent regressor.
         index: usize,
@@ -116,8 +116,8 @@ pub enum Error {
         /// Index of the first value that is not finite.
         index: usize,
     },
-    /// Pulse of a simulation whose nonlinear equations have no solution.
-    #[error("the equations have no solution at {time:.4} s (pulse {index}) of the simulation: {why}; shorten the step, or check the coefficients of the nonlinear terms")]
+    /// Pulse of a simulation whose non-linear equations have no solution.
+    #[error("the equations have no solution at {time:.4} s (pulse {index}) of the simulation: {why}; shorten the step, or check the coefficients of the non-linear terms")]
     NoSolution {
         /// Middle of the pulse \[s\].
         time: f64,

@@ -1,7 +1,7 @@
 //! Expressions of non-linear terms as programs in postfix notation, evaluated together with their derivatives.
 //!
 //! A channel is a signal or a derivative of it. A [`DerivedSignal`] is an expression over channels, such as y³ or
-//! |Dy|·Dy. A nonlinear term of an equation is a linear term of a derived signal.
+//! |Dy|·Dy. A non-linear term of an equation is a linear term of a derived signal.
 
 use crate::error::{Error, Result};
 use crate::fractional::kernels::MAX_ORDER;
@@ -123,7 +123,7 @@ impl Instruction {
 }
 
 fn refuse<T>(what: String, remedy: &str) -> Result<T> {
-    Err(Error::Structure { what: format!("{what} in a nonlinear term"), remedy: remedy.into() })
+    Err(Error::Structure { what: format!("{what} in a non-linear term"), remedy: remedy.into() })
 }
 
 /// Expression over numbered channels.

@@ -123,7 +123,7 @@ impl Record {
         }
     }
 
-    /// Record of the substitutes for all signals but one.
+    /// Record in which every signal except this one is replaced by its substitute for noise-free regressors.
     ///
     /// # Panics
     /// If the signal does not exist.
@@ -178,12 +178,12 @@ impl Record {
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn with_initial_state(mut self, transients: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
-        check_length("signals whose sensor held something", self.len(), transients.len())?;
+        check_length("flags of signals with a transient of the sensor filter", self.len(), transients.len())?;
         check_length("levels of signals", self.len(), levels.len())?;
         check_finite("level of a signal", levels)?;
         for answer in &answers {
-            check_length("answer of the filter", self.m(), answer.len())?;
-            check_finite("answer of the filter", answer)?;
+            check_length("response of the sensor filter", self.m(), answer.len())?;
+            check_finite("response of the sensor filter", answer)?;
         }
         let unit = if levels.iter().any(|v| *v != 0.0) { self.initial_term(0.0) } else { Vec::new() };
         let above = |(signal, &level): (&Vec<f64>, &f64)| {

@@ -264,7 +264,7 @@ struct InverseKernels<'s, 'a> {
     system: &'s System<'a>,
     inverse: Vec<Vec<Vec<f64>>>,
     kernels: Vec<Vec<Kernel>>,
-    /// Filtered response of every output to the error of each equation, by equation; computed when first needed.
+    /// Response of every output to the error of each equation, filtered, by equation; computed when first needed.
     behind: Vec<Option<Vec<Kernel>>>,
     buffers: Buffers,
 }

@@ -129,7 +129,7 @@ struct Realization {
 }
 
 impl Realization {
-    /// Balanced state-space model of equations; None if the direct terms are singular, or for too many states.
+    /// The balanced state-space model of equations; None if the direct terms are singular, or for too many states.
     fn new(
         equations: &[Equation],
         inputs: &[InputSignal],

@@ -96,7 +96,7 @@ impl Regression {
         let count = first + (self.starts.len() - 1) * self.exponents.len();
         check_length("solution", count, solution.len())?;
         if let Some(index) = dropped.iter().find(|index| !(first..count).contains(index)) {
-            let what = format!("column {index} is no initial term of {first} to {count}");
+            let what = format!("column {index} is not an initial term; these are columns {first} to {count}");
             return Err(Error::Structure { what, remedy: "omit initial terms only".into() });
         }
         let mut free = solution.iter();

@@ -31,7 +31,7 @@ const LEGENDRE_RULE: [(f64, f64); 4] = [
     (0.930_568_155_797_026_3, 0.173_927_422_568_726_93),
 ];
 
-/// Starred transform on the line Re s = σ for a number of uniform samples.
+/// The starred transform on the line Re s = σ for a number of uniform samples.
 pub(crate) struct StarredTransform {
     step: f64,
     plan: Plan,

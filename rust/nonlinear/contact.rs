@@ -208,7 +208,7 @@ impl ContactOperators {
         let moves_freely =
             |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.is_resting && output == state);
         let free: Vec<usize> = (0..states).filter(|&state| moves_freely(state)).collect();
-        // Response of the state channels to a friction, with the nonlinear terms.
+        // Response of the state channels to a friction, with the non-linear terms.
         let response = |b: usize| -> Vec<f64> {
             let of = |a: usize| free.iter().map(|&s| inverse[a * states + s] * gains[s * count + count - n + b]).sum();
             (0..states).map(of).collect()

@@ -245,7 +245,7 @@ fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
     vec![(0..count).map(weight).collect(); experiment.samples.len()]
 }
 
-/// Weighted least-squares fit of the output error from an initial guess.
+/// Fit of the output error by weighted least squares, from an initial guess.
 ///
 /// # Errors
 /// An initial guess whose simulation fails ([`Error::Diverged`], [`Error::NoSolution`]); an inconsistent model, or

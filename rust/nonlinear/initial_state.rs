@@ -57,8 +57,8 @@ impl EndVelocityForcing {
                     name: "exponent of an initial term".into(),
                     value: exponent + 1.0,
                     range: "(0, ∞) or 0".into(),
-                    remedy: "a level that a term above its equation's order differentiates needs that term's power of \
-                             t beside it; start at rest, or let the start be found"
+                    remedy: "the initial value of a signal that is differentiated more often than the order of its equation \
+                             requires that term's power of t as well; start at rest, or estimate the initial conditions"
                         .into(),
                 });
             }
@@ -140,7 +140,7 @@ pub(super) fn derivative_powers(
                 name: "exponent of an initial term".into(),
                 value: exponent,
                 range: format!("above {}, or 0, 1, …", order - 1.0),
-                remedy: "the derivative in a nonlinear term has no mean over the first pulse".into(),
+                remedy: "the derivative in a non-linear term has no mean over the first pulse".into(),
             });
         }
         let scale = libm::tgamma(exponent + 1.0) / libm::tgamma(exponent - order + 1.0);

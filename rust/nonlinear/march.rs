@@ -358,14 +358,15 @@ impl Operators {
                     PulseFailure::Overflow => (String::new(), true),
                     PulseFailure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
                     // Integrals of short pulses are small, so that only growth within a pulse has no solution.
-                    PulseFailure::Contact => ("no friction agrees with the motion".into(), false),
+                    PulseFailure::Contact => ("no friction force is consistent with the motion".into(), false),
                     PulseFailure::Newton(why) => (why.into(), !self.algebraic),
                 };
                 return (run, Some(End { index: k, why, is_overflow }));
             }
             let positive = pulse.determinant > 0.0;
             if *sign.get_or_insert(positive) != positive {
-                let why = "two solutions of the pulse merge and vanish".into();
+                let why =
+                    "the Jacobian of the equations is singular, and they have no solution beyond this point".into();
                 return (run, Some(End { index: k, why, is_overflow: !self.algebraic }));
             }
             let values = pulse.z.iter().chain(&pulse.values);
@@ -400,10 +401,10 @@ fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
     }
     if order > MAX_EXCESS {
         return Err(Error::OutOfRange {
-            name: "order of a derivative of an input in a nonlinear term".into(),
+            name: "order of a derivative of an input in a non-linear term".into(),
             value: order,
             range: format!("[0, {MAX_EXCESS}]"),
-            remedy: "record the derivative".into(),
+            remedy: "measure the derivative as a signal".into(),
         });
     }
     Ok(product(&Kernel::new(means), &kernel(-order, means.len(), step)))

@@ -273,16 +273,19 @@ impl NonlinearModel {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
         };
         if self.derived.iter().flat_map(|d| &d.channels).any(|(signal, _)| *signal >= recorded) {
-            return refuse("an expression names a signal that is not there", "number them from 0");
+            return refuse("an expression contains the number of a signal that does not exist", "count signals from 0");
         }
         self.model.check_structure(recorded, self.derived.len())?;
         if self.frictions.iter().any(|friction| friction.0 >= self.model.equations.len()) {
-            return refuse("friction stands in an equation that is not there", "number them from 0");
+            return refuse("friction is given for an equation that does not exist", "count equations from 0");
         }
         let known = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.model.coordinates.len());
         let mut numbers = self.frictions.iter().flat_map(|(_, law)| law.numbers());
         if numbers.any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
-            return refuse("friction is no multiple of one free coefficient", "give it one that is not negative");
+            return refuse(
+                "a friction coefficient is not a non-negative multiple of one free coefficient",
+                "give one such factor",
+            );
         }
         for experiment in experiments {
             self.model.check_experiment(experiment)?;

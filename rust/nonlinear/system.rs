@@ -79,7 +79,7 @@ impl NonlinearSystem {
             if place >= self.equations.len() || self.frictions[..k].iter().any(|f| f.0 == place) {
                 return Err(Error::Structure {
                     what: format!("friction in equation {place}"),
-                    remedy: format!("there are {}, each with one friction", self.equations.len()),
+                    remedy: format!("there are {} equations; give each one friction law at most", self.equations.len()),
                 });
             }
         }
@@ -87,10 +87,15 @@ impl NonlinearSystem {
             check_finite("friction", &[coulomb, stribeck, speed])?;
             let alpha = self.equations[place].structure.order;
             if !(alpha > 1.0 && alpha <= 2.0) {
-                return refuse("order of a body with friction", alpha, "(1, 2]", "a velocity needs inertia");
+                return refuse(
+                    "order of a body with friction",
+                    alpha,
+                    "(1, 2]",
+                    "friction requires an equation with inertia, so that the velocity is continuous",
+                );
             }
             if let Some(force) = [coulomb, stribeck].into_iter().find(|f| *f < 0.0) {
-                return refuse("friction", force, "[0, ∞)", "friction takes energy, it does not give any");
+                return refuse("friction", force, "[0, ∞)", "friction dissipates energy");
             }
             if speed <= 0.0 {
                 let remedy = "it is the speed at which friction falls";
@@ -121,7 +126,7 @@ impl NonlinearSystem {
             let above = |term: &&Term| term.signal >= self.recorded && term.order > limit - MIN_INTEGRATION_ORDER;
             if let Some(term) = structure.terms.iter().find(above) {
                 return Err(Error::OutOfRange {
-                    name: "order of a nonlinear term in an equation with friction".into(),
+                    name: "order of a non-linear term in an equation with friction".into(),
                     value: term.order,
                     range: format!("below {limit}, the order of the equation minus 1"),
                     remedy: "reduce the order, or remove the friction".into(),
@@ -225,5 +230,5 @@ impl NonlinearSystem {
 
 /// Error for non-linear terms in combination with an option that does not support them.
 pub(crate) fn unsupported_with(what: &str, remedy: &str) -> Error {
-    Error::Structure { what: format!("nonlinear terms in combination with {what}"), remedy: remedy.into() }
+    Error::Structure { what: format!("non-linear terms in combination with {what}"), remedy: remedy.into() }
 }

@@ -18,7 +18,7 @@ pub(crate) struct CandidateIndex<'a> {
     pub(crate) problem: Problem,
     pub(crate) lattice: Cow<'a, OrderGrid>,
     pub(crate) options: Options,
-    /// Unused part of the memory limit \[bytes\].
+    /// Part of the memory limit that is not used \[bytes\].
     pub(crate) spare_bytes: u64,
     /// Column of each value of each term, per block of the order grid.
     tables: Vec<Vec<Vec<usize>>>,

@@ -10,7 +10,7 @@ pub(crate) const MAX_LISTED_FAILURES: usize = 100;
 pub enum Failure {
     /// Regressors are linearly dependent to working precision.
     Singular,
-    /// Simulated output overflows.
+    /// The simulated output overflows.
     Diverged,
 }
 

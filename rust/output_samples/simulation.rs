@@ -141,7 +141,7 @@ impl OutputSimulation {
             });
         }
         if recording.is_all_filtered() {
-            let remedy = "the sensor filter does not commute with nonlinear terms: use coupling='simulated' and inputs before it";
+            let remedy = "the sensor filter does not commute with non-linear terms: use coupling='simulated' and inputs before it";
             return Err(nonlinear::unsupported_with("inputs behind the sensor filter", remedy));
         }
         let simulation = Self { recording, equations, frictions, times, derived };
@@ -157,10 +157,10 @@ impl OutputSimulation {
             let is_improper = |t: &&Term| t.order >= structure.order - ORDER_TOLERANCE && driven(t.signal);
             if let Some(term) = structure.terms.iter().find(is_improper) {
                 return Err(Error::OutOfRange {
-                    name: "order of an input in equations with nonlinear terms".into(),
+                    name: "order of an input in equations with non-linear terms".into(),
                     value: term.order,
                     range: format!("below {}, that of the equation", structure.order),
-                    remedy: "lower it".into(),
+                    remedy: "use a lower order".into(),
                 });
             }
         }
@@ -183,7 +183,7 @@ impl OutputSimulation {
         self.frictions.is_empty() && self.derived.is_empty()
     }
 
-    /// Initial terms of a model with friction or nonlinear terms, fitted on a grid of `every` pulses per sampling
+    /// Initial terms of a model with friction or non-linear terms, fitted on a grid of `every` pulses per sampling
     /// interval.
     ///
     /// Outputs are not linear in the initial terms, so these are found by optimization. It starts from level and
@@ -411,8 +411,9 @@ impl<'a> Grid<'a> {
         self.samples(means, &terms, false)
     }
 
-    /// Samples from pulse means, with direct feedthrough from the values of the inputs at the samples. // The last two
-    /// pulses before each sample time are extrapolated to it.
+    /// Samples from pulse means, with direct feedthrough from the values of the inputs at the samples.
+    ///
+    /// The last two pulses before each sample time are extrapolated to it.
     ///
     /// These pulses contain no jump of a zero-order-hold input, so the extrapolation crosses no slope discontinuity
     /// t^α. At nonuniform sample times jumps may be anywhere. There, samples follow from the pulses around them and the
@@ -541,7 +542,8 @@ impl<'a> Grid<'a> {
     }
 
     /// Part of the mean of the pulses on either side of each inner sample that occurs only after the sample, by output.
-    /// // It is half of the response in the first pulse after a jump or a slope discontinuity of the inputs.
+    ///
+    /// It is half of the response in the first pulse after a jump or a slope discontinuity of the inputs.
     ///
     /// At the sample only the direct gain acts, as in the joint fit.
     fn early_responses(&self) -> Result<Rows> {

@@ -196,7 +196,7 @@ impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
         }
         let words = object.is_instance_of::<PyString>() || object.is_instance_of::<PyDict>();
         if words || !object.hasattr("__getitem__")? {
-            return Err(PyTypeError::new_err(format!("{} is no sequence", object.get_type().name()?)));
+            return Err(PyTypeError::new_err(format!("{} is not a sequence", object.get_type().name()?)));
         }
         let length = object.len()?;
         if length > MOST_ITEMS {

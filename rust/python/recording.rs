@@ -243,7 +243,7 @@ pub fn recordings(runs: &[Py<Recording>], signals: usize, outputs: &[usize], fre
         check_length("signals of a run", signals, run.channels().len())?;
         check_length("free numbers of inputs of a run", free, run.free_inputs.len())?;
         if run.outputs() != outputs {
-            let what = format!("outputs {:?} of a run, but outputs {outputs:?} of the problem", run.outputs());
+            let what = format!("the run has outputs {:?}, but the problem has outputs {outputs:?}", run.outputs());
             return Err(Error::Structure { what, remedy: "make both from one structure".into() });
         }
     }

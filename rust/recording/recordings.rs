@@ -94,7 +94,7 @@ impl Recordings {
         let bytes: usize = self.runs.iter().map(|run| run.bytes(sampling)).fold(0, usize::saturating_add);
         let names = || self.runs.iter().map(|run| format!("'{}'", run.name())).collect::<Vec<_>>().join(", ");
         let every = sampling.pulses_per_sample;
-        check_memory(|| format!("grids of {every} pulses a sample of run {}", names()), bytes, self.memory)?;
+        check_memory(|| format!("grids of {every} pulses per sample of run {}", names()), bytes, self.memory)?;
         self.runs.iter().map(|run| run.experiment(sampling)).collect()
     }
 

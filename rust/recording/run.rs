@@ -515,8 +515,9 @@ impl Recording {
         pulse_means(&samples, m, intersample)
     }
 
-    /// Pulse means of every signal in the equations. // If `filtered`, signals that were not measured through the
-    /// sensor filter are filtered.
+    /// Pulse means of every signal in the equations.
+    ///
+    /// If `filtered`, signals that were not measured through the sensor filter are filtered.
     ///
     /// The equations then hold for filtered signals.
     ///
@@ -649,7 +650,7 @@ impl Recording {
         }
     }
 
-    /// Recorded samples of each output at the times of comparison; NaN for missing samples.
+    /// Samples of each output, as recorded, at the times of comparison; NaN for missing samples.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};

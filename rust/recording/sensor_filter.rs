@@ -89,8 +89,10 @@ impl FilterStates {
 
     /// Initial transient of a filtered signal at its samples; None if it cannot be computed.
     ///
-    /// The first sample is entirely transient. // Over the first samples the input of the filter is nearly a straight
-    /// line. The response to it and `states` responses to an impulse and its derivatives are fitted together.
+    /// The first sample is entirely transient.
+    ///
+    /// Over the first samples the input of the filter is nearly a straight line. The response to it and `states`
+    /// responses to an impulse and its derivatives are fitted together.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn transient(&self, samples: &[f64], step: f64, states: usize) -> Option<Vec<f64>> {
         let row_count = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest * step);

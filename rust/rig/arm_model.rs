@@ -1,5 +1,7 @@
 //! Time stepping of a two-link arm: four coupled fractional-order equations in its angles, with dry friction at its
-//! joints. // The caller supplies equations with orders and coefficients, as in identification and simulation.
+//! joints.
+//!
+//! The caller supplies equations with orders and coefficients, as in identification and simulation.
 //!
 //! Each equation is integrated once. Derivatives above order 1, D^ν θ with ν > 1, then appear on the left as momenta
 //! D^{ν−1} θ. All other terms are forces. Fractional derivatives of the angles are integrals of their rates, D^ν θ =
@@ -153,7 +155,7 @@ impl Arm {
             if arm.coulomb[k] > 0.0 && !(column[2 * k] > 0.0 && column[2 * k].is_finite()) {
                 return Err(Error::Structure {
                     what: format!(
-                        "motor {} does not turn its hub, so friction given as its current does not hold it",
+                        "motor {} does not move its hub, so friction given as a current of the motor does not act on the hub",
                         k + 1
                     ),
                     remedy: "give the hub a positive torque per ampere, or no friction".into(),

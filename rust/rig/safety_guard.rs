@@ -103,7 +103,7 @@ pub enum Fault {
         value: f64,
     },
     /// Encoder that does not count although its motor has current.
-    #[error("encoder {stage} has not counted for {seconds:.2} s under {current:.2} A or more; it is dead, or the hub is blocked: check its cable and the gear")]
+    #[error("encoder {stage} has not changed for {seconds:.2} s under {current:.2} A or more; the encoder is faulty or the hub is blocked; check its cable and the gear")]
     DeadEncoder {
         /// Number of the joint.
         stage: usize,
@@ -131,7 +131,7 @@ pub enum Fault {
         volts: f64,
     },
     /// Strain gauge that does not respond to its motor.
-    #[error("strain gauge {stage} has stood at {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is dead, and would not see the link bend: check its amplifier and cable")]
+    #[error("strain gauge {stage} has not changed from {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is faulty and would not detect a bent link; check its amplifier and cable")]
     DeadGauge {
         /// Number of the link.
         stage: usize,

@@ -1,4 +1,4 @@
-//! Truncated power series in the one-step delay: products, quotients, linear systems, and reference algorithms for
+//! Power series in the one-step delay, truncated: products, quotients, linear systems, and reference algorithms for
 //! tests.
 //!
 //! A causal operator on pulse means is a polynomial in the delay z truncated at z^m. The fractional integral F^η is one

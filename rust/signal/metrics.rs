@@ -11,7 +11,7 @@ pub struct Metrics {
     pub error: f64,
     /// Root mean square error √(Σ(y − ŷ)²/M), equation (46) of the paper.
     pub rmse: f64,
-    /// Normalized error NR = RMSE / σ(y), σ with divisor M (paper (47), as in its tables).
+    /// The normalized error NR = RMSE / σ(y), σ with divisor M (paper (47), as in its tables).
     pub nr: f64,
     /// Fit 100·(1 − ‖y − ŷ‖/‖y − ȳ‖) in percent.
     pub fit_percent: f64,

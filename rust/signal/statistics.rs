@@ -206,8 +206,9 @@ const SAMPLES_A_COEFFICIENT: usize = 10;
 /// Minimum length of the circulant matrix. Within it, a correlation of 0.99 per sample has decayed.
 const LEAST_CIRCLE: usize = 4096;
 
-/// Whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance. // The Yule–Walker
-/// equations are solved by the Levinson–Durbin recursion (doi:10.1093/biomet/47.3-4.233).
+/// Whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance.
+///
+/// The Yule–Walker equations are solved by the Levinson–Durbin recursion (doi:10.1093/biomet/47.3-4.233).
 ///
 /// Covariances are pooled over the series, each about its own mean. The order, `most` at most, minimizes the Bayesian
 /// information criterion. NaN counts as a missing sample.

@@ -266,7 +266,7 @@ fn what_cannot_be_started_is_refused() {
         let mut coefficients = COEFFICIENTS;
         coefficients[i] = bad;
         match start(&ORDERS, &coefficients) {
-            Err(Error::OutOfRange { name, .. }) => assert_eq!(name, format!("start of coefficient {i}")),
+            Err(Error::OutOfRange { name, .. }) => assert_eq!(name, format!("initial guess of coefficient {i}")),
             other => panic!("{other:?}"),
         }
     }

@@ -189,7 +189,7 @@ impl ParameterSet {
         self.coefficients.iter().map(of).collect()
     }
 
-    /// Integer orders within the bounds, as of a second-order equation with first and zeroth derivatives.
+    /// Integer values of the free orders within their bounds: 2 for the output, and 1 and 0 for its terms, if possible.
     #[must_use]
     pub fn integer_orders(&self) -> Vec<f64> {
         let mut usual: BTreeMap<&String, f64> = BTreeMap::new();

@@ -21,7 +21,7 @@ pub struct Problem {
     pub model: FreeModel,
     /// Friction laws by index of their equation.
     pub frictions: Vec<(usize, FreeFrictionLaw)>,
-    /// Signals of the nonlinear terms: expressions, numbered after the recorded signals.
+    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
 }
 
@@ -115,7 +115,7 @@ impl Problem {
     /// Minimize the cost by Levenberg–Marquardt. If `steady`, a stable model does not become unstable.
     ///
     /// # Errors
-    /// As [`fit_until`], with friction or nonlinear terms [`nonlinear::fit`].
+    /// As [`fit_until`], with friction or non-linear terms [`nonlinear::fit`].
     pub fn minimize(
         &self,
         experiments: &[Experiment],
@@ -163,7 +163,7 @@ impl Problem {
 pub struct Iterate {
     /// Free orders, coefficients and input parameters.
     pub point: ParameterPoint,
-    /// Initial states of each run with friction or nonlinear terms; empty if unknown.
+    /// Initial states of each run with friction or non-linear terms; empty if unknown.
     pub states: Vec<Vec<f64>>,
 }
 
@@ -297,7 +297,7 @@ impl Problem {
         Ok(at.iter().zip(&step).map(|(a, s)| a + share * s).collect())
     }
 
-    /// Highest order of a derivative of a signal in the expressions of nonlinear terms.
+    /// Highest order of a derivative of a signal in the expressions of non-linear terms.
     fn highest_derivative(&self, signal: usize) -> f64 {
         let channels = self.derived.iter().flat_map(|derived| &derived.channels);
         channels.filter(|channel| channel.0 == signal).fold(0.0, |highest, channel| channel.1.max(highest))

@@ -44,7 +44,7 @@ pub struct ParametricTerm {
     pub order: Order,
     /// Coefficient, free or fixed.
     pub coefficient: Coefficient,
-    /// Known factor of the coefficient.
+    /// Factor of the coefficient, a given number.
     pub factor: f64,
 }
 
@@ -149,7 +149,7 @@ impl ParametricEquation {
                 order >= MIN_INPUT_ORDER && order < alpha + MAX_EXCESS - ORDER_TOLERANCE
             };
             if !fits {
-                let what = format!("order {order} of signal {} beside alpha = {alpha}", term.signal);
+                let what = format!("order {order} of signal {} with order alpha = {alpha} of the output", term.signal);
                 return refuse(what, "lower it");
             }
         }
@@ -192,12 +192,12 @@ pub struct Hints {
     pub known: BTreeMap<String, f64>,
 }
 
-/// Structure of a joint fit: equations, bounds, initial terms, input nonlinearities and laws.
+/// Structure of a joint fit: equations, bounds, initial terms, input non-linearities and laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParametricStructure {
     /// Names of the signals, for messages: recorded ones, then derived ones.
     pub signals: Vec<String>,
-    /// Signals of the nonlinear terms: expressions, numbered after the recorded signals.
+    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
     /// One equation per output.
     pub equations: Vec<ParametricEquation>,

@@ -1,4 +1,4 @@
-//! Steps of a nonlinear least-squares problem: problem trait, damped step, secant curvature, valley extrapolation.
+//! Steps of a non-linear least-squares problem: problem trait, damped step, secant curvature, valley extrapolation.
 //!
 //! With an incomplete model the residuals stay large, and in an ill-conditioned valley the second-order part is as
 //! large as JᵀJ. Gauss–Newton then converges slowly. The secant updates of Dennis, Gay & Welsch (NL2SOL,
@@ -325,7 +325,7 @@ fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(V
     back_substitute(r, stride, &shifted)
 }
 
-/// Nonlinear least-squares problem.
+/// Non-linear least-squares problem.
 pub trait LeastSquaresProblem {
     /// Argument of the residuals.
     type Point: Clone;

@@ -1,4 +1,4 @@
-//! Nonlinear least squares with bounds by Levenberg–Marquardt.
+//! Non-linear least squares with bounds by Levenberg–Marquardt.
 //!
 //! Columns are scaled by the column norms of the Jacobian. Steps follow from a QR factor of [J | e] with the damping
 //! below it. A rejected step costs no Jacobian. The problem defines the coordinates and bounds of its parameters.

@@ -1,4 +1,4 @@
-//! Optimization: nonlinear least squares within bounds.
+//! Optimization: non-linear least squares within bounds.
 
 pub mod damped_step;
 pub mod levenberg_marquardt;

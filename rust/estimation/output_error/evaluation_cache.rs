@@ -173,7 +173,7 @@ impl EvaluationCache {
         }
     }
 
-    /// Spectrum of the input of a term of integration order `eta`, after its input nonlinearity, for products of
+    /// Spectrum of the input of a term of integration order `eta`, after its input non-linearity, for products of
     /// [`SPECTRUM_FACTORS`] series.
     pub(crate) fn input_spectrum(
         &mut self,

@@ -146,8 +146,11 @@ impl Experiment {
     pub fn check(&self) -> Result<()> {
         let (m, every) = (self.record.m(), self.pulses_per_sample);
         if every == 0 || m % every != 0 {
-            let what = format!("{m} pulses are no multiple of {every} a sample interval");
-            return Err(Error::Structure { what, remedy: "refine every interval alike".into() });
+            let what = format!("{m} pulses are not a multiple of {every} pulses per sample interval");
+            return Err(Error::Structure {
+                what,
+                remedy: "use the same number of pulses in every sample interval".into(),
+            });
         }
         for (i, samples) in self.samples.iter().enumerate() {
             check_finite(&format!("samples of output {i}"), samples)?;

@@ -169,7 +169,7 @@ impl JumpCorrection {
                 // Nonuniform samples have an exact kink correction instead.
                 let instant = experiment.point_values.get(signal).filter(|_| experiment.nonuniform.is_none())?;
                 if !instant.is_zero_order_hold {
-                    // The kinks behind a free input nonlinearity are unknown.
+                    // The kinks behind a free input non-linearity are unknown.
                     instant.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
                     return Some((experiment.point_deviation(signal).iter().map(|v| -v).collect(), Vec::new()));
                 }

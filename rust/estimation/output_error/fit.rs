@@ -91,7 +91,7 @@ impl Simulation<'_> {
     }
 }
 
-/// Nonlinear least-squares problem of the output error of a model.
+/// Non-linear least-squares problem of the output error of a model.
 struct OutputErrorProblem<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
@@ -397,10 +397,12 @@ fn check_start(model: &FreeModel, start: &ParameterPoint) -> Result<()> {
     for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
         if !coordinate.contains(c) {
             return Err(Error::OutOfRange {
-                name: format!("start of coefficient {i}"),
+                name: format!("initial guess of coefficient {i}"),
                 value: c,
                 range: "its coordinate".into(),
-                remedy: "start a coefficient with logarithmic coordinate away from 0, and a ratio above 1".into(),
+                remedy:
+                    "give a coefficient with logarithmic coordinate a value other than 0, and a ratio a value above 1"
+                        .into(),
             });
         }
     }
@@ -408,10 +410,10 @@ fn check_start(model: &FreeModel, start: &ParameterPoint) -> Result<()> {
     match start.inputs.iter().position(|v| !v.is_finite()) {
         None => Ok(()),
         Some(index) => Err(Error::OutOfRange {
-            name: format!("start of the number of input {index}"),
+            name: format!("initial guess of the delay or limit of input {index}"),
             value: start.inputs[index],
             range: "numbers within its bounds".into(),
-            remedy: "start each delay and limit at a finite number".into(),
+            remedy: "give each delay and limit a finite initial guess".into(),
         }),
     }
 }

@@ -85,7 +85,7 @@ pub(crate) struct Companion {
     step: f64,
     /// Pulse width in seconds.
     width: f64,
-    /// Cached discretizations, shared by all experiments of this pulse width.
+    /// Cache of discretizations, shared by all experiments of this pulse width.
     known: RefCell<Vec<Rc<Discretization>>>,
 }
 

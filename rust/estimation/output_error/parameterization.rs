@@ -177,7 +177,10 @@ impl FreeModel {
                 return refuse(what, "delay and limit inputs only");
             }
             if self.law_of(signal) != Some(k) {
-                return refuse(format!("signal {signal} has two free numbers"), "free one of an input");
+                return refuse(
+                    format!("signal {signal} has two free parameters"),
+                    "free only one parameter of an input",
+                );
             }
             let least = if law == InputLaw::Delay { f64::MIN } else { 0.0 };
             if !(least <= low && low <= high && high.is_finite()) {
@@ -208,7 +211,7 @@ impl FreeModel {
         self.inputs.iter().position(|d| d.signal == signal)
     }
 
-    /// Pulse means of an input after its nonlinearity, and their derivative with respect to its parameter.
+    /// Pulse means of an input after its non-linearity, and their derivative with respect to its parameter.
     pub(crate) fn apply_input_law(
         &self,
         record: &Record,
@@ -293,7 +296,7 @@ fn unrounded_order(law: &AffineOrder, free: &[f64]) -> f64 {
     law.constant + law.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>()
 }
 
-/// Kind of input nonlinearity.
+/// Kind of input non-linearity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputLaw {
     /// Delay by a time \[s\].
@@ -304,19 +307,19 @@ pub enum InputLaw {
     DeadZone,
 }
 
-/// Free parameter of an input nonlinearity.
+/// Free parameter of an input non-linearity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FreeInput {
     /// Index of the input in the record; not an output of an equation.
     pub signal: usize,
-    /// Kind of the nonlinearity.
+    /// Kind of the non-linearity.
     pub law: InputLaw,
     /// Lower and upper bound: \[s\] for a delay, else in the unit of the input.
     pub bounds: (f64, f64),
 }
 
 impl InputLaw {
-    /// Apply the nonlinearity to pulse means; return them and their derivative with respect to the parameter.
+    /// Apply the non-linearity to pulse means; return them and their derivative with respect to the parameter.
     ///
     /// A delay is exact for a zero-order hold, and of second order in the step for linear interpolation. At an integer
     /// number of steps the derivative is one-sided, towards longer delays. Limits act on every pulse separately, which

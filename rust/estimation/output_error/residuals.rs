@@ -293,7 +293,7 @@ impl FreeModel {
         Ok((response, solved))
     }
 
-    /// Pulse means of the input of a term of integration order `eta`, after the input nonlinearity.
+    /// Pulse means of the input of a term of integration order `eta`, after the input non-linearity.
     pub(crate) fn input_means<'a>(
         &self,
         record: &'a Record,
@@ -426,7 +426,7 @@ pub(crate) struct Linearization {
     pub(crate) basis: Vec<Vec<f64>>,
     /// Effects of the linear coefficients.
     pub(crate) linear_effects: Vec<ParameterEffect>,
-    /// Pulse means of each input after its free nonlinearity, and their derivative with respect to its parameter.
+    /// Pulse means of each input after its free non-linearity, and their derivative with respect to its parameter.
     pub(crate) input_means: Vec<(Vec<f64>, Vec<f64>)>,
     /// Direct feedthrough.
     pub(crate) feedthrough: Option<Feedthrough>,

@@ -11,8 +11,8 @@ const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
 const MAX_ANGLE_STEP_RAD: f64 = 0.5;
 /// Difference below which two exponents of s are merged: they are distinguishable only beyond ω = e^1000.
 const EXPONENT_TOLERANCE: f64 = 1e-3;
-/// Computed number of zeros in the right half-plane above which the equation is unstable; a zero on the axis counts
-/// 1/2.
+/// Number of zeros in the right half-plane, as computed, above which the equation is unstable; a zero on the imaginary
+/// axis counts 1/2.
 const MIN_UNSTABLE_ZERO_COUNT: f64 = 0.25;
 
 /// Return true if an equation of order α with autoregressive terms (c, ν) is unstable.

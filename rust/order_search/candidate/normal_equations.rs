@@ -104,7 +104,7 @@ impl NormalEquations {
         (self.record_equations.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
     }
 
-    /// Fixed coefficients by term, `None` for a free coefficient.
+    /// Values of the fixed coefficients by term, `None` for a free coefficient.
     pub(super) fn fixed_coefficients(&self) -> &[Option<f64>] {
         &self.fixed
     }

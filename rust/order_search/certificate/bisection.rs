@@ -109,7 +109,7 @@ pub fn certify(
             name: "largest".into(),
             value: options.max_coefficient,
             range: "[1, 1e9]".into(),
-            remedy: "100 leaves out terms that cancel but for a hundredth".into(),
+            remedy: "a limit of 100 excludes terms that cancel to 1 % of their size".into(),
         });
     }
     let pool = pool(options.threads)?;

@@ -75,7 +75,7 @@ impl BinomialSums {
         Self { eta, sums: sums.collect(), powers: powers.collect() }
     }
 
-    /// Scaled derivative (∂/∂η − μ)^j v_n of the kernel, n = 1 … m.
+    /// Derivative (∂/∂η − μ)^j v_n of the scaled kernel, n = 1 … m.
     fn derivative(&self, j: usize, mu: f64, m: usize) -> Vec<f64> {
         let power = |x: f64| x.powi(i32::try_from(j).unwrap_or(0));
         let double = libm::exp2(self.eta + 1.0);

@@ -1,5 +1,6 @@
-//! Test vectors linearized in the coefficients: built for one candidate, corrected to first order for others. // The
-//! test vector of the candidate with denominator D₀ and output error e₀ is t₀ = D₀⁻ᵀ sign(e₀).
+//! Test vectors linearized in the coefficients: built for one candidate, corrected to first order for others.
+//!
+//! The test vector of the candidate with denominator D₀ and output error e₀ is t₀ = D₀⁻ᵀ sign(e₀).
 //!
 //! A candidate with the same orders of the output terms has D = D₀ − Σ x_m G_m, where the G_m are combinations of the
 //! kernels F_i of these terms. One Newton step for D⁻ᵀ sign(e₀) gives t = t₀ + Σ x_m v_m with v_m = D₀⁻ᵀ G_mᵀ t₀. Then

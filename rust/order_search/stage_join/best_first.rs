@@ -78,7 +78,7 @@ impl Table {
     }
 }
 
-/// Coupled equations prepared for a search, with the data shared by their candidates.
+/// A stage of coupled equations, prepared for a search, with the data shared by their candidates.
 pub struct Stage<'a> {
     lattice: Cow<'a, OrderLawGrid>,
     options: Options,
@@ -299,7 +299,7 @@ impl SearchState {
         if candidates.eq(self.entries.iter().map(Vec::len)) {
             Ok(())
         } else {
-            Err(mismatch_error("a search goes on with another stage than it began with".into()))
+            Err(mismatch_error("the stage is not the one with which the search was created".into()))
         }
     }
 
@@ -325,7 +325,7 @@ impl SearchState {
             Verdict::Failed(_) => true,
         };
         if verdicts.len() != count || !verdicts.iter().all(sound) {
-            return Err(mismatch_error(format!("{} verdicts are not those of {count} candidates", verdicts.len())));
+            return Err(mismatch_error(format!("{} results do not match {count} candidates", verdicts.len())));
         }
         let first_pass = self.pass.0 < stage.tables.len();
         let mut verdicts = verdicts.iter();

@@ -1,5 +1,7 @@
-//! Join of the score tables of coupled equations: compatible orders of the equations under the order law. // The order
-//! law makes all orders functions of a few free orders x, so many tuples x give the same orders of one equation.
+//! Join of the score tables of coupled equations: compatible orders of the equations under the order law.
+//!
+//! The order law makes all orders functions of a few free orders x, so many tuples x give the same orders of one
+//! equation.
 //!
 //! The free orders are divided into two halves, x = (a, b), one for the first equation and one for the others. The
 //! orders of an equation are a contribution of its own half plus an addend from the other half, which has few distinct

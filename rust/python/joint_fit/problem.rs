@@ -92,7 +92,7 @@ impl JointProblem {
         let place = Iterate { point: self.inner.problem.point(&start.0)?, states: to_vectors(start.1) };
         let size = self.inner.problem.size();
         if let Some(index) = held.iter().find(|&&number| number >= size) {
-            let what = format!("number {index} of {size} to be held");
+            let what = format!("the parameter to be fixed has index {index}, but there are {size}");
             return Err(Error::Structure { what, remedy: "count them from 0".into() }.into());
         }
         let (free, settings) = (Arc::clone(&self.inner), MinimizationSettings { evaluations, tolerance });

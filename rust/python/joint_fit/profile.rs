@@ -108,7 +108,7 @@ fn check_surface_points(points: usize) -> Result<(), Error> {
         return Ok(());
     }
     let (name, value) = ("points of a cost surface".into(), points as f64);
-    let (range, remedy) = (format!("[0, {MAX_SURFACE_POINTS}]"), "take fewer, over a part of it".into());
+    let (range, remedy) = (format!("[0, {MAX_SURFACE_POINTS}]"), "use fewer points, over a smaller range".into());
     Err(Error::OutOfRange { name, value, range, remedy })
 }
 

@@ -335,6 +335,6 @@ pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
         }
     });
     decoded.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
-        mismatch_error(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
+        mismatch_error(format!("{} bytes of values and {} of kinds do not match", values.len(), kinds.len()))
     })
 }

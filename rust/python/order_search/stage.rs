@@ -95,8 +95,8 @@ impl StageSearch {
     fn course<T>(&self, work: impl FnOnce(&mut SearchState) -> Result<T, Error>) -> Result<T, Error> {
         let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
         let state = course.as_mut().ok_or_else(|| Error::Structure {
-            what: "this search only follows candidates".into(),
-            remedy: "make one that keeps its course".into(),
+            what: "this search stores no state".into(),
+            remedy: "create a search with a state".into(),
         })?;
         work(state)
     }

@@ -193,7 +193,7 @@ pub(super) fn check_linear(structure: &ParametricStructure, item: &ParametricEqu
     }
     let output = &structure.signals[item.output];
     Err(Error::Structure {
-        what: format!("the equation of {output} has friction, which {what} does not know"),
+        what: format!("the equation of {output} has friction, which {what} does not support"),
         remedy: "rank by the output error, or remove the friction".into(),
     })
 }

@@ -348,7 +348,7 @@ fn loaded_body_guesses(
         at.extend(free.coefficients.iter().cloned().zip(free.free_from(&candidate)));
         let named: Vec<String> = shares.iter().map(|share| format_general(*share, 6)).collect();
         let carried = if together { named[0].clone() } else { named.join(" and ") };
-        let words = format!("{}{each} by itself, carrying {carried} of its inertia", outputs.join(" and "));
+        let words = format!("{}{each} separately, with {carried} times its own inertia", outputs.join(" and "));
         guess_at(free, &at, words)
     };
     shares.into_iter().map(guess).collect()

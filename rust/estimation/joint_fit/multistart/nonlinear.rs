@@ -1,7 +1,7 @@
-//! Multistart for equations with nonlinear terms: linear fits with the measured values of the expressions.
+//! Multistart for equations with non-linear terms: linear fits with the measured values of the expressions.
 //!
 //! With measured values a derived signal is one more input, and the order grids of linear equations give initial
-//! guesses, ranked by simulations of the nonlinear equations. Derivatives of measured signals are taken of raw and of
+//! guesses, ranked by simulations of the non-linear equations. Derivatives of measured signals are taken of raw and of
 //! smoothed samples. With friction, output-error fits of these equations are the guesses. Without friction such fits
 //! add guesses only if no other guess reaches the noise level. The same holds for fits without the non-linear terms.
 
@@ -31,7 +31,7 @@ const SMOOTHING_HALF_WIDTH: usize = 15;
 /// Finest grid of the initial guesses, in block pulses per sampling interval.
 const MAX_START_PULSES_PER_SAMPLE: usize = 4;
 
-/// Run the multistart of a problem with nonlinear terms; return the candidates best first.
+/// Run the multistart of a problem with non-linear terms; return the candidates best first.
 ///
 /// # Errors
 /// As [`run_multistart`]; [`crate::error::Error::Interrupted`].
@@ -119,7 +119,7 @@ fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> 
     candidates.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
 }
 
-/// Problem without the nonlinear terms; None if an equation has only non-linear terms.
+/// Problem without the non-linear terms; None if an equation has only non-linear terms.
 fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterSet> {
     let recorded = structure.recorded_count();
     let of = |item: &ParametricEquation| {
