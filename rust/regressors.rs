@@ -354,7 +354,7 @@ pub enum Key {
 }
 
 impl Key {
-    /// Key of I^eta of a signal.
+    /// Key under which the regressor I^eta of a signal is stored.
     #[must_use]
     pub fn integral(signal: usize, eta: f64) -> Self {
         Self::Integral { signal, order: grains(eta) }

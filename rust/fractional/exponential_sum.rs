@@ -148,7 +148,7 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
 pub fn integral_by_memory(x: &[f64], order: f64, step: f64, tolerance: f64) -> Result<(Vec<f64>, usize)> {
     check_finite("samples", x)?;
     if !(order > 0.0 && order <= 1.0) {
-        let (range, remedy) = ("(0, 1]".into(), "integrate whole orders apart".into());
+        let (range, remedy) = ("(0, 1]".into(), "integrate integer orders separately".into());
         return Err(Error::OutOfRange { name: "order".into(), value: order, range, remedy });
     }
     #[allow(clippy::cast_precision_loss)]

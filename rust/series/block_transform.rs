@@ -125,7 +125,7 @@ impl simd::SimdKernel for ForwardTransform<'_> {
     }
 }
 
-/// Write the transform of up to 128 terms to every `stride`-th tile.
+/// Write the transform of up to 128 terms to every `stride`-th tile (group of frequencies).
 pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
     let (blocks, rest) = terms.as_chunks();
     let mut padded = [0.0; BLOCK_TERMS];

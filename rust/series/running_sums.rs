@@ -160,7 +160,7 @@ impl RunningSumSystem {
         out
     }
 
-    /// Weights of a source in each sum.
+    /// Weights with which a source enters each running sum.
     fn weights(&self, source: &Source) -> Vec<f64> {
         running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect()
     }

@@ -445,7 +445,7 @@ def test_the_command_line_names_filtered_signals():
     assert built == ftlm.equation(WORDS, sensor_filter=sensor(("y", "v")))
     assert StructureOptions(filtered_signals=["v"]).structure(WORDS).sensor_filter == ftlm.SensorFilter.low_pass(["v"])
     for options, text, words in [
-        ({"sensor_filter": "2"}, WORDS, "--sensor-filter is of signals that --filtered-signals names"),
+        ({"sensor_filter": "2"}, WORDS, "--sensor-filter applies to the signals of --filtered-signals"),
         (
             {"filtered_signals": ["y"], "sensor_filter": "slow"},
             WORDS,

@@ -251,7 +251,7 @@ def test_an_offset_that_is_the_input_or_that_a_method_lacks_is_refused():
         assert c.coefficients["b"] / c.coefficients["a"] == pytest.approx(1.0, rel=0.02)
     with pytest.raises(ftlm.ModelError, match="the genetic baseline does not estimate an offset"):
         ftlm.identify(fractional_run(1, 0.5), structure, method=ftlm.GeneticAlgorithm(seeds=(1,)))
-    with pytest.raises(ftlm.ModelError, match="cannot be followed in a stream"):
+    with pytest.raises(ftlm.ModelError, match="not supported in a stream"):
         Streaming(structure, step=0.1, longest=10.0, inputs=("u",))
 
 

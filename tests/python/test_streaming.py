@@ -129,7 +129,7 @@ def test_an_estimate_that_fails_does_not_stop_the_run(stage):
     ("structure", "options", "words"),
     [
         (ftlm.flexible_link(form="published", stage=1), {}, "are free; a stream needs numbers"),
-        (ftlm.equation("D^1.5 y = b u", initial="caputo"), {}, "cannot be followed in a stream"),
+        (ftlm.equation("D^1.5 y = b u", initial="caputo"), {}, "not supported in a stream"),
         (ftlm.equation("D^2.5 y = b u"), {}, "outside [0, 2]"),
         (
             ftlm.equation("D^1.5 y = b u"),

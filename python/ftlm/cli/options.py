@@ -161,7 +161,7 @@ class StructureOptions:
         if not self.filtered_signals:
             if self.sensor_filter is not None:
                 raise ModelError(
-                    "--sensor-filter is of signals that --filtered-signals names; name them, or leave it out"
+                    "--sensor-filter applies to the signals of --filtered-signals; name them, or leave it out"
                 )
             return None
         if self.sensor_filter in (None, "stock"):
@@ -203,7 +203,7 @@ class StructureOptions:
             raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
         if self.filtered_signals or self.sensor_filter not in (None, "stock"):
             raise ModelError(
-                "--filtered-signals and --sensor-filter HZ are of equations in words; the flexible link has "
+                "--filtered-signals and --sensor-filter HZ apply to equations in words; the flexible link has "
                 "--sensor-filter stock"
             )
         laws: dict[str, Sequence[Law]] = {

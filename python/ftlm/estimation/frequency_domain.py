@@ -269,7 +269,7 @@ def _structure(
     if fixed:
         check_known("fixed coefficient", fixed, target.coefficient_names)
     target = target.with_delays(delay or {}).with_orders(orders or {}).with_coefficients(fixed or {})
-    lacking = "which a frequency response does not know"
+    lacking = "which a fit of a frequency response does not support"
     if target.has_friction:
         raise ModelError(f"the equations have friction, {lacking}; identify runs over time, or leave it out")
     check_linear(target.equations, "a frequency response")

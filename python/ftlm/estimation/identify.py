@@ -540,7 +540,7 @@ def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
     if structure.has_friction:
         raise ModelError(
             f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the test of "
-            f"{parameter('offset', 'auto')} does not know; use {parameter('offset', 'constant')}, whose interval "
+            f"{parameter('offset', 'auto')} does not support; use {parameter('offset', 'constant')}, whose interval "
             f"says whether it is 0, or {parameter('offset', 'none')}"
         )
     check_linear(structure.equations, f"the test of {parameter('offset', 'auto')}")

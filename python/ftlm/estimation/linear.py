@@ -385,7 +385,7 @@ class Streaming:
             )
         if structure.offset != "none":
             raise ModelError(
-                f"{setting('offset')} {structure.offset!r} cannot be followed in a stream; identify the recorded "
+                f"{setting('offset')} {structure.offset!r} is not supported in a stream; identify the recorded "
                 f"run, or use {parameter('offset', 'none')}"
             )
         if (
@@ -395,7 +395,7 @@ class Streaming:
             or structure.initial not in ("auto", "rest")
         ):
             raise ModelError(
-                "delays, limits, initial terms and sensor filters cannot be followed in a stream; identify the "
+                "delays, limits, initial terms and sensor filters are not supported in a stream; identify the "
                 "recorded run"
             )
         self.signals = tuple(structure.signals)

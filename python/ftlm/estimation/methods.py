@@ -287,7 +287,7 @@ class OutputError:
         if self.reference is not None and structure.has_friction:
             raise ModelError(
                 f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the "
-                f"instrument {parameter('reference', self.reference)} does not know; leave one of the two out"
+                f"instrument {parameter('reference', self.reference)} does not support; leave one of the two out"
             )
         if self.reference is not None:
             check_linear(structure.equations, f"the instrument {parameter('reference', self.reference)}")

@@ -395,7 +395,7 @@ def _resolve_unit(
             )
         if unit is not None and unit != option:
             raise DataError(
-                f"column {item.column.name!r} states {unit}, and {parameter(f'{what}_unit', option)} is asked for; "
+                f"column {item.column.name!r} states {unit}, and {parameter(f'{what}_unit', option)} is given; "
                 f"leave {parameter(f'{what}_unit')} out, or rename the column"
             )
         return option

@@ -222,8 +222,8 @@ class Pool:
             columns, why = self._clocks(table, signals)
             if len(columns) > 1 and table.runs:
                 raise DataError(
-                    f"{table.path.name} holds {len(table.runs)} runs, a group with a time each; give the path of one, "
-                    f"as in {str(table.path / table.runs[0])!r}; the groups are {join_names(table.runs)}"
+                    f"{table.path.name} holds {len(table.runs)} runs, each in a group with its own time; give the "
+                    f"path of one, as in {str(table.path / table.runs[0])!r}; the groups are {join_names(table.runs)}"
                 )
             if len(columns) > 1:
                 raise DataError(

@@ -379,7 +379,7 @@ def optimizers(reproduction: Reproduction) -> Evidence:
 
 
 def manual(reproduction: Reproduction) -> Evidence:
-    """Return whether p = 7 is closer to the run than the manual's model, if the simulated arms agree."""
+    """Return whether the model with p = 7 has a smaller error than the manual's model, if the simulated arms agree."""
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
     return _of_trials(reproduction.panel.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
         "errors": _by_prior(reproduction, lambda t: (t.manual, t.nr)),

@@ -365,8 +365,8 @@ class Equation:
         alpha = self.order.constant
         if not 1 < alpha <= 2:
             raise ModelError(
-                f"{words} acts on its velocity, but alpha = {alpha:g} is outside (1, 2]; of a measured speed write "
-                f"'- fc*tanh(100 {self.output})', or choose another order"
+                f"{words} requires an order alpha in (1, 2], not {alpha:g}, because it depends on the velocity; choose "
+                f"another order, or write '- fc*tanh(100 {self.output})' if {self.output} is itself a velocity"
             )
 
     def check_input_orders(self, outputs: Sequence[str]) -> None:

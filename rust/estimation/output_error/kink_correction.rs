@@ -94,7 +94,7 @@ impl KinkCorrection {
         })
     }
 
-    /// Correction of the weighted samples.
+    /// Kink correction of the weighted output samples of one experiment, concatenated over the outputs.
     pub(crate) fn weighted_correction(
         &self,
         model: &FreeModel,

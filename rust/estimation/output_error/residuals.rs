@@ -289,7 +289,8 @@ impl FreeModel {
             SystemInverse::from_matrix(matrix)
         })?;
         let response = solved.solve_by_division(&rhs)?;
-        let response = response.ok_or_else(|| Error::Internal { what: "equations that nothing divides".into() })?;
+        let response =
+            response.ok_or_else(|| Error::Internal { what: "equations without a solution by division".into() })?;
         Ok((response, solved))
     }
 

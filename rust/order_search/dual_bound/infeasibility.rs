@@ -215,7 +215,7 @@ impl InfeasibilityProof {
         [ratios, size, slack]
     }
 
-    /// Assemble the weighted quadratic form. Its inequalities are equalities at the current point.
+    /// Assemble the weighted sum of the quadratic inequalities, each with equality at the current point.
     #[inline(always)]
     fn assemble(&mut self, states: &[[Wide; 3]], smallest: f64) {
         let k = self.unknowns;

@@ -90,7 +90,7 @@ pub(crate) struct LinearizedVector {
     center: Vec<f64>,
     /// Coefficients of the kernels in the basis: F_i = G_i + Σ_{j<i} mix[i·k + j] G_j.
     mix: Vec<f64>,
-    /// Largest magnitude of each correction v_m.
+    /// Largest magnitude of each first-order correction vector v_m of the test vector.
     peak_values: Vec<f64>,
     solution_residuals: Vec<f64>,
     /// Upper bound of Σ|g_m| of the series of G_m and of its components, times the largest norm.

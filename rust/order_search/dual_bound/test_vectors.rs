@@ -463,8 +463,10 @@ impl TestVectors {
         (bounds, guesses)
     }
 
-    /// Upper bound of ‖Σ c (Fᵀt − g t)‖ for output columns whose coefficients may cancel. The sum of all coefficients
-    /// multiplies the first row. Each partial sum multiplies the path length to the next row.
+    /// Upper bound of ‖Σ c (Fᵀt − g t)‖ over the output columns of a group, whose coefficients c may cancel.
+    ///
+    /// By summation by parts, the sum of all coefficients multiplies the norm of the first column, and each partial sum
+    /// multiplies the length of the path to the next column.
     #[inline(always)]
     fn joint_slack(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {
         for i in 1..own.len() {

@@ -323,7 +323,10 @@ pub(super) fn law_candidates(
                 let value_of =
                     |name: &String| values_by_name.get(name).or(rest.coefficients.get(name)).copied().unwrap_or(ratio);
                 let coefficients = free.coefficients.iter().map(value_of).collect();
-                let words = format!("{origin}, by the law at {}", format_general(ratio, 6));
+                let words = format!(
+                    "{origin}, by the coefficient law with its free parameters at {}",
+                    format_general(ratio, 6)
+                );
                 attempts.push(new_candidate(row.values(&free.orders), coefficients, &words));
             }
         }

@@ -15,8 +15,8 @@ pub(super) const MAX_REFITS_PER_BOUND: usize = 40;
 const MAX_BOUND_DISTANCE: f64 = 1e3;
 /// Smallest first step, relative to the Wald half-width.
 const MIN_FIRST_STEP_RATIO: f64 = 0.01;
-/// A bracket is narrow if its width is [`BOUND_TOLERANCE`] times the value inside it, or times this fraction of the
-/// distance.
+/// A bracket is narrow if its width is [`BOUND_TOLERANCE`] times the value inside it, or times this fraction of its
+/// distance from the optimum.
 const BRACKET_SCALE_RATIO: f64 = 0.1;
 /// Smallest factor by which the distance from the optimum grows in one step.
 const MIN_STEP_FACTOR: f64 = 1.1;
@@ -48,7 +48,8 @@ impl Interval {
         Self { low: f64::NEG_INFINITY, high: f64::INFINITY, points: Vec::new(), evaluations: 0 }
     }
 
-    /// Interval on the extrapolated grid, within the bounds of its parameter.
+    /// Interval shifted by the difference between the optima on the extrapolated grid and on the profile grid, then
+    /// limited to the bounds of its parameter.
     pub(super) fn shift(mut self, by: f64, (low, high): (f64, f64)) -> Self {
         for end in [&mut self.low, &mut self.high].into_iter().filter(|end| end.is_finite()) {
             *end = (*end + by).clamp(low, high);
