@@ -210,7 +210,7 @@ BAD = [
     (("identify", "square.csv", *SEARCH, "--m", "4096"), 2, "4096"),
     (("identify", "square.csv", *SEARCH, "--m", "1000", "--method", "multi-innovation"), 2, "power of two"),
     (("identify", "square.csv", *SEARCH, "--threads", "0"), 2, "threads"),
-    (("identify", "square.csv", *SEARCH, "--top", "0"), 2, "keep"),
+    (("identify", "square.csv", *SEARCH, "--top", "0"), 2, "choose the number of rows"),
     (("identify", "square.csv", *SEARCH, "--window", "5"), 2, "--window"),
     (("identify", "square.csv", *SEARCH, "--window", "5:4"), 3, "--window"),
     (("identify", "square.csv", *SEARCH, "--orders", "alhpa=1.5"), 2, "alpha"),

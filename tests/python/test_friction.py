@@ -241,8 +241,8 @@ def test_words_are_read_and_written() -> None:
         ("D^2 y = u - fc*sign(D u)", "velocity of the output of the equation"),
         ("D^2 y = u - fc*sign(y)", "of a measured speed .*fc.tanh"),
         ("D^2 y = u - fc*sign(D y) - fs*sign(D y)", "twice"),
-        ("D^0.8 y = u - fc*sign(D y)", r"outside \(1, 2\]"),
-        ("D^2.2 y = u - fc*sign(D y)", r"outside \(1, 2\]"),
+        ("D^0.8 y = u - fc*sign(D y)", r"requires an order alpha in \(1, 2\]"),
+        ("D^2.2 y = u - fc*sign(D y)", r"requires an order alpha in \(1, 2\]"),
         ("D^2 y = D^2 u - fc*sign(D y)", "not below alpha"),
     ],
 )

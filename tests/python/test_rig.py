@@ -498,7 +498,7 @@ def test_what_a_killed_program_left_is_kept(tmp_path, capsys):
     left = tmp_path / "run.csv.partial"
     left.write_text("rows", encoding="utf-8")
     assert command("record", "--duration", 1, "-o", tmp_path / "run.csv") == 3
-    assert "did not end" in capsys.readouterr().err
+    assert "was interrupted" in capsys.readouterr().err
     assert left.read_text(encoding="utf-8") == "rows"
     assert command("record", "--duration", 1, "-o", tmp_path / "run.csv", "--force") == 0
     assert not left.exists()

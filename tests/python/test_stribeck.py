@@ -216,7 +216,7 @@ def test_words_are_read_and_written() -> None:
     ("words", "said"),
     [
         (f"D^2 y = u {NEAR}", r"add '- fc\*sign\(D y\)'"),
-        (f"{BLOCK} {NEAR.replace('fs', 'fs2')}", "Stribeck friction of D y stands there twice"),
+        (f"{BLOCK} {NEAR.replace('fs', 'fs2')}", "Stribeck friction of D y occurs twice"),
         ("D^2 y = u - fc*sign(D y) + fs*exp(-(D y/vs)^2)*sign(D y)", "it is subtracted"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D u)", "velocity of the output of the equation"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D u/vs)^2)*sign(D y)", "follows one velocity"),
@@ -227,7 +227,7 @@ def test_words_are_read_and_written() -> None:
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)", "'vs' at character 41 divides inside a non-linear term"),
         ("D^2 y = u - fc*sign(D y) - fs*exp(-(D y/0)^2)*sign(D y)", "vs = 0; give a positive one"),
         ("D^2 y = u - fc*sign(D y) - fc*exp(-(D y/vs)^2)*sign(D y)", "fc occurs twice"),
-        ("D^0.8 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)", r"outside \(1, 2\]"),
+        ("D^0.8 y = u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)", r"requires an order alpha in \(1, 2\]"),
     ],
 )
 def test_words_that_mean_nothing_are_refused(words: str, said: str) -> None:
