@@ -183,7 +183,7 @@ def test_what_is_printed_is_read(structure):
         ("y = 1/(s + 1", "expected ')' at character 13"),
         ("D y - D y = u", "D^1 y cancels out"),
         ("u = D y", "its left-hand side has no derivative"),
-        ("y' + c = u", "the offset 'c' at character 6 stands on the left-hand side"),
+        ("y' + c = u", "the offset 'c' at character 6 is on the left-hand side"),
         ("D y = a*3 y", "3 at character 9 follows the coefficient a"),
     ],
 )

@@ -225,7 +225,7 @@ def test_words_say_an_offset_and_are_printed_back():
         (lambda: ftlm.equation("D y = -a y + 3.7"), "an offset is unknown: write '\\+ c'"),
         (lambda: ftlm.equation("D y = -a y + 3.7 + b u"), "3.7 at character 14 is a constant without a signal"),
         (lambda: ftlm.equation("D y = -a y - c"), "has a sign, but an unknown constant has its own"),
-        (lambda: ftlm.equation("D y = -a y + c + c0"), "stands there twice"),
+        (lambda: ftlm.equation("D y = -a y + c + c0"), "occurs twice"),
         (lambda: ftlm.equation("D x = a x + c; D y = b y"), "the equation of x has an offset, that of y has none"),
         (lambda: ftlm.equation("D y = -a y + c", offset="none"), "has an offset, but offset='none'"),
         (lambda: ftlm.equation("D y = -a y", offset="some"), "use 'none', 'level', 'constant', 'ramp' or 'auto'"),

@@ -328,8 +328,8 @@ class EquationParser:
     def _take_offset(self, sign: float, *, is_lhs: bool) -> None:
         _, value, at = self._peek()
         if self.offset or sign < 0 or is_lhs:
-            reason = "stands there twice" if self.offset else "has a sign, but an unknown constant has its own"
-            reason = "stands on the left-hand side" if is_lhs else reason
+            reason = "occurs twice" if self.offset else "has a sign, but an unknown constant has its own"
+            reason = "is on the left-hand side" if is_lhs else reason
             raise self._error(
                 f"the offset {value!r} at character {at + 1} {reason}; write '+ c' once, on the right-hand side"
             )
