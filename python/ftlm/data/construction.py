@@ -190,7 +190,10 @@ class RunArguments:
                 )
                 continue
             if is_missing[0]:
-                what, remedy = "no value before which there is none to hold", "begin where the input is known, with "
+                what, remedy = (
+                    "no value, and there is no earlier value to hold",
+                    "begin where the input is known, with ",
+                )
                 raise masked_rows_error(self.label_of(name), what, is_missing, remedy + parameter("window"))
             out[name] = fill_input_gaps(values, behaviour[name])
             how = "its last value was held" if behaviour[name] == ZERO_ORDER_HOLD else "a straight line was drawn"

@@ -38,7 +38,7 @@ from ftlm.structure.input_nonlinearity import InputEffect, input_name
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Offset, Structure
 from ftlm.utils.linalg import orthonormal
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
+from ftlm.utils.statistics import ROUNDING_RESIDUAL_RATIO
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, simulate_runs
 from ftlm.validation.residual_tests import (
@@ -167,7 +167,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
     are tested only for intersample behavior.
     """
     joint, structure, runs = fit.joint, fit.task.structure, as_runs(fit.task.runs)
-    large = [o for o in tests.outputs.values() if not o.nr <= NEGLIGIBLE_RESIDUAL_SHARE]
+    large = [o for o in tests.outputs.values() if not o.nr <= ROUNDING_RESIDUAL_RATIO]
     colored = any(not o.whiteness.passed or o.follows_direction for o in large)
     is_excluded = structure.has_friction or structure.limits or structure.free_inputs
     if joint is None or not joint.names or not colored or is_excluded:
@@ -490,7 +490,7 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
 
 
 def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs: Runs) -> list[Extension]:
-    """Return the structure with a constant load that sets in at an unknown time; [] for several or irregular runs.
+    """Return the structure with a constant load that starts at an unknown time; [] for several or irregular runs.
 
     From the parameters of each of `starts`, the step is put at the time at which a load, with the parameters adapted to
     it, explains most of the residuals. The model is fitted again, until the time does not change.

@@ -37,7 +37,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, chi_squared_99, is_white
+from ftlm.utils.statistics import ROUNDING_RESIDUAL_RATIO, chi_squared_99, is_white
 from ftlm.utils.validation import Floats, as_floats, check_known, real_number
 from ftlm.validation.information_criteria import InformationCriteria, criteria_of_likelihood
 
@@ -193,7 +193,7 @@ def _fit_response(
     if count <= numbers:
         raise DataError(
             f"{count // 2} frequencies give {count} values, and {numbers} parameters are free "
-            f"({', '.join(problem.names)}); measure more frequencies, or fix numbers"
+            f"({', '.join(problem.names)}); measure more frequencies, or fix parameters"
         )
     if isinstance(progress, Progress):
         progress.expect(
@@ -245,7 +245,7 @@ def _fit_response(
         kind,
         (reached, len(fits)),
         active_bounds,
-        exact=best.cost <= NEGLIGIBLE_RESIDUAL_SHARE**2 * total,
+        exact=best.cost <= ROUNDING_RESIDUAL_RATIO**2 * total,
         ends=ends,
     )
 

@@ -65,7 +65,7 @@ from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.formatting import finite
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import run_in_worker
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE
+from ftlm.utils.statistics import ROUNDING_RESIDUAL_RATIO
 from ftlm.utils.validation import Floats, check_threads
 from ftlm.validation.comparison import (
     MAX_NORMALIZED_RESIDUAL,
@@ -721,7 +721,7 @@ def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     if fit.joint is None:
         return residual_findings(tests)
     codes = ("output_not_white", "noise_coloured")
-    return [f for f in residual_findings(tests, floor=NEGLIGIBLE_RESIDUAL_SHARE) if f.code not in codes]
+    return [f for f in residual_findings(tests, floor=ROUNDING_RESIDUAL_RATIO) if f.code not in codes]
 
 
 def _estimate(

@@ -41,7 +41,7 @@ from ftlm.utils.linalg import (
     triangular_factor,
 )
 from ftlm.utils.statistics import (
-    NEGLIGIBLE_RESIDUAL_SHARE,
+    ROUNDING_RESIDUAL_RATIO,
     SIGNIFICANCE_LEVEL,
     chi_squared,
     is_white,
@@ -101,7 +101,7 @@ class OffsetTest:
     share: float
     size: float
 
-    def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = NEGLIGIBLE_RESIDUAL_SHARE) -> bool:
+    def exceeds(self, level: float = SIGNIFICANCE_LEVEL, *, size: float = ROUNDING_RESIDUAL_RATIO) -> bool:
         """Whether the statistic is significant at `level` and the effect is larger than `size`.
 
         An effect larger than the standard deviation of the output counts as significant, because noise of any color
@@ -496,9 +496,9 @@ def refit_if_accepted(
 ) -> JointFit | None:
     """Return the refit of a linear structure with other initial conditions or offsets; None if rejected or failed.
 
-    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The
-    residuals, multiplied by a share, are an optimistic estimate of those of a complete fit. Then follow a fit on the same grid and, with `refine`, one with a refined step. Each is made only if `accepts`
-    accepts the result before.
+    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The residuals,
+    multiplied by a share, are an optimistic estimate of those of a complete fit. Then follow a fit on the same grid
+    and, with `refine`, one with a refined step. Each is made only if `accepts` accepts the result before.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]

@@ -25,7 +25,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import format_bound
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import memory_limit, stop_flag
-from ftlm.utils.statistics import NEGLIGIBLE_RESIDUAL_SHARE, NORMAL_95
+from ftlm.utils.statistics import NORMAL_95, ROUNDING_RESIDUAL_RATIO
 from ftlm.utils.validation import Floats
 
 Loss = Literal["squares", "huber"]
@@ -225,7 +225,7 @@ class JointFit:
     def exact_outputs(self, runs: Sequence[Run]) -> set[str]:
         """Return the outputs whose residuals are negligible: errors of rounding and discretization, not noise."""
         sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in self.noise}
-        return {o for o, noise in self.noise.items() if noise <= NEGLIGIBLE_RESIDUAL_SHARE * sizes[o]}
+        return {o for o, noise in self.noise.items() if noise <= ROUNDING_RESIDUAL_RATIO * sizes[o]}
 
     @property
     def names(self) -> list[str]:

@@ -468,7 +468,8 @@ def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
     if poles.origin_order > 0 and drifting:
         raise ModelError(
             f"the model integrates its input (order {poles.origin_order:g}), so that {drifting[0]} may drift without "
-            f"limit; say how far it may go by {parameter('limits')}, or give {parameter('reference_run')} a run"
+            f"limit; give its largest acceptable value with {parameter('limits')}, or give "
+            f"{parameter('reference_run')} a run"
         )
 
 

@@ -264,8 +264,8 @@ class Timestamps:
         starts, ends = (m.astype("datetime64[D]").astype(np.int64) for m in (months, months + 1))
         bad = (month < 1) | (month > 12) | (day < 1) | (day > ends - starts)
         if bad.any():
-            remedy = f"correct these rows, or say the order of day and month with {layout_parameter(dates='dmy')}"
-            raise masked_rows_error(thing, "a date that is none", bad, remedy)
+            remedy = f"correct these rows, or give the order of day and month with {layout_parameter(dates='dmy')}"
+            raise masked_rows_error(thing, "an invalid date", bad, remedy)
         days = starts + day - 1
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 

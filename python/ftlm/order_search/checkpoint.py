@@ -375,7 +375,7 @@ class Store:
         """Return the error for a search that another version of ftlm began and this version cannot resume."""
         content = self.contents
         return DataError(
-            f"store {self.path} is of ftlm {content.version}, whose rounds follow algorithm {content.algorithm}; this "
+            f"store {self.path} is of ftlm {content.version}, whose rounds use algorithm {content.algorithm}; this "
             f"version's is {ALGORITHM_VERSION}: finish the search with that version, or start it again in another file"
         )
 

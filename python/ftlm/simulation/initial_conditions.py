@@ -18,10 +18,10 @@ from ftlm.data.sampling import drop_missing
 from ftlm.structure.structure import History, Initial, Structure
 from ftlm.utils.linalg import vector_norm
 from ftlm.utils.statistics import (
-    NEGLIGIBLE_RESIDUAL_SHARE,
     NOISE_SAMPLES,
     REST_SHARE,
     REST_SIGMAS,
+    ROUNDING_RESIDUAL_RATIO,
     chi_squared,
     estimate_noise,
     huber_excess,
@@ -351,7 +351,7 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
     excess = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
         is_finite = ~np.isnan(one)
-        if float(np.sqrt(np.mean(one[is_finite] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
+        if float(np.sqrt(np.mean(one[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * size:
             excess += huber_excess(one[is_finite], other[is_finite])
     return excess
 
@@ -362,7 +362,7 @@ def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequenc
     for one, other, size in zip(few, many, sizes, strict=True):
         is_finite = ~np.isnan(one)
         floor, above = float(np.mean(other[is_finite] ** 2)), float(np.sum(one[is_finite] ** 2 - other[is_finite] ** 2))
-        if math.sqrt(float(np.mean(one[is_finite] ** 2))) > NEGLIGIBLE_RESIDUAL_SHARE * size:
+        if math.sqrt(float(np.mean(one[is_finite] ** 2))) > ROUNDING_RESIDUAL_RATIO * size:
             squares += above / floor if floor > 0.0 else math.inf
     return max(misfit(few, many, sizes), SQUARES_WEIGHT * squares)
 

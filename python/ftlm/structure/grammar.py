@@ -877,7 +877,9 @@ class EquationParser:
         names = sorted(name for _, name, _ in terms if name is not None)
         twice = next((a for a, b in pairwise(names) if a == b), None)
         if twice is not None:
-            raise self._error(f"{twice} stands in several terms once multiplied out; give each term a name of its own")
+            raise self._error(
+                f"{twice} occurs in several terms after multiplication; give each term its own coefficient name"
+            )
         return sorted(_add_known(terms), key=lambda term: term[1] is not None)
 
 

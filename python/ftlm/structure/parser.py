@@ -248,7 +248,8 @@ def _merge_delays(parsed: Sequence[EquationParser], explicit_delays: Mapping[str
     for signal, delay in chain.from_iterable(words.delays.items() for words in parsed):
         if delays.setdefault(signal, delay) != delay:
             raise ModelError(
-                f"{signal} has two delays in these equations; give the input that comes later a name of its own"
+                f"{signal} has two delays in these equations; give the input with the longer delay its own name, "
+                "and its own signal in the run"
             )
     late = {signal: delay for signal, delay in delays.items() if delay != 0.0}
     twice = next((signal for signal in explicit_delays if signal in late), None)

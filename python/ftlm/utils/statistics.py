@@ -18,7 +18,7 @@ REST_SHARE = 1e-3
 #: Median absolute deviation of a normal variable in standard deviations.
 MAD_OVER_SIGMA = 0.6744897501960817
 #: Residuals below this share of an output's standard deviation are rounding and discretization errors.
-NEGLIGIBLE_RESIDUAL_SHARE = 3e-5
+ROUNDING_RESIDUAL_RATIO = 3e-5
 #: Huber threshold in standard deviations: 95 % efficiency under normal noise.
 HUBER_THRESHOLD = 1.345
 #: Significance level of tests.

@@ -157,7 +157,7 @@ impl<'a> FitProblem<'a> {
 
     /// Objective with equal weights of all outputs relative to their standard deviations.
     ///
-    /// The noise levels determine the optimum, but are not needed to approach it.
+    /// The optimum depends on the noise levels, but a search far from it does not need them.
     fn equally_weighted_grid(&self, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
         let weights = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
         self.grid(weights, sampling, refine)
@@ -365,7 +365,8 @@ fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -
     Ok((runner.with_result(attempt), grid))
 }
 
-/// Best survivor on all samples; of long records the best one on their first part continues alone.
+/// Best survivor of the multistart on all samples. For long records, only the best survivor on their first part is
+/// fitted to all samples.
 fn select_on_part(
     sought: FitProblem<'_>,
     contenders: &[Candidate],

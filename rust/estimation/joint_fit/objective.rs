@@ -48,7 +48,7 @@ pub struct Objective<'a> {
     pub requires_stability: bool,
     /// Relative decrease of the cost by a full step below which an optimization has converged.
     tolerance: f64,
-    /// Mask of the present samples, by run and output; empty without missing samples.
+    /// Weight 1 of the present and 0 of the missing samples, by run and output; empty without missing samples.
     sample_mask: Arc<Vec<Vec<Vec<f64>>>>,
     experiments: Arc<Vec<Experiment>>,
 }

@@ -174,7 +174,8 @@ fn integer_order_optima(
 
 /// Optimize a submodel from its own initial guesses; the best `going` of them continue.
 ///
-/// The second budget is for optima that can compete with a cost per residual of `level`, that of the full problem. Of integer orders the leading intervals of long records suffice. Empty if two of its terms coincide.
+/// The second budget is for optima that can compete with `level`, the cost per residual of the full problem, and for
+/// the best one. For integer orders the leading intervals of long records suffice. Empty if two of its terms coincide.
 fn optimize_submodel(
     free: &ParameterSet,
     course: MultistartContext<'_>,
