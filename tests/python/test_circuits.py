@@ -184,6 +184,8 @@ def test_an_exponent_ends_at_1_and_bounds_are_kept():
         ("R0-p(R1,X1)", {}, r"'X1' is not an element; known: R \(resistor\), C \(capacitor\), L \(inductor\), CPE"),
         ("R0-p(R1,C1", {}, "a parenthesis is not closed"),
         ("R0-R0", {}, "two elements are R0; number them"),
+        ("R0-p(R1)", {}, r"joins two or more elements in parallel, and one has a single branch; write p\(R1,C1\)"),
+        ("R0-p(R1-C1)", {}, "joins two or more elements in parallel"),
         ("R0-p(R1,C1))", {}, r"'\)' is out of place"),
         ("R0-", {}, "ends where an element is expected"),
         ("R0+C1", {}, "has an invalid character; write it as in"),

@@ -417,7 +417,7 @@ def test_an_equation_is_a_structure(folder: Path) -> None:
     for words in (["--equation", EQUATION], [f"--equation={EQUATION}"]):
         found = run_command("identify", "square.csv", *words, cwd=folder)
         assert found.returncode == 2
-        assert "No such option: --equation; --structure takes equations in words, too." in found.stderr
+        assert "No such option: --equation; --structure takes equations in words" in found.stderr
     # Where there is no structure, it is as unknown as any other.
     assert "No such option: --equation" in run_command("doctor", "--equation", "x", cwd=folder).stderr
 
@@ -641,3 +641,19 @@ def test_a_file_to_write_is_checked_before_the_work(tmp_path):
         assert "overwrite it with --force" in refused.stderr or "is not a folder; create it first" in refused.stderr
     assert CliRunner().invoke(commands, ["-o", str(path), "--force"]).exit_code == 0
     assert done == [(str(path), False), (str(path), True)]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["identify", "x.csv", "--structure", "auto", "--method", "output-eror"], "(did you mean 'output-error'?)"),
+        (["open", "x.csv", "--separator", "coma"], "(did you mean 'comma'?)"),
+        (["identify", "x.csv", "--structure", "atuo"], "(did you mean 'auto'?)"),
+        (["search", "x.csv", "--structure", "auto"], "selects a structure in ftlm identify and ftlm select"),
+        (["select", "x.csv", "--circuit", "R0"], "ftlm identify-frequency takes circuits: fit each"),
+    ],
+)
+def test_a_word_that_is_no_choice_is_refused_with_the_nearest_one(folder: Path, words: list[str], text: str) -> None:
+    found = run_command(*[word.replace("x.csv", "square.csv") for word in words], cwd=folder)
+    assert found.returncode == 2
+    assert text in " ".join(found.stderr.split())

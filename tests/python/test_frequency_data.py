@@ -521,7 +521,7 @@ def test_the_command_says_what_python_says(tmp_path):
         (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is not part"),
         (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is given"),
         (["--structure", ARC, "--start", "alfa=1"], 2, "did you mean alpha?"),
-        (["--equation", ARC], 2, "--structure takes equations in words, too"),
+        (["--equation", ARC], 2, "--structure takes equations in words"),
     ):
         refused = run_command("identify-frequency", path, *words)
         assert refused.exit_code == code, refused.output
@@ -721,3 +721,23 @@ def test_a_record_with_its_names_repeated_or_a_word_in_a_cell_is_refused_with_th
     (tmp_path / "run.csv").write_text("t,u,y\n" + "".join(rows))
     with pytest.raises(ftlm.DataError, match=r"no output is named, .* column 'u', line 9: 'ERR' is not a number"):
         ftlm.load(tmp_path / "run.csv")
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_sweeps_of_one_file_are_counted_and_compared(tmp_path, direction):
+    """Two sweeps of one resistor and capacitor, the second with 10 % more; a check of one frequency is no sweep."""
+    frequency = np.geomspace(0.1, 1e3, 25)[::direction]
+    z = 10 + 100 / (1 + 0.2j * np.pi * frequency)
+    rows = [np.column_stack([frequency, z.real, z.imag])] * 2
+    rows[1] = rows[1] * [1, 1.1, 1.1]
+
+    def notes(table):
+        path = tmp_path / "z.csv"
+        np.savetxt(path, table, delimiter=",", header="freq/Hz,Re(Z)/Ohm,Im(Z)/Ohm", comments="")
+        return [w for w in ftlm.load_frequency(path).warnings if "sweeps" in w]
+
+    (note,) = notes(np.vstack(rows))
+    assert "2 sweeps" in note
+    assert "by up to 10 %" in note
+    assert notes(rows[0]) == []
+    assert notes(np.vstack([rows[0], rows[0][:1]])) == []

@@ -167,20 +167,23 @@ def test_what_is_printed_is_read(structure):
         ("D y = k " + "*".join(600 * ["y"]), "the non-linear term at character 9 has too many operations"),
         ("D^1.5 y = k D^0.7 (abs(D y)^2) + u", "has the derivative of order 1 of y, above 0.8"),
         ("D y = k D^1.2 (u^2) + u", "order 1.2 of the non-linear term k D^1.2 (u^2) in the equation of y is outside"),
-        ("m D^2 y + k y = u", "m multiplies the highest derivative; divide by it"),
+        ("m D^2 y + k y = u", "m multiplies the highest derivative; write 'D^2 y = a0 y + b0 u'"),
         ("D y = -y/tau + u", "'tau' at character 10 divides"),
         ("D y = u/0", "'0' at character 9 divides"),
         ("D y = k (u - y)", "k at character 7 multiplies a sum"),
         ("y = 1/(T s + 1) u", "T multiplies the highest derivative"),
         ("D y = a y + b u(t - Td)", "the delay Td of u is free"),
-        ("y = e^(-L s)/(s + 1) u", "an exponential at character 5 is a known delay"),
+        ("y = e^(-L s)/(s + 1) u", "an exponential at character 5 is a delay: a number, as in e^(-0.1 s), or bounds"),
         ("D y = a y + u + 0.5 u(t - 0.1)", "u has two delays"),
         ("y = 1/(s + 1) u + 2/(s + 1) u", "u occurs twice"),
-        ("y = (a s + b)/((s + 1) (c s + 2)) u", "c occurs in several terms after multiplication"),
-        ("y = 1/(s + a) u + 1/(s + b) v", "a*b is a product of two coefficients"),
+        ("y = (a s + b)/((s + 1) (c s + 2)) u", "c multiplies the highest derivative; write"),
+        ("y = 1/(s + a) u + 1/(s + b) v", "a*b is a product of coefficients"),
         ("y = (s + 1) (a s + 1)/(s + 2) u", "a occurs in several terms after multiplication"),
         (f"y = 1/(s + 1)^{MAX_POLYNOMIAL_POWER + 1} u", "not a whole number from 1 to 10"),
         ("y = 1/(s + 1", "expected ')' at character 13"),
+        ("G(s) = 2/(s + 3)", "the transfer function has no input; write both signals"),
+        ("D^u y = a y + b u", "u names an order and a signal"),
+        ("D^y y = a y + b u", "y names an order and a signal"),
         ("D y - D y = u", "D^1 y cancels out"),
         ("u = D y", "its left-hand side has no derivative"),
         ("y' + c = u", "the offset 'c' at character 6 is on the left-hand side"),
@@ -191,3 +194,53 @@ def test_what_is_not_computed_is_refused_with_its_place(text, message):
     with pytest.raises(ftlm.ModelError) as refused:
         ftlm.equation(text)
     assert message in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "response"),
+    [
+        ("y = k/(tau s + 1) u", lambda s, k, tau, **_: k / (tau * s + 1)),
+        ("y = k/(tau s^0.7 + 1) e^(-0.3 s) u", lambda s, k, tau, **_: k / (tau * s**0.7 + 1) * np.exp(-0.3 * s)),
+        ("tau y' + y = k u", lambda s, k, tau, **_: k / (tau * s + 1)),
+        ("y = k/((tau s + 1)(T s + 1)) u", lambda s, k, tau, T, **_: k / ((tau * s + 1) * (T * s + 1))),
+        ("y = k w^2/(s^2 + 2 z w s + w^2) u", lambda s, k, w, z, **_: k * w**2 / (s**2 + 2 * z * w * s + w**2)),
+        ("y = (k s + z)/((s + 1) (T s + 2)) u", lambda s, k, z, T, **_: (k * s + z) / ((s + 1) * (T * s + 2))),
+        ("y = (s + 1) (k s + 1)/(s + 2) u", lambda s, k, **_: (s + 1) * (k * s + 1) / (s + 2)),
+    ],
+)
+def test_a_refused_quotient_of_coefficients_is_rewritten_as_an_equivalent_equation(text, response):
+    """The suggested equation has the response of the refused one for any values of its coefficients."""
+    with pytest.raises(ftlm.ModelError) as refused:
+        ftlm.equation(text)
+    rewritten, meanings = str(refused.value).split("; write '")[1].split("', where ")
+    values = {"k": 1.7, "tau": 0.6, "T": 2.3, "w": 3.1, "z": 0.4}
+    fixed = {
+        name: eval(value.replace("^", "**"), {}, values)
+        for name, value in (item.split(" = ") for item in meanings.split(", "))
+    }
+    w = np.array([0.3, 1.1, 4.0])
+    model = ftlm.Model(ftlm.equation(rewritten, fixed=fixed))
+    assert np.allclose(model.frequency_response(w), response(1j * w, **values), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("printed", "plain"),
+    [
+        ("D y = -3·y + b·u", "D y = -3*y + b*u"),
+        ("D y = a × y + b u", "D y = a*y + b u"),
+        ("D² y = a ⋅ y + b u³", "D^2 y = a y + b u^3"),
+        ("y = 2/(s² + 3)² u", "y = 2/(s^2 + 3)^2 u"),
+    ],
+)
+def test_multiplication_signs_and_superscripts_of_printed_texts_are_read(printed, plain):
+    assert ftlm.equation(printed) == ftlm.equation(plain)
+
+
+def test_a_delay_between_bounds_is_estimated_in_a_transfer_function():
+    assert ftlm.equation("y = 2/(s + 3) e^(-0:0.4 s) u") == ftlm.equation("D y = -3 y + 2 u(t - 0:0.4)")
+
+
+def test_a_polynomial_with_too_many_products_of_coefficients_is_refused():
+    factors = " ".join(f"(p{k} s + q{k})" for k in range(20))
+    with pytest.raises(ftlm.ModelError, match="more than 200 terms once multiplied out"):
+        ftlm.equation(f"y = 1/({factors}) u")

@@ -26,6 +26,7 @@ from ftlm.utils.files import check_free, write_atomically
 from ftlm.utils.formatting import columns, wrap_text
 from ftlm.utils.parameters import use_interface
 from ftlm.utils.resources import duration_bounds, estimate_duration
+from ftlm.utils.validation import join_names, nearest
 
 
 def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
@@ -97,13 +98,15 @@ def split_numbers(text: str) -> list[float]:
 
 
 #: Options of other programs, or argument names, with the options that are meant.
-OPTION_ALIASES = {"--equation": "--structure"}
+OPTION_ALIASES = {"--equation": "--structure", "--circuit": "--structure"}
 #: Gaps between cells from which a line counts as a table row, and patterns of gaps and list entries.
 MIN_TABLE_GAPS, _GAP_PATTERN, _ENTRY_PATTERN = (
     3,
     re.compile(" {2,}"),
     re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )"),
 )
+#: Message of the parser of options for a word that is no choice of an option.
+_CHOICE_PATTERN = re.compile(r".*?'([^']*)' is not one of (.*)\.")
 #: Type names in help texts.
 TYPE_LABELS = {str: "TEXT", float: "NUMBER", int: "N"}
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
@@ -117,7 +120,7 @@ OTHER_PANEL = "Options"
 
 
 class Command(TyperCommand):
-    """Command with help in panels, which suggests the correct option for a common alias."""
+    """Command with help in panels, which suggests correct options and choices."""
 
     @property
     def methods_by_field(self) -> dict[str, tuple[str, ...]]:
@@ -129,12 +132,22 @@ class Command(TyperCommand):
         names = {name for parameter in self.params for name in parameter.opts}
         for option_name in (a.partition("=")[0] for a in args):
             if option_name not in names and OPTION_ALIASES.get(option_name) in names:
-                ctx.fail(f"No such option: {option_name}; {OPTION_ALIASES[option_name]} takes equations in words, too.")
+                ctx.fail(
+                    f"No such option: {option_name}; {OPTION_ALIASES[option_name]} takes equations in words, and ftlm "
+                    "identify-frequency takes circuits: fit each, and compare their AICc."
+                )
         ctx.meta["method"] = self._chosen_method(args)
         if HELP_ALL_FLAG in args:
             ctx.meta["method"] = None
             args = ["--help"]
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            choice = _CHOICE_PATTERN.fullmatch(error.message)
+            if choice is not None:
+                choices = re.findall("'([^']*)'", choice[2])
+                error.message = f"{choice[1]!r} is not one of {join_names(choices)}{nearest(choice[1], choices)}."
+            raise
 
     def _chosen_method(self, args: Sequence[str]) -> str | None:
         """Return the method that a command line selects, or the default one; None if the command has no methods."""

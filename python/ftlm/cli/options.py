@@ -20,11 +20,14 @@ from ftlm.structure.parser import equation
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import INITIAL_CHOICES, Offset, Structure, check_initial
 from ftlm.utils.parameters import flag_of, parameter
+from ftlm.utils.validation import nearest
 
 #: Options of the flexible link, in the order of messages.
 LINK_OPTIONS = ("cross_stage", "cross_sensitivity", "cross_damping", "friction", "laws", "form", "input_order")
 #: Stages of the arm by the end of a structure's name.
 STAGES_BY_NAME: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both"}
+#: Structures that have names, and the word for a selected one.
+STRUCTURE_NAMES = ("auto", *(f"{name}:{part}" for name in ("flexible-link", "arm") for part in ("1", "2", "both")))
 
 
 class MethodOptions:
@@ -102,11 +105,16 @@ class StructureOptions:
             built = self._flexible_link(text)
         elif re.fullmatch(r"arm(:\w*)?", text):
             built = self._arm(text, alone)
+        elif text == "auto":
+            raise ModelError(
+                "--structure auto selects a structure in ftlm identify and ftlm select; give this command an equation, "
+                "such as the one that ftlm select prints"
+            )
         elif "=" not in text:
             raise ModelError(
-                f"--structure {text!r} is no equation and has no name of a structure; use auto, flexible-link:1, :2 or "
-                ":both, arm:1, :2 or :both, or an equation such as 'D y = a y + b u' (ftlm identify-frequency takes "
-                "circuits)"
+                f"--structure {text!r} is no equation and has no name of a structure{nearest(text, STRUCTURE_NAMES)}; "
+                "use auto, flexible-link:1, :2 or :both, arm:1, :2 or :both, or an equation such as "
+                "'D y = a y + b u' (ftlm identify-frequency fits circuits: fit each, and compare their AICc)"
             )
         else:
             built = equation(text, sensor_filter=self._sensor())

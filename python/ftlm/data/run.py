@@ -885,7 +885,8 @@ class Runs(tuple[Run, ...]):
             every = [runs] if isinstance(runs, Run) else list(runs)
         except TypeError:
             raise DataError(
-                f"runs is {type(runs).__name__}; give a Run or a list of them (identify_frequency takes frequency data)"
+                f"runs is {type(runs).__name__}; give a Run or a list of them (identify_frequency takes frequency "
+                "data: fit each circuit or equation, and compare their information.aicc)"
             ) from None
         if not every:
             raise DataError("no run is given; give at least one")

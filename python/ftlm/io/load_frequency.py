@@ -59,6 +59,8 @@ _PHASE_UNITS = ("deg", "rad", "mrad")
 _DIMENSIONLESS_UNITS = ("", "1", "-", "abs", "lin", "linear")
 #: Longer column names are not compared with the names of parts.
 _MAX_PART_NAME_CHARACTERS = 60
+#: Fewest rows of a sweep; instruments repeat single frequencies as a check.
+MIN_SWEEP_ROWS = 3
 #: Relative tolerance between a magnitude column and real and imaginary part in the same file.
 _MAGNITUDE_TOLERANCE = 0.02
 
@@ -164,8 +166,34 @@ def load_frequency(
         notes.append(f"{int(np.sum(rest))} of {omega.size} rows are at frequency 0 and left out")
         omega, response = omega[~rest], response[~rest]
         deviation = None if deviation is None else deviation[~rest]
+    notes += _describe_sweeps(omega, response)
     PACKAGE_LOGGER.info("read: %s: %d frequencies", label, omega.size)
     return FrequencyData(omega, response, deviation, output, input, unit, label, tuple(notes))
+
+
+def _describe_sweeps(omega: Floats, response: Complex) -> list[str]:
+    """Return a note on how far repeated sweeps differ; [] if the rows are one sweep.
+
+    A sweep is a stretch of rows whose frequencies rise or fall. A later sweep is compared with the first one, linearly
+    interpolated over the logarithm of the frequency, in the range that both cover.
+    """
+    steps = np.sign(np.diff(omega))
+    reversals = np.flatnonzero(steps == -np.sign(np.sum(steps))) + 1
+    sweeps = [rows for rows in np.split(np.arange(omega.size), reversals) if rows.size >= MIN_SWEEP_ROWS]
+    differences = []
+    for rows in sweeps[1:]:
+        first = sweeps[0][np.argsort(omega[sweeps[0]], kind="stable")]
+        shared = rows[(omega[rows] >= omega[first[0]]) & (omega[rows] <= omega[first[-1]])]
+        if shared.size >= MIN_SWEEP_ROWS:
+            at, known = np.log(omega[shared]), np.log(omega[first])
+            curve = np.interp(at, known, response[first].real) + 1j * np.interp(at, known, response[first].imag)
+            differences.append(float(np.linalg.norm(response[shared] - curve) / np.linalg.norm(curve)))
+    if not differences:
+        return []
+    return [
+        f"the file has {len(differences) + 1} sweeps over its frequencies, read as one response; they differ from the "
+        f"first by up to {100 * max(differences):.2g} %: give each sweep a file of its own if the object changed"
+    ]
 
 
 def is_response(pool: Pool) -> bool:

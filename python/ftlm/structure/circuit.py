@@ -169,6 +169,11 @@ class Circuit:
                     parts.append(series())
                 if not tokens or tokens.pop(0) != ")":
                     raise ModelError(f"circuit {self.text!r}: a parenthesis is not closed; write p(R1,C1)")
+                if len(parts) == 1:
+                    raise ModelError(
+                        f"circuit {self.text!r}: p(…) joins two or more elements in parallel, and one has a single "
+                        "branch; write p(R1,C1), or leave p( ) out"
+                    )
                 return group("parallel", parts)
             if _letters(token) not in CIRCUIT_ELEMENTS:
                 elements = ", ".join(f"{n} ({e.meaning})" for n, e in CIRCUIT_ELEMENTS.items())

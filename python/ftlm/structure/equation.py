@@ -287,6 +287,9 @@ class Equation:
         both = set(names) & set(self.order_names)
         if both:
             raise ModelError(f"{min(both)} names an order and a coefficient; rename one")
+        both = {self.output, *(signal for term in self.terms for signal in term.signals)} & set(self.order_names)
+        if both:
+            raise ModelError(f"{min(both)} names an order and a signal; rename the order")
         if not self.order.names and not 0 < self.order.constant <= MAX_ORDER:
             raise ModelError(
                 f"order alpha = {self.order.constant:g} of {self.output} is outside (0, 10]; choose another"

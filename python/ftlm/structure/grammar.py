@@ -21,16 +21,16 @@ an expression in parentheses. Blanks between names, numbers and symbols do not m
     friction    = [strength [*]] ["exp(-(D y/" speed ")^2)" [*]] "sign(D y)"
     transfer    = signal "=" {sign} ratio signal {sign ratio signal}  |  signal "/" signal "=" ratio
     ratio       = factor {("*" | "/" | "") factor}
-    factor      = number  |  name  |  "s" ["^" order]  |  "sqrt(s)"  |  "e^(-" delay "s)"
+    factor      = number  |  name ["^" whole number]  |  "s" ["^" order]  |  "sqrt(s)"  |  "e^(-" delay "s)"
                 |  "(" polynomial ")" ["^" whole number]
 """
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
 
 from ftlm.errors import ModelError
 from ftlm.structure.equation import Friction, Stribeck
@@ -60,6 +60,9 @@ _TOKEN_PATTERN = re.compile(
 #: Tops of ``d^2 y/dt^2``, ``d2y/dt2`` and ``dy/dt``, with a space between tokens, and most tokens of such a derivative.
 _LEIBNIZ_PATTERN = re.compile(rf"d(?: \^ (\d+)(?: ({IDENTIFIER_PATTERN}))?|(?:(\d+)?({IDENTIFIER_PATTERN}))?)(?= /)")
 MAX_LEIBNIZ_TOKENS = 8
+#: Signs of printed texts, by the symbols of the grammar.
+_PRINTED_SIGNS = str.maketrans("−·⋅×", "-***")
+_SUPERSCRIPT_PATTERN = re.compile("[⁰¹²³⁴-⁹]+")
 #: What follows the name of an offset in parentheses, by the kind of offset.
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
 #: Functions that an error message names where they are applied to a signal.
@@ -68,6 +71,8 @@ FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt"
 MAX_DEPTH = 30
 #: Largest power of a polynomial in s that is multiplied out.
 MAX_POLYNOMIAL_POWER = 10
+#: Largest number of terms of a polynomial in s with named coefficients.
+MAX_POLYNOMIAL_TERMS = 200
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,8 @@ class ParsedTerm:
         return (self.signal,) if self.expression is None else tuple(signal for signal, _ in self.expression.channels)
 
 
-#: Terms (factor, name, order) of a sum of ``factor * name * s^order``; orders may be fractional.
+#: Terms (factor, name, order) of a sum of ``factor * name * s^order``; orders may be fractional. The name of a product
+#: of coefficients is ``"a*b"``.
 SymbolicPolynomial = list[tuple[float, str | None, Order]]
 UNIT_POLYNOMIAL: SymbolicPolynomial = [(1.0, None, Order())]
 
@@ -120,9 +126,12 @@ class EquationParser:
         Names of signals that occur without saturation and dead zone.
     delays
         Delays [s] by signal: a number if known, (lower, upper) if it is to be estimated in this interval.
+    is_transfer
+        Whether the text has transfer functions in s.
     """
 
     def __init__(self, text: str, signals: Collection[str] = ()) -> None:
+        text = _SUPERSCRIPT_PATTERN.sub(lambda power: "^" + unicodedata.normalize("NFKC", power[0]), text)
         self.text = text
         self._signals = signals
         self._depth = 0
@@ -134,10 +143,11 @@ class EquationParser:
         self.limits: dict[tuple[str, NonlinearityKind], Value] = {}
         self.plain: set[str] = set()
         self.delays: dict[str, Value] = {}
+        self.is_transfer = False
         self._tokens: list[tuple[str, str, int]] = []
         self._position = 0
-        # A minus sign of a printed text, and the power of a Python text, of the same length.
-        readable = text.replace("−", "-").replace("**", "^ ")
+        # Signs of a printed text, and the power of a Python text, of the same length.
+        readable = text.translate(_PRINTED_SIGNS).replace("**", "^ ")
         at = 0
         while readable[at:].strip():
             token = _TOKEN_PATTERN.match(readable, at)
@@ -197,6 +207,7 @@ class EquationParser:
     def parse(self) -> EquationParser:
         """Parse the whole text as an equation, set the attributes, and return the parser."""
         if self._is_transfer():
+            self.is_transfer = True
             self._transfer()
             return self
         self.left = self._sum(is_lhs=True)
@@ -779,7 +790,8 @@ class EquationParser:
 
     def _ratio(self, common: str | None) -> tuple[SymbolicPolynomial, SymbolicPolynomial, Value]:
         """Parse a transfer function up to its signal, and return numerator, denominator and delay."""
-        top, bottom, divides, delay = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False, 0.0
+        top, bottom, divides = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False
+        delay: Value = 0.0
         while True:
             kind, value, _ = self._peek()
             symbols = [self._peek(k)[1] for k in (1, 2, 3)]
@@ -787,6 +799,11 @@ class EquationParser:
                 delay = self._exponential()
             elif self._ends_ratio(kind, value, symbols, is_named=common is None):
                 return top, bottom, delay
+            elif kind == "end" and not divides:
+                raise self._error(
+                    "the transfer function has no input; write both signals, as in 'y = 2/(s + 3) u' or "
+                    "'y/u = 2/(s + 3)'"
+                )
             elif divides:
                 bottom = self._times(bottom, self._factor())
             else:
@@ -806,18 +823,18 @@ class EquationParser:
         last = symbols[0] in ("the end", "+", "-") or symbols == ["(", "s", ")"]
         return kind == "name" and value not in ("s", "sqrt") and last
 
-    def _exponential(self) -> float:
-        """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, and return the delay [s]."""
+    def _exponential(self) -> Value:
+        """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, and return the delay [s] or its bounds."""
         _, value, at = self._take()
         if value == "e":
             self._take()
         close = {"(": ")", "{": "}"}.get(self._take()[1])
         if close is None or not self._accept("-") or self._peek()[0] != "number":
             raise self._error(
-                f"an exponential at character {at + 1} is a known delay, as in e^(-0.1 s); estimate one by "
-                f"{parameter('delay')}"
+                f"an exponential at character {at + 1} is a delay: a number, as in e^(-0.1 s), or bounds to estimate "
+                "it between, as in e^(-0:0.5 s)"
             )
-        delay = float(self._take()[1])
+        delay = self._value("a delay [s], or LEAST:LARGEST where it is estimated")
         self._accept("*")
         self._expect("s")
         self._expect(close)
@@ -845,13 +862,14 @@ class EquationParser:
             return [(1.0, None, Order(0.5))]
         if kind == "name" and value not in FUNCTION_NAMES:
             self._take()
-            if value != "s":
-                return [(1.0, value, Order())]
-            return [(1.0, None, self._order() if self._accept("^") else Order(1.0))]
-        if not self._accept("("):
+            if value == "s":
+                return [(1.0, None, self._order() if self._accept("^") else Order(1.0))]
+            inner: SymbolicPolynomial = [(1.0, value, Order())]
+        elif self._accept("("):
+            inner = self._polynomial()
+            self._expect(")")
+        else:
             raise self._syntax_error("a number, a coefficient, s or (…)")
-        inner = self._polynomial()
-        self._expect(")")
         if not self._accept("^"):
             return inner
         kind, value, at = self._take()
@@ -866,30 +884,28 @@ class EquationParser:
         return product
 
     def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
-        """Return the product of two polynomials in s; terms of equal power with known coefficients are added."""
-        terms: SymbolicPolynomial = []
-        for (c1, n1, o1), (c2, n2, o2) in product(first, second):
-            if n1 is not None and n2 is not None:
+        """Return the product of two polynomials in s; terms of equal power and coefficient are added."""
+        products: dict[tuple[str | None, Order], float] = {}
+        for c1, n1, o1 in first:
+            for c2, n2, o2 in second:
+                names = [name for product in (n1, n2) if product for name in product.split("*")]
+                key = "*".join(sorted(names)) or None, add_orders(o1, o2)
+                products[key] = products.get(key, 0.0) + c1 * c2
+            if len(products) > MAX_POLYNOMIAL_TERMS:
                 raise self._error(
-                    f"{n1}*{n2} is a product of two coefficients; multiply out, and give each product a name"
+                    f"the transfer function has more than {MAX_POLYNOMIAL_TERMS} terms once multiplied out; give each "
+                    "power of s one coefficient"
                 )
-            terms.append((c1 * c2, n1 or n2, add_orders(o1, o2)))
-        names = sorted(name for _, name, _ in terms if name is not None)
-        twice = next((a for a, b in pairwise(names) if a == b), None)
-        if twice is not None:
-            raise self._error(
-                f"{twice} occurs in several terms after multiplication; give each term its own coefficient name"
-            )
-        return sorted(_add_known(terms), key=lambda term: term[1] is not None)
+        return [(c, name, order) for (name, order), c in products.items() if c != 0.0]
 
 
 def _add_known(terms: SymbolicPolynomial) -> SymbolicPolynomial:
-    """Return a polynomial in which terms of one order with known coefficients are added, without their zero sums."""
+    """Return a polynomial in which terms of one order with known coefficients are added."""
     sums: dict[object, tuple[float, str | None, Order]] = {}
     for place, (c, name, order) in enumerate(terms):
         key = order if name is None else place
         sums[key] = (sums[key][0] + c if key in sums else c, name, order)
-    return [(c, name, order) for c, name, order in sums.values() if c != 0.0 or name is not None]
+    return list(sums.values())
 
 
 def add_orders(first: Order, second: Order) -> Order:

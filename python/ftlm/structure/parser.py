@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -13,8 +15,14 @@ from msgspec import UNSET
 
 from ftlm.errors import ModelError
 from ftlm.structure.equation import Equation, Friction, Term, derivative
-from ftlm.structure.grammar import EquationParser
-from ftlm.structure.input_nonlinearity import InputNonlinearity, NonlinearityKind, Value, sort_nonlinearities
+from ftlm.structure.grammar import NONLINEARITY_KINDS, EquationParser, ParsedTerm
+from ftlm.structure.input_nonlinearity import (
+    INPUT_EFFECT_ABBREVIATIONS,
+    InputNonlinearity,
+    NonlinearityKind,
+    Value,
+    sort_nonlinearities,
+)
 from ftlm.structure.order import Values
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial, check_offset
@@ -177,11 +185,9 @@ def _equation_of(words: EquationParser) -> Equation:
     first = derivatives[0]
     if not any(item.order.names for item in derivatives):
         first = max(derivatives, key=lambda item: item.order.constant)
-    if first.name is not None:
-        raise ModelError(
-            f"equation {words.text!r}: {first.name} multiplies the highest derivative; divide by it, and give each "
-            f"quotient a name of its own: '{derivative(first.order, first.signal)} = …'"
-        )
+    reason = _division_reason(words, first)
+    if reason:
+        raise ModelError(f"equation {words.text!r}: {reason}; write {_divided_equation(words, first)}")
     leading, rest = 0.0, []
     for side, items in ((-1.0, words.left), (1.0, words.right)):
         for item in items:
@@ -203,6 +209,88 @@ def _equation_of(words: EquationParser) -> Equation:
         else:
             terms.append(Term(item.signal, item.order, item.name, factor, expression=shape))
     return Equation(first.signal, first.order, tuple(terms), _friction_of(words, first.signal, leading) or UNSET)
+
+
+def _division_reason(words: EquationParser, first: ParsedTerm) -> str | None:
+    """Return why the coefficients of an equation are not those of its terms; None if they are."""
+    linear = [item for item in (*words.left, *words.right) if item.expression is None]
+    named = next((i.name for i in linear if i.name and (i.signal, i.order) == (first.signal, first.order)), None)
+    if named is not None:
+        return f"{named} multiplies the highest derivative"
+    names = [item.name for item in linear if item.name]
+    product = next((name for name in names if "*" in name), None)
+    if product is not None:
+        return f"{product} is a product of coefficients"
+    twice = next((name for name in names if words.is_transfer and names.count(name) > 1), None)
+    return twice and f"{twice} occurs in several terms after multiplication"
+
+
+def _divided_equation(words: EquationParser, first: ParsedTerm) -> str:
+    """Return an equation divided by its highest derivative, with one coefficient per term, and their meanings."""
+    sums: dict[tuple[str, str], list[tuple[float, str | None]]] = {}
+    for side, items in ((-1.0, words.left), (1.0, words.right)):
+        for item in items:
+            text = derivative(item.order, _signal_text(words, item.signal))
+            if item.expression is not None:
+                text = f"({item.expression.as_text()})"
+            sums.setdefault((item.signal, text), []).append((side * item.factor, item.name))
+    divisor = [(-c, name) for c, name in sums.pop((first.signal, derivative(first.order, first.signal)))]
+    used = {name for item in (*words.left, *words.right) for name in (*item.signals, *(item.name or "").split("*"))}
+    counts = {"a": itertools.count(), "b": itertools.count()}
+    terms: list[str] = []
+    meanings: list[str] = []
+    for (signal, text), quotient in reversed(sums.items()):
+        if all(name is None for _, name in (*quotient, *divisor)):
+            terms.insert(0, f"{sum(c for c, _ in quotient) / sum(c for c, _ in divisor):g} {text}")
+            continue
+        letter = "a" if signal == first.signal else "b"
+        name = next(name for k in counts[letter] if (name := f"{letter}{k}") not in used)
+        terms.insert(0, f"{name} {text}")
+        meanings.insert(0, f"{name} = {_quotient_text(quotient, divisor)}")
+    right = " + ".join(terms).replace("+ -", "- ") or "0"
+    scaled = []
+    forces = [pair for pair in (words.friction, words.stribeck) if pair is not None]
+    for force, signal in forces:
+        right += f" {force.as_text(signal)}"
+        scaled += [force.coefficient] if isinstance(force.coefficient, str) else []
+    right += {"constant": " + c", "ramp": " + (c + ramp t)"}.get(words.offset or "", "")
+    if divisor != [(1.0, None)]:
+        scaled += ["c"] if words.offset else []
+        meanings += [f"{name} has become {_quotient_text([(1.0, name)], divisor)}" for name in scaled]
+    return f"'{derivative(first.order, first.signal)} = {right}', where {', '.join(meanings)}"
+
+
+def _signal_text(words: EquationParser, signal: str) -> str:
+    """Return a signal of a parsed equation with its delay and its limits as text."""
+
+    def value_text(value: Value) -> str:
+        return ":".join(f"{v:g}" for v in ((value,) if isinstance(value, (int, float)) else value))
+
+    delay = words.delays.get(signal, 0.0)
+    text = signal if delay == 0.0 else f"{signal}(t - {value_text(delay)})"
+    for kind in NONLINEARITY_KINDS:
+        if (signal, kind) in words.limits:
+            text = f"{INPUT_EFFECT_ABBREVIATIONS[kind]}({text}, {value_text(words.limits[signal, kind])})"
+    return text
+
+
+def _quotient_text(above: Sequence[tuple[float, str | None]], below: Sequence[tuple[float, str | None]]) -> str:
+    """Return the quotient of two sums of numbers times names as text."""
+
+    def product_text(factor: float, name: str | None) -> str:
+        counts = Counter(name.split("*")) if name else {}
+        texts = [part if count == 1 else f"{part}^{count}" for part, count in counts.items()]
+        return "*".join([f"{factor:g}", *texts] if abs(factor) != 1.0 or not texts else texts)
+
+    def sum_text(terms: Sequence[tuple[float, str | None]]) -> str:
+        text = " + ".join("-" * (c == -1.0 and n is not None) + product_text(c, n) for c, n in terms)
+        return text.replace("+ -", "- ")
+
+    top, bottom = sum_text(above), sum_text(below)
+    if list(below) == [(1.0, None)]:
+        return top
+    top = f"({top})" if len(above) > 1 else top
+    return f"{top}/{bottom}" if re.fullmatch(r"\w+", bottom) else f"{top}/({bottom})"
 
 
 def _friction_of(words: EquationParser, output: str, leading: float) -> Friction | None:

@@ -10,7 +10,7 @@ from statistics import median
 
 import numpy as np
 
-from ftlm.data.run import Run
+from ftlm.data.run import Run, as_runs
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.identify import identify, identify_pieces
@@ -182,8 +182,8 @@ def select(
     subset. For a list of more than 200 candidates a ``UserWarning`` estimates the remaining time after the first ones.
     """
     workers = check_threads(threads)
-    several = [runs] if isinstance(runs, Run) else list(runs)
-    folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
+    several = as_runs(runs)
+    folds = Folds.of(several, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
     if not isinstance(candidates, (str, Structure, Sequence, Mapping)):
         raise ModelError(
             f"candidates is {type(candidates).__name__}; use ftlm.equation(…), a list or a dictionary of structures, "
