@@ -214,7 +214,8 @@ def _equation_of(words: EquationParser) -> Equation:
 def _division_reason(words: EquationParser, first: ParsedTerm) -> str | None:
     """Return why the coefficients of an equation are not those of its terms; None if they are."""
     linear = [item for item in (*words.left, *words.right) if item.expression is None]
-    named = next((i.name for i in linear if i.name and (i.signal, i.order) == (first.signal, first.order)), None)
+    leading = [i for i in linear if i in words.left and (i.signal, i.order) == (first.signal, first.order)]
+    named = next((item.name for item in leading if item.name), None)
     if named is not None:
         return f"{named} multiplies the highest derivative"
     names = [item.name for item in linear if item.name]
