@@ -12,7 +12,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ftlm.data.frequency_data import FrequencyData
-from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseProblem, ResponseRecord, halton
+from ftlm.estimation.response_problem import (
+    MAX_EXPONENT,
+    MAX_STARTS,
+    ResponseProblem,
+    ResponseRecord,
+    halton,
+)
 from ftlm.structure.circuit import Circuit, impedance_and_derivatives
 from ftlm.utils.validation import Complex, Floats
 
@@ -67,13 +73,15 @@ class CircuitProblem(ResponseProblem):
     def intervals(self, values: Floats, widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Return (low, high) of each parameter by name, in SI units, from half-widths by name.
 
-        The bounds of a positive parameter are symmetric in its logarithm.
+        The bounds of a positive parameter are symmetric in its logarithm. An exponent is at most 1.
         """
         intervals = super().intervals(values, widths)
         for name, value, is_log in zip(self.names, values.tolist(), self.is_log.tolist(), strict=True):
             if is_log:
                 ratio = float(np.exp(np.minimum(widths[name] / value, MAX_LOG_WIDTH)))
                 intervals[name] = (value / ratio, value * ratio)
+            else:
+                intervals[name] = (intervals[name][0], min(intervals[name][1], MAX_EXPONENT))
         return intervals
 
     def jacobian_in_seconds(self, values: Floats, jacobian: Floats) -> Floats:

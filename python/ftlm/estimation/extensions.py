@@ -578,8 +578,7 @@ def _with_lag(item: Equation, coefficient: str) -> Equation:
 
     The order of the left-hand side rises by 1, and its former derivative becomes a term with the named coefficient.
     """
-    raised = Order(item.order.constant + 1.0, item.order.weights)
-    return replace(item, order=raised, terms=(Term(item.output, item.order, coefficient), *item.terms))
+    return replace(item, order=item.order + Order(1.0), terms=(Term(item.output, item.order, coefficient), *item.terms))
 
 
 def _with_terms(item: Equation, terms: Sequence[Term]) -> Equation:
@@ -590,7 +589,7 @@ def _with_terms(item: Equation, terms: Sequence[Term]) -> Equation:
 def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
     """Return a new term of an input, of an order 1 above the input's highest order in the equation."""
     highest = max((t.order for t in item.terms if t.signal == name), key=lambda order: order.constant)
-    return Term(name, Order(highest.constant + 1.0, highest.weights), coefficient)
+    return Term(name, highest + Order(1.0), coefficient)
 
 
 def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, added_parameters: int) -> float:

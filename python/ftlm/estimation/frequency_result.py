@@ -615,7 +615,8 @@ def _errors_in_words(errors: Sequence[ResponseError]) -> list[str]:
     lines = ["error over the size of the measured response"]
     for e in errors:
         lines.append(
-            f"  {e.output} from {e.input} ({e.name}): {e.rms:.3g} % rms, at most {e.largest:.3g} % at {e.at:.4g} rad/s"
+            f"  {e.output} from {e.input} ({e.name}): {e.rms:.3g} % rms, at most {e.largest:.3g} % at {e.at:.4g} rad/s "
+            f"({e.at / (2.0 * math.pi):.4g} Hz)"
         )
     return lines
 

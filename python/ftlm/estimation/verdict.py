@@ -146,7 +146,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     against = _combined_verdict([*result_findings(result)], result.fit, runs, has_validation)
     if against is not None:
         return against
-    fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
+    fits = ", ".join(f"{o} {f.fit:.4g} %" for o, f in (validation or result.comparison).output_error.items())
     residual_text = _describe_residuals(result)
     return Verdict(
         TRUST_LEVEL, f"it predicts validation runs ({fits}), {residual_text}, all parameters are well determined"
@@ -199,7 +199,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
         judgement = _combined_verdict(own, estimation_fits, validation, bool(validation) and not is_repeated)
     if judgement is not None:
         return judgement
-    fits = ", ".join(f"{o} {f.fit:.3g} %" for c in validation for o, f in c.output_error.items())
+    fits = ", ".join(f"{o} {f.fit:.4g} %" for c in validation for o, f in c.output_error.items())
     return Verdict(TRUST_LEVEL, f"it predicts validation runs ({fits}), and no finding speaks against its fit")
 
 

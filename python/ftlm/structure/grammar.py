@@ -275,7 +275,7 @@ class EquationParser:
         scale, shape = operand.split_factor()
         factor = self._divisors(factor * scale)
         if shape.operation == "channel":
-            return [ParsedTerm(factor, name, add_orders(order, Order(shape.value)), shape.signal)]
+            return [ParsedTerm(factor, name, order + Order(shape.value), shape.signal)]
         if shape.is_linear:
             if not shape.channels:
                 raise self._error(f"the term at character {begin + 1} is a constant without a signal; leave it out")
@@ -889,11 +889,11 @@ class EquationParser:
         for c1, n1, o1 in first:
             for c2, n2, o2 in second:
                 names = [name for product in (n1, n2) if product for name in product.split("*")]
-                key = "*".join(sorted(names)) or None, add_orders(o1, o2)
+                key = "*".join(sorted(names)) or None, o1 + o2
                 products[key] = products.get(key, 0.0) + c1 * c2
             if len(products) > MAX_POLYNOMIAL_TERMS:
                 raise self._error(
-                    f"the transfer function has more than {MAX_POLYNOMIAL_TERMS} terms once multiplied out; give each "
+                    f"the transfer function has more than {MAX_POLYNOMIAL_TERMS} terms after multiplication; give each "
                     "power of s one coefficient"
                 )
         return [(c, name, order) for (name, order), c in products.items() if c != 0.0]
@@ -906,13 +906,3 @@ def _add_known(terms: SymbolicPolynomial) -> SymbolicPolynomial:
         key = order if name is None else place
         sums[key] = (sums[key][0] + c if key in sums else c, name, order)
     return list(sums.values())
-
-
-def add_orders(first: Order, second: Order) -> Order:
-    """Return the sum of two orders as an order."""
-    weights = dict(first.weights)
-    for name, weight in second.weights:
-        weights[name] = weights.get(name, 0.0) + weight
-    return Order(
-        round(first.constant + second.constant, 9) + 0.0, tuple(sorted((n, w) for n, w in weights.items() if w))
-    )

@@ -44,6 +44,14 @@ class Order:
     constant: float = 0.0
     weights: tuple[tuple[str, float], ...] = ()
 
+    def __add__(self, other: Order) -> Order:
+        """Return the sum of two orders."""
+        weights = dict(self.weights)
+        for name, weight in other.weights:
+            weights[name] = weights.get(name, 0.0) + weight
+        constant = round(self.constant + other.constant, 9) + 0.0
+        return Order(constant, tuple(sorted((n, w) for n, w in weights.items() if w)))
+
     def substitute(self, values: Mapping[str, float]) -> Order:
         """Return the order with values in place of some free orders; the others stay free."""
         constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
