@@ -201,7 +201,7 @@ def test_words_where_nothing_can_be_compared():
     for parts in (200, 10**9):
         with pytest.raises(ftlm.DataError, match=f"motor has 300 rows, too few to be cut into {parts} parts"):
             ftlm.consistency(run, SECOND, segments=parts)
-    with pytest.raises(ftlm.ModelError, match="store= is of one identification"):
+    with pytest.raises(ftlm.ModelError, match="store= applies to a single identification"):
         ftlm.consistency(run, SECOND, method=ftlm.LeastSquares(store="a.ftlm"))
     with pytest.raises(ftlm.ModelError, match="method 'least-squares' gives no standard errors of D"):
         ftlm.consistency(run, SECOND, method="least-squares", threads=1)

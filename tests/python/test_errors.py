@@ -335,7 +335,7 @@ BAD = {
     ),
     "dependent regressors": (
         CONVERGENCE,
-        "regressor 2 of 3 is a combination of the others",
+        "regressor 2 of 3 is a linear combination of the others",
         lambda: ftlm.identify(
             run(), ftlm.equation("D^1.5 y = a y + b u + c D^0 u", initial="rest"), method="least-squares"
         ),

@@ -222,7 +222,7 @@ BAD_TEXT = {
         b"t,u,y\n" + 120_000 * b"0,1,23456\n" + b"9,\xb0,2\n",
         ["line 120002", "UTF-8", "0xb0", "encoding="],
     ),
-    "neither UTF-8 nor text": (b"t,u,y\n0,1,\xb0\x01\n", ["line 2", "0xb0", "no text", "encoding="]),
+    "neither UTF-8 nor text": (b"t,u,y\n0,1,\xb0\x01\n", ["line 2", "0xb0", "not text", "encoding="]),
     "gzip": (gzip.compress(rows().encode(), mtime=0), ["x.csv"]),
     "duplicate names": ("t,u,y,u\n0,1,2,3\n1,1,2,3\n2,1,2,3\n", ["line 1", "'u'", "2 times"]),
     "short line": ("t,u,y\n0,1,2\n1,1\n2,1,2\n3,1\n", ["line 3 has 2 cells", "has 3", "2 lines in all", "comma"]),

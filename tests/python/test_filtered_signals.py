@@ -455,7 +455,7 @@ def test_the_command_line_names_filtered_signals():
         (
             {"filtered_signals": ["theta12"]},
             "flexible-link:1",
-            "of equations in words; the flexible link has --sensor-filter stock",
+            "apply to equations in words; the flexible link has --sensor-filter stock",
         ),
         ({"filtered_signals": ["theta12"]}, "arm", "--filtered-signals: --structure arm has its own; leave it out"),
         ({"sensor_filter": "2"}, "flexible-link:1", "the flexible link has --sensor-filter stock"),

@@ -519,7 +519,7 @@ def test_the_command_says_what_python_says(tmp_path):
         (["--structure", ARC, "--weights", "deviation"], 3, "states no standard deviation; use --weights relative"),
         (["--structure", "arm:1"], 2, "a frequency response takes an equation in words"),
         (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is not part"),
-        (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is given"),
+        (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is asked for"),
         (["--structure", ARC, "--start", "alfa=1"], 2, "did you mean alpha?"),
         (["--equation", ARC], 2, "--structure takes equations in words"),
     ):

@@ -525,7 +525,7 @@ def test_output_error_is_the_default_and_gives_intervals(small_run, with_noise):
         ({"method": "magic"}, "method = 'magic' is not known; use "),
         ({"method": "genetics"}, "method = 'genetics' is not known; use "),
         ({"threads": 0}, "threads = 0 is outside [1, 1024]"),
-        ({"m": 600}, "m = 600 is more than run 'small, simulated' carries: 513 rows are 512 pulses"),
+        ({"m": 600}, "m = 600 is more than run 'small, simulated' allows: 513 rows give 512 pulses"),
     ],
 )
 @pytest.mark.parametrize("method", ["output-error", *METHODS])
@@ -554,7 +554,7 @@ def test_regressors_that_cannot_be_told_apart_are_refused(small_run):
         step=0.02, inputs={"u": small_run["u"], "v": 3 * small_run["u"]}, outputs={"y": small_run["y"]}
     )
     words = ftlm.equation("D^1.6 y = a D^0.6 y + c y + b u + d v")
-    with pytest.raises(ftlm.ConvergenceError, match="regressor 3 of 4 is a combination of the others"):
+    with pytest.raises(ftlm.ConvergenceError, match="regressor 3 of 4 is a linear combination of the others"):
         ftlm.identify(twice, words, method="least-squares")
     silent = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.zeros(513)}, outputs={"y": small_run["y"]})
     with pytest.raises(ftlm.DataError, match="u is 0 in all rows, so its coefficient in the equation of y cannot"):

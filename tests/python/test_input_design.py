@@ -414,11 +414,11 @@ def hopeless(tmp_path: Path, change) -> ftlm.Model:
 BAD = {
     "no model": ({}, 3, "model is int"),
     "peak": ({"peak": 0}, None, "peak of u = 0 is not above 0"),
-    "peak of another": ({"peak": {"w": 1}}, None, "peak names 'w'.*none of u"),
+    "peak of another": ({"peak": {"w": 1}}, None, "peak names 'w'.*not one of u"),
     "infinite": ({"peak": math.inf}, None, "peak of u is infinite"),
     "text": ({"peak": "loud"}, None, "peak of u = 'loud' is not a number"),
     "slew": ({"slew": 1e-3}, None, "slew of u = 0.001 a second takes"),
-    "limit of an input": ({"limits": {"u": 1}}, None, "limits names 'u'.*none of y"),
+    "limit of an input": ({"limits": {"u": 1}}, None, "limits names 'u'.*not one of y"),
     "limit below 0": ({"limits": {"y": -1}}, None, "limits of y = -1 is not above 0"),
     "parameters": ({"parameters": ["alhpa"]}, None, r"names\[0\] = 'alhpa'.*did you mean 'alpha'"),
     "no names": ({"parameters": []}, None, "names is empty"),

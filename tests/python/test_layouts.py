@@ -131,7 +131,10 @@ OPEN = {
         "t;u;y\n01/02/2024 00:00;1;2\n02/02/2024 00:00;1;3\n03/02/2024 00:00;1;4\n",
         ["column 't' (time)", "'01/02/2024 00:00' may begin with the day or with the month", "dates='dmy'"],
     ),
-    "no such date": ("t;u;y\n30.02.2024;1;2\n01.03.2024;1;3\n02.03.2024;1;3\n", ["'t' (time)", "row 0", "none"]),
+    "no such date": (
+        "t;u;y\n30.02.2024;1;2\n01.03.2024;1;3\n02.03.2024;1;3\n",
+        ["'t' (time)", "row 0", "invalid date"],
+    ),
     "dates among numbers": (
         "t;u;y\n0;1;2\n1;1;3\n2024-01-01;1;4\n3;1;2\n",
         ["column 't', line 4", "'2024-01-01' stands among numbers", "row 2, 1 in all"],

@@ -207,7 +207,7 @@ def test_many_runs_have_neither_a_store_nor_two_executors(noisy, tmp_path):
             ftlm.identify_many([noisy], structure, method=ftlm.LeastSquares(executor=pool), executor=pool)
         with pytest.raises(ftlm.ModelError, match="method = 'magic' is not known"):
             ftlm.identify_many([noisy], structure, method="magic", executor=pool)
-    with pytest.raises(ftlm.ModelError, match="start= is of one identification"):
+    with pytest.raises(ftlm.ModelError, match="start= applies to a single identification"):
         ftlm.consistency(noisy, structure, method=ftlm.OutputError(start={"a": 1.0}))
     with pytest.raises(ftlm.ModelError, match="offset='auto' may need two searches"):
         ftlm.identify(noisy, structure, method=ftlm.LeastSquares(store=tmp_path / "s.ftlm"), offset="auto")

@@ -596,7 +596,7 @@ def test_no_command_is_written_after_the_time_limit(bench):
     ("what", "channel", "number", "words", "rows"),
     [
         ("dead encoder", 0, 0.0, "encoder 1 has not changed for 0.50 s under 0.25 A or more", 551),
-        ("dead encoder", 1, 0.0, "encoder 2 has not counted", 551),
+        ("dead encoder", 1, 0.0, "encoder 2 has not changed", 551),
         ("saturated gauge", 0, 0.0, "strain gauge 1 is saturated at 10.00 V", 301),
         ("saturated gauge", 1, 0.0, "strain gauge 2 is saturated", 301),
         ("limit switch", 2, 0.0, "limit switch 2 is tripped", 301),

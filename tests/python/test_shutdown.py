@@ -325,7 +325,7 @@ def test_whatever_ends_a_recording_its_rows_are_kept(monkeypatch, tmp_path, erro
 def test_a_dangling_partial_link_is_not_followed(tmp_path):
     away = tmp_path / "away"
     (tmp_path / "run.csv.partial").symlink_to(away)
-    with pytest.raises(ftlm.DataError, match="did not end"):
+    with pytest.raises(ftlm.DataError, match="a program that was interrupted"):
         rig.record(duration=0.1, out=tmp_path / "run.csv")
     rig.record(duration=0.1, out=tmp_path / "run.csv", force=True)
     assert not away.exists()

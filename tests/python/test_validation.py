@@ -157,7 +157,7 @@ def test_a_model_that_knows_no_m_takes_what_the_run_carries(small_model, small_r
     unknown = replace(small_model, m=None)
     assert unknown.compare(small_run).m == 512
     assert small_model.compare(small_run.window(0, 4)).m == 199
-    with pytest.raises(ftlm.ModelError, match=r"m = 513 is more than run 'small, simulated' carries: 513 rows are 512"):
+    with pytest.raises(ftlm.ModelError, match=r"m = 513 is more than run 'small, simulated' allows: 513 rows give 512"):
         small_model.compare(small_run, m=513)
 
 

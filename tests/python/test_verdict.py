@@ -64,7 +64,7 @@ def checked(found, other):
 def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
     judged = verdict(found, checked)
     assert (judged.level, judged.reasons, judged.trusted) == ("trust", (), True)
-    assert judged.reason.startswith("it predicts validation runs (y 99")
+    assert judged.reason.startswith("it predicts validation runs (y 98.99 %)")
     assert checked.verdict == judged == found.verdict(checked)
     assert found.verdict() == found.verdict
     assert str(checked).startswith("TRUST: ")

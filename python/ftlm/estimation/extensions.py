@@ -501,7 +501,7 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
     (name,) = _unused_names("load", 1, structure, run)
     wider = replace(structure, equations=(_with_terms(item, [Term(name, Order(0.0), name)]),))
 
-    def loaded(row: int) -> Run:
+    def with_load(row: int) -> Run:
         return run_with_inputs(run, {name: np.where(np.arange(run.length) >= row, 1.0, 0.0)})
 
     def search(values: Mapping[str, float]) -> tuple[float, int, Mapping[str, float]]:
@@ -512,22 +512,22 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
             row = _load_row(*_residuals_at(values, structure, run), _load_response(item, structure, values, run))
             if row is None or row == best[1]:
                 break
-            fit = fit_output_error([loaded(row)], wider, start={name: 0.0, **values}, refine=False)
+            fit = fit_output_error([with_load(row)], wider, start={name: 0.0, **values}, refine=False)
             noise, values = fit.noise[item.output], fit.values_by_name
             if not noise < best[0]:
                 break
             best = noise, row, values
         return best
 
-    found = []
+    searches = []
     for fit in starts:
         with contextlib.suppress(FtlmError):
-            found.append(search(fit.values_by_name))
-    noise, row, values = min(found, key=lambda f: f[0], default=(math.inf, 0, {}))
+            searches.append(search(fit.values_by_name))
+    noise, row, values = min(searches, key=lambda s: s[0], default=(math.inf, 0, {}))
     if not math.isfinite(noise):
         return []
     time = run.start + row * run.step
-    return [Extension("load_step_fits", wider, 2, [name], [values], runs=as_runs(loaded(row)), load_time=time)]
+    return [Extension("load_step_fits", wider, 2, [name], [values], runs=as_runs(with_load(row)), load_time=time)]
 
 
 def _residuals_at(values: Mapping[str, float], structure: Structure, run: Run) -> tuple[Floats, Floats]:
