@@ -66,6 +66,7 @@ __all__ = [
     "panic_on_purpose",
     "point_samples",
     "portmanteau",
+    "prediction_ratio",
     "profile_intervals",
     "projected_errors",
     "pulse_mean_rows",
@@ -485,6 +486,9 @@ def cost_surface(
 def covariance_of(jacobian: _Floats, series: Sequence[_Floats], squares: float) -> _Matrix: ...
 def fit_covariance(jacobian: _Floats, series: Sequence[_Floats], shares: _Floats | None) -> _Matrix: ...
 def long_run_covariance(jacobian: _Floats, series: Sequence[_Floats]) -> _Matrix: ...
+def prediction_ratio(
+    few: _Floats, many: _Floats, residuals: _Floats, blocks: Sequence[Sequence[tuple[int, int]]], most: int
+) -> float: ...
 def whitening_filter(series: Sequence[_Floats], most: int) -> tuple[_Vector, float]: ...
 def arx_model(
     series: Sequence[_Floats], inputs: Sequence[Sequence[_Floats]], most: int

@@ -1,5 +1,6 @@
 //! Estimators of coefficients at given orders, and of orders and coefficients together.
 
+pub mod generalized_least_squares;
 pub mod instrumental_variables;
 pub mod joint_fit;
 pub mod least_squares;

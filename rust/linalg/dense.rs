@@ -141,6 +141,36 @@ pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
     Some(SingularValues { left: vectors(decomposition.U()), values: sizes, right: vectors(decomposition.V()) })
 }
 
+/// Least-squares solution of smallest norm. O(k²m). Singular values below a fraction `share` of the largest count as 0.
+///
+/// None if the singular values cannot be computed, which does not occur for finite values.
+///
+/// ```
+/// // The two columns are equal: each gets half of what one would get.
+/// let found = ftlm::linalg::dense::minimum_norm_solution(&[vec![1.0, 1.0], vec![1.0, 1.0]], &[3.0, 1.0], 1e-12);
+/// assert!(found.is_some_and(|x| x.iter().all(|v| (v - 1.0).abs() < 1e-12)));
+/// ```
+#[must_use]
+pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], share: f64) -> Option<Vec<f64>> {
+    let k = columns.len();
+    let mut solution = vec![0.0; k];
+    if k == 0 {
+        return Some(solution);
+    }
+    let tall: Vec<Vec<f64>> = columns.iter().cloned().chain([target.to_vec()]).collect();
+    let factor = triangular_factor(&tall);
+    let column = |j: usize| -> Vec<f64> { (0..=k).map(|i| factor[i * (k + 1) + j]).collect() };
+    let factors = singular_values(&(0..k).map(column).collect::<Vec<_>>())?;
+    let (rest, least) = (column(k), share * factors.values.first().copied().unwrap_or(0.0));
+    for ((left, value), right) in factors.left.iter().zip(&factors.values).zip(&factors.right) {
+        if *value > least {
+            let amount = left.iter().zip(&rest).map(|(u, v)| u * v).sum::<f64>() / value;
+            solution.iter_mut().zip(right).for_each(|(x, v)| *x += amount * v);
+        }
+    }
+    Some(solution)
+}
+
 /// Inner products of every left with every right column of equal length, row-major left × right.
 ///
 /// O(left·right·m) on the threads of the current pool. The result is invalid after `stop` was set.

@@ -1,10 +1,11 @@
 //! Simulation of equations with non-linear terms, pulse by pulse, and its sensitivities.
 //!
-//! A state channel is an output, or a derivative D^ρ of an output that enters an expression. Its pulse means are z = L
-//! + Σ κ_η ∗ (w x). L is the part due to inputs and initial terms, κ_η the kernel of I^η, and x a channel of a linear
-//! term or the value of an expression, with weight w. The autoregressive terms are not inverted, so no kernel grows
-//! exponentially, and an unstable linear part loses no digits. The scheme is implicit; Newton iterations that start at
-//! the last pulse solve it. Sensitivities obey the same sums, linearized at the simulation, and need no iteration.
+//! A state channel is an output, or a derivative D^ρ of an output that enters an expression. Its pulse means z are the
+//! sum of L and of κ_η ∗ (w x) over all terms. L is the part due to inputs and initial terms, κ_η the kernel of I^η, and
+//! x a channel of a linear term or the value of an expression, with weight w. The autoregressive terms are not inverted,
+//! so no kernel grows exponentially, and an unstable linear part loses no digits. The scheme is implicit; Newton
+//! iterations that start at the last pulse solve it. Sensitivities obey the same sums, linearized at the simulation, and
+//! need no iteration.
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
 use super::contact::{BodyDerivatives, BodyMotion, BodyState, ContactOperators, PulseEquations};

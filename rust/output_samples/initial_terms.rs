@@ -2,9 +2,9 @@
 
 use super::richardson::{add_multiple, Rows};
 use crate::error::{check_length, Error, Result};
-use crate::linalg::dense;
+use crate::linalg::dense::minimum_norm_solution;
 use crate::linalg::orthogonal::norm;
-use crate::signal::statistics::{inner, mean};
+use crate::signal::statistics::mean;
 
 /// Relative distance of the response to an initial term from the span of the other responses, below which it is
 /// collinear, as in the joint fit.
@@ -85,11 +85,12 @@ pub fn fit_initial_terms(
     let mut scaled: Vec<Vec<f64>> = columns.iter().map(weighted).collect();
     let sizes: Vec<f64> = scaled.iter().map(|column| norm(column)).collect();
     let usable: Vec<usize> = (0..sizes.len()).filter(|&k| sizes[k].is_finite() && sizes[k] > 0.0).collect();
-    let mut tall: Vec<Vec<f64>> =
+    let tall: Vec<Vec<f64>> =
         usable.iter().map(|&k| std::mem::take(&mut scaled[k]).into_iter().map(|v| v / sizes[k]).collect()).collect();
-    tall.push(weighted(&missing));
+    let error = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
+    let solution = minimum_norm_solution(&tall, &weighted(&missing), COLLINEARITY_TOLERANCE).ok_or_else(error)?;
     let mut values = vec![0.0; units.len()];
-    for (&k, value) in usable.iter().zip(minimum_norm_solution(&tall, COLLINEARITY_TOLERANCE)?) {
+    for (&k, value) in usable.iter().zip(solution) {
         values[k] = value / sizes[k];
     }
     let (mut outputs, mut initial) = (driven, vec![Vec::new(); n]);
@@ -100,26 +101,4 @@ pub fn fit_initial_terms(
         }
     }
     Ok(OutputSamples { outputs, initial })
-}
-
-/// Minimum-norm least-squares solution with the last column as target. Singular values below a fraction `share` of the
-/// largest are set to zero.
-fn minimum_norm_solution(columns: &[Vec<f64>], share: f64) -> Result<Vec<f64>> {
-    let k = columns.len();
-    let factor = dense::triangular_factor(columns);
-    let mut square: Vec<Vec<f64>> = (0..k).map(|j| (0..k).map(|i| factor[i * k + j]).collect()).collect();
-    let target = square.pop().unwrap_or_default();
-    let mut solution = vec![0.0; square.len()];
-    if square.is_empty() {
-        return Ok(solution);
-    }
-    let error = || Error::Internal { what: "singular values of initial terms that do not converge".into() };
-    let factors = dense::singular_values(&square).ok_or_else(error)?;
-    let least = share * factors.values[0];
-    for ((left, value), right) in
-        factors.left.iter().zip(&factors.values).zip(&factors.right).filter(|((_, v), _)| **v > least)
-    {
-        add_multiple(&mut solution, inner(left, &target) / value, right);
-    }
-    Ok(solution)
 }

@@ -6,7 +6,7 @@
 
 use crate::equation::Filter;
 use crate::error::{check_points, Result};
-use crate::linalg::dense::{multiply, singular_values};
+use crate::linalg::dense::{minimum_norm_solution, multiply};
 use crate::linalg::orthogonal::norm;
 use crate::linalg::small::spectral_radius;
 use crate::state_space::exponential;
@@ -113,7 +113,9 @@ impl FilterStates {
         let scaled: Vec<Vec<f64>> =
             columns.iter().zip(&sizes).map(|(c, size)| c.iter().map(|v| v / size).collect()).collect();
         let rest: Vec<f64> = samples.iter().zip(&first).map(|(v, one)| v - level * one).collect();
-        let mut scaled_states = minimum_norm_solution(&scaled, &rest)?;
+        #[allow(clippy::cast_precision_loss)]
+        let rounding = f64::EPSILON * rest.len().max(scaled.len()) as f64;
+        let mut scaled_states = minimum_norm_solution(&scaled, &rest, rounding)?;
         scaled_states.iter_mut().zip(&sizes).for_each(|(x, size)| *x /= size);
         scaled_states.truncate(states - 1);
         scaled_states.push(level);
@@ -161,21 +163,4 @@ fn free_responses(system: &[f64], n: usize, starts: &[Vec<f64>], count: usize, s
         power = multiply(&power, &power, n, n, n);
     }
     Some((0..rows).map(|row| (0..count).map(|k| responses[(k * rows + row) * n + state]).collect()).collect())
-}
-
-/// Least-squares solution of smallest norm; None if the singular values cannot be computed.
-#[allow(clippy::cast_precision_loss)]
-fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64]) -> Option<Vec<f64>> {
-    let factors = singular_values(columns)?;
-    let least = factors.values.first().copied().unwrap_or(0.0)
-        * f64::EPSILON
-        * target.len().min(columns.first().map_or(0, Vec::len)).max(columns.len()) as f64;
-    let mut solution = vec![0.0; columns.len()];
-    for ((direction, value), right) in factors.left.iter().zip(&factors.values).zip(&factors.right) {
-        if *value > least {
-            let share = direction.iter().zip(target).map(|(u, v)| u * v).sum::<f64>() / value;
-            solution.iter_mut().zip(right).for_each(|(x, v)| *x += share * v);
-        }
-    }
-    Some(solution)
 }

@@ -34,11 +34,9 @@ from ftlm.structure.structure import History, Initial, Structure, offset_exponen
 from ftlm.utils.linalg import (
     column_norms,
     dot,
-    minimum_norm_solution,
     orthonormal,
     projections,
     thin_svd,
-    triangular_factor,
 )
 from ftlm.utils.statistics import (
     ROUNDING_RESIDUAL_RATIO,
@@ -53,14 +51,6 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS
 
 #: Block pulses per sampling interval if the fit does not state its refinement.
 DEFAULT_PULSES_PER_SAMPLE = 2
-#: Maximum number of alternations between the fit of the noise and the regression under that noise.
-NOISE_FITS = 4
-#: Rows of the lagged residuals that are stored at a time.
-NOISE_BLOCK_ROWS = 1 << 14
-#: Samples of the shortest run for each lag of an autoregression.
-SAMPLES_PER_NOISE_LAG = 10
-#: Singular values of whitened columns, relative to the largest one, below which they are collinear.
-NOISE_RANK_TOLERANCE = 1e-10
 #: Relative size of the offset sensitivity below which it is collinear with the other parameters.
 OFFSET_COLLINEARITY_TOLERANCE = 1e-6
 #: Smallest reported effect of an offset, as a fraction of the standard deviation of the output.
@@ -206,7 +196,9 @@ def offset_test(
     along = projections(basis_part, residuals)
     # The initial terms, which are projected out of all columns, are fitted anew under the color of the noise.
     common = np.column_stack([basis, *_initial_responses(point, blocks, residuals.size)])
-    statistic = _prediction_ratio(common, np.column_stack([common, basis_part]), residuals, blocks)
+    few, many = (np.ascontiguousarray(c.T) for c in (common, np.column_stack([common, basis_part])))
+    by_output = [list(places_of_output) for places_of_output in zip(*blocks, strict=True)]
+    statistic = _core.prediction_ratio(few, many, residuals, by_output, DEFAULT_LAGS)
     explained = basis_part @ along
     sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
     weights = [w for _ in runs for w in grid.weights]
@@ -265,109 +257,6 @@ def _initial_responses(point: Iterate, blocks: list[list[tuple[int, int]]], size
             columns.append(np.zeros((size, len(responses))))
             columns[-1][own[0][0] : own[-1][1]] = responses.T
     return columns
-
-
-def _prediction_ratio(few: Floats, many: Floats, residuals: Floats, blocks: list[list[tuple[int, int]]]) -> float:
-    """Return the decrease of the noise criterion from the columns `few` to the columns `many`, at least 0.
-
-    For equal autoregressions it is twice the logarithm of the likelihood ratio of their one-step prediction errors.
-    Predictions are compared because a random walk has a large mean, but white increments. Each set of columns has its
-    own autoregression order, because the order needed without constants can imitate a constant. Both sets are evaluated
-    on the same rows.
-    """
-    outputs = [[slice(*own[k]) for own in blocks] for k in range(len(blocks[0]))]
-    shortest = [min(p.stop - p.start for p in places) for places in outputs]
-    most = [min(DEFAULT_LAGS, size // SAMPLES_PER_NOISE_LAG) for size in shortest]
-    orders = [_noise_criterion(columns, residuals, outputs, most)[1] for columns in (few, many)]
-    max_orders = [max(pair) for pair in zip(*orders, strict=True)]
-    one, other = (_noise_criterion(columns, residuals, outputs, max_orders)[0] for columns in (few, many))
-    return max(one - other, 0.0)
-
-
-def _noise_criterion(
-    columns: Floats, residuals: Floats, outputs: Sequence[Sequence[slice]], max_orders: Sequence[int]
-) -> tuple[float, list[int]]:
-    """Return the noise criterion after regression on columns, and the order of the noise of each output.
-
-    The criterion is that of :func:`_fit_autoregression`, summed over the outputs. Generalized least squares and the fit
-    of autoregressions alternate until it no longer decreases. `max_orders` bounds the order of each output and is the
-    first predicted row of each run. `columns` are orthonormal.
-    """
-    both, amounts = np.column_stack([columns, residuals]), projections(columns, residuals)
-    best, orders = math.inf, list(max_orders)
-    for _ in range(NOISE_FITS):
-        noise = residuals - columns @ amounts
-        fits = [
-            _fit_autoregression([noise[p] for p in places], most)
-            for places, most in zip(outputs, max_orders, strict=True)
-        ]
-        criterion = sum(f.criterion for f in fits)
-        if not criterion < best:
-            break
-        best, orders = criterion, [f.order for f in fits]
-        whitened = np.concatenate(
-            [
-                f.whiten(both[place], first)
-                for f, places, first in zip(fits, outputs, max_orders, strict=True)
-                for place in places
-            ]
-        )
-        amounts = minimum_norm_solution(whitened[:, :-1], whitened[:, -1], NOISE_RANK_TOLERANCE)
-    return best, orders
-
-
-@dataclass(frozen=True)
-class _Autoregression:
-    """Autoregression without a constant: whitening filter, and deviation and criterion of its errors."""
-
-    filter: Floats
-    deviation: float
-    criterion: float
-
-    @property
-    def order(self) -> int:
-        return self.filter.size - 1
-
-    def whiten(self, columns: Floats, start: int) -> Floats:
-        """Return prediction errors of columns from a row on, divided by their standard deviation."""
-        rows = columns[start - self.order :].T
-        return np.stack([np.convolve(row, self.filter, "valid") for row in rows], axis=1) / self.deviation
-
-
-def _fit_autoregression(series: Sequence[Floats], most: int) -> _Autoregression:
-    """Return the autoregression of lower criterion: of the series, or of their increments, whose root is fixed at 1.
-
-    Both are fitted by least squares from row ``most`` of each series on. Orders minimize Akaike's criterion, because
-    white noise on a random walk needs many lags. The criterion of the series has an additional penalty log(rows). An
-    estimated root near 1 is biased downward, so a random walk would otherwise count as stationary noise about a mean.
-    Series are not centered, because their mean is tested.
-    """
-    factor = np.zeros((most + 1, most + 1))
-    for windows in (np.lib.stride_tricks.sliding_window_view(e, most + 1) for e in series):
-        for block in np.array_split(windows, len(windows) // NOISE_BLOCK_ROWS + 1):
-            # Lags first, the predicted row last: each order is a part of one triangular factor.
-            factor = triangular_factor(np.concatenate([factor, np.column_stack([block[:, -2::-1], block[:, -1]])]))
-    rows = sum(e.size - most for e in series)
-    fits = [_nested_regression(factor, rows, np.ones(1), math.log(rows))]
-    if most:
-        changes = np.column_stack([factor[:, :-2] - factor[:, 1:-1], factor[:, -1] - factor[:, 0]])
-        fits.append(_nested_regression(triangular_factor(changes), rows, np.array([1.0, -1.0]), 0.0))
-    return min(fits, key=lambda fit: fit.criterion)
-
-
-def _nested_regression(factor: Floats, rows: int, difference: Floats, penalty: float) -> _Autoregression:
-    """Return the autoregression of the order that minimizes rows log(power) + 2 order + `penalty`.
-
-    The triangular `factor` has the lags first and the predicted value last: regression on the first k columns leaves
-    the last column from row k on. `difference` is the filter that was applied to the series; the result includes it.
-    """
-    last = factor[:, -1]
-    powers = np.maximum(np.cumsum(last[::-1] ** 2)[::-1] / rows, np.finfo(np.float64).tiny)
-    criteria = rows * np.log(powers) + 2.0 * np.arange(last.size) + penalty
-    order = int(np.argmin(criteria))
-    coefficients = np.linalg.lstsq(factor[:order, :order], last[:order], rcond=None)[0]
-    through = np.convolve(np.append(1.0, -coefficients), difference)
-    return _Autoregression(through, math.sqrt(powers[order]), float(criteria[order]))
 
 
 def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str]) -> list[Finding]:

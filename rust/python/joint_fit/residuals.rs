@@ -3,6 +3,7 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
+use crate::estimation::generalized_least_squares;
 use crate::estimation::joint_fit::covariance as spread;
 use crate::python::convert::{copy_vector, matrix, rows, vector, List};
 use crate::python::errors::run_attached;
@@ -61,6 +62,26 @@ pub fn long_run_covariance<'py>(
     let (size, points) = (jacobian.len(), jacobian.iter().map(Vec::len).sum());
     let covariance = run_interruptible(py, points, None, move |_| spread::long_run_covariance(&jacobian, &series))?;
     matrix(py, covariance, size)
+}
+
+/// Likelihood ratio of two nested regressions under autoregressive noise. Columns are rows of the arrays; `blocks` are
+/// the (start, stop) indices of the samples by output and run.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn prediction_ratio(
+    py: Python<'_>,
+    few: PyReadonlyArray2<'_, f64>,
+    many: PyReadonlyArray2<'_, f64>,
+    residuals: PyReadonlyArray1<'_, f64>,
+    blocks: List<List<(usize, usize)>>,
+    most: usize,
+) -> PyResult<f64> {
+    let (few, many, residuals) = (rows(&few)?, rows(&many)?, copy_vector("residuals", &residuals)?);
+    let outputs: Vec<Vec<_>> = blocks.iter().map(|places| places.iter().map(|&(a, b)| a..b.max(a)).collect()).collect();
+    let points = residuals.len().saturating_mul((few.len() + many.len() + most).max(1));
+    run_interruptible(py, points, None, move |stop| {
+        generalized_least_squares::prediction_ratio(&few, &many, &residuals, &outputs, most, stop)
+    })
 }
 
 /// Whitening filter of series with a common spectrum, and the innovation variance.

@@ -1,0 +1,213 @@
+//! Regression under autoregressive noise by generalized least squares, and the likelihood ratio of two of them.
+//!
+//! Predictions one step ahead are compared, because a random walk has a mean as large as itself, but white increments.
+
+use std::ops::Range;
+
+use crate::error::{check_length, Error, Result};
+use crate::linalg::dense::{minimum_norm_solution, triangular_factor};
+use crate::parallel::Stop;
+use crate::signal::statistics::inner;
+
+/// Maximum number of alternations between the fit of the noise and the regression under that noise.
+const MAX_ALTERNATIONS: usize = 4;
+/// Samples of the shortest run for each lag of an autoregression.
+const SAMPLES_PER_LAG: usize = 10;
+/// Rows of the lagged residuals that are stored at a time.
+const BLOCK_ROWS: usize = 1 << 14;
+/// Singular values of whitened columns, relative to the largest one, below which they are collinear.
+const RANK_TOLERANCE: f64 = 1e-10;
+
+/// Twice the logarithm of the likelihood ratio of two nested regressions under autoregressive noise, at least 0.
+///
+/// `residuals` are regressed on the columns `few` and `many`, each set orthonormal. `outputs` are the samples of each
+/// run by output; each output has its own noise of at most `most` lags. Each set has its own order: that which is needed
+/// without the further columns can imitate them. Both are evaluated on the same samples. O(k² N) for k columns or lags.
+///
+/// # Errors
+/// [`Error::Length`] for a column of another length, [`Error::Interrupted`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::estimation::generalized_least_squares::prediction_ratio;
+/// use ftlm::parallel::Stop;
+/// // Alternating noise about a mean of 0.5, and the same noise without a mean.
+/// let noise: Vec<f64> = (0..200).map(|k| if k * k % 7 < 3 { 0.1 } else { -0.1 }).collect();
+/// let constant = vec![vec![1.0 / 200.0_f64.sqrt(); 200]];
+/// let shifted: Vec<f64> = noise.iter().map(|v| v + 0.5).collect();
+/// let ratio = |e: &[f64]| prediction_ratio(&[], &constant, e, &[vec![0..200]], 5, &Stop::default());
+/// assert!(ratio(&shifted)? > 100.0 && ratio(&noise)? < 20.0);
+/// # Ok(())
+/// # }
+/// ```
+pub fn prediction_ratio(
+    few: &[Vec<f64>],
+    many: &[Vec<f64>],
+    residuals: &[f64],
+    outputs: &[Vec<Range<usize>>],
+    most: usize,
+    stop: &Stop,
+) -> Result<f64> {
+    for column in few.iter().chain(many) {
+        check_length("column", residuals.len(), column.len())?;
+    }
+    if let Some(end) = outputs.iter().flatten().map(|place| place.end).find(|end| *end > residuals.len()) {
+        check_length("residuals", end, residuals.len())?;
+    }
+    let shortest = |places: &Vec<Range<usize>>| places.iter().map(Range::len).min().unwrap_or(0);
+    let limits: Vec<usize> = outputs.iter().map(|places| most.min(shortest(places) / SAMPLES_PER_LAG)).collect();
+    let fit = |columns, limits: &[usize]| noise_criterion(columns, residuals, outputs, limits, stop);
+    let (orders, other_orders) = (fit(few, &limits)?.1, fit(many, &limits)?.1);
+    let common: Vec<usize> = orders.into_iter().zip(other_orders).map(|(a, b)| a.max(b)).collect();
+    Ok((fit(few, &common)?.0 - fit(many, &common)?.0).max(0.0))
+}
+
+/// Noise criterion after regression on columns, summed over outputs, and the order of the noise of each output.
+///
+/// Generalized least squares and the fit of autoregressions alternate until the criterion no longer decreases. `limits`
+/// are the largest order of each output and the first predicted sample of each run.
+fn noise_criterion(
+    columns: &[Vec<f64>],
+    residuals: &[f64],
+    outputs: &[Vec<Range<usize>>],
+    limits: &[usize],
+    stop: &Stop,
+) -> Result<(f64, Vec<usize>)> {
+    let mut amounts: Vec<f64> = columns.iter().map(|column| inner(column, residuals)).collect();
+    let (mut best, mut orders) = (f64::INFINITY, limits.to_vec());
+    for _ in 0..MAX_ALTERNATIONS {
+        stop.check()?;
+        let mut noise = residuals.to_vec();
+        columns.iter().zip(&amounts).for_each(|(column, x)| add_multiple(&mut noise, -x, column));
+        let fit = |(places, &most): (&Vec<Range<usize>>, &usize)| {
+            let series: Vec<&[f64]> = places.iter().map(|place| &noise[place.clone()]).collect();
+            Autoregression::fit(&series, most)
+        };
+        let fits: Vec<Autoregression> = outputs.iter().zip(limits).map(fit).collect();
+        let criterion: f64 = fits.iter().map(|fit| fit.criterion).sum();
+        if criterion.is_nan() || criterion >= best {
+            break;
+        }
+        best = criterion;
+        orders = fits.iter().map(Autoregression::order).collect();
+        let whiten = |column: &[f64]| -> Vec<f64> {
+            let of = fits.iter().zip(outputs).zip(limits);
+            of.flat_map(|((fit, places), &first)| {
+                places.iter().flat_map(move |place| fit.whiten(&column[place.clone()], first))
+            })
+            .collect()
+        };
+        let whitened: Vec<Vec<f64>> = columns.iter().map(|column| whiten(column)).collect();
+        let error = || Error::Internal { what: "singular values of whitened columns that do not converge".into() };
+        amounts = minimum_norm_solution(&whitened, &whiten(residuals), RANK_TOLERANCE).ok_or_else(error)?;
+    }
+    Ok((best, orders))
+}
+
+fn add_multiple(sum: &mut [f64], factor: f64, values: &[f64]) {
+    sum.iter_mut().zip(values).for_each(|(sum, v)| *sum += factor * v);
+}
+
+/// Autoregression without a constant.
+struct Autoregression {
+    /// Whitening filter 1, a₁, …, aₙ.
+    filter: Vec<f64>,
+    /// Standard deviation of the prediction errors.
+    deviation: f64,
+    /// Samples times the logarithm of the innovation variance, and a penalty of the order.
+    criterion: f64,
+}
+
+impl Autoregression {
+    /// Autoregression of lower criterion: of the series, or of their increments, whose root is fixed at 1.
+    ///
+    /// Both are fitted by least squares from sample `most` of each series on. Orders minimize Akaike's criterion, because
+    /// white noise on a random walk needs many lags. The criterion of the series is larger by the logarithm of the number
+    /// of samples: an estimated root near 1 is biased downward, so that a random walk would pass for stationary noise
+    /// about a mean. Series are not centered, because their mean is what is tested.
+    #[allow(clippy::cast_precision_loss)]
+    fn fit(series: &[&[f64]], most: usize) -> Self {
+        let size = most + 1;
+        let mut factor = vec![0.0; size * size];
+        for values in series {
+            for start in (most..values.len()).step_by(BLOCK_ROWS) {
+                let end = (start + BLOCK_ROWS).min(values.len());
+                // Lags first, the predicted sample last: each order is a part of one triangular factor.
+                let column = |j: usize| {
+                    let lag = if j < most { j + 1 } else { 0 };
+                    let above = (0..size).map(|i| factor[i * size + j]);
+                    above.chain(values[start - lag..end - lag].iter().copied()).collect()
+                };
+                factor = triangular_factor(&(0..size).map(column).collect::<Vec<_>>());
+            }
+        }
+        let count: usize = series.iter().map(|values| values.len().saturating_sub(most)).sum();
+        let direct = Self::of_best_order(&factor, size, count, &[1.0], libm::log(count.max(1) as f64));
+        if most == 0 {
+            return direct;
+        }
+        let column = |j: usize| -> Vec<f64> {
+            let (one, other) = if j + 1 < most { (j, j + 1) } else { (most, 0) };
+            (0..size).map(|i| factor[i * size + one] - factor[i * size + other]).collect()
+        };
+        let increments = triangular_factor(&(0..most).map(column).collect::<Vec<_>>());
+        let walk = Self::of_best_order(&increments, most, count, &[1.0, -1.0], 0.0);
+        if walk.criterion < direct.criterion {
+            walk
+        } else {
+            direct
+        }
+    }
+
+    /// Autoregression of the order that minimizes count·log(variance) + 2·order + `penalty`.
+    ///
+    /// The triangular factor has the lags first and the predicted sample last: regression on the first k columns leaves
+    /// the last column from row k on. `difference` is the filter that the series passed before, and part of the result.
+    #[allow(clippy::cast_precision_loss)]
+    fn of_best_order(factor: &[f64], size: usize, count: usize, difference: &[f64], penalty: f64) -> Self {
+        let last: Vec<f64> = (0..size).map(|i| factor[i * size + size - 1]).collect();
+        let variance =
+            |order: usize| (inner(&last[order..], &last[order..]) / count.max(1) as f64).max(f64::MIN_POSITIVE);
+        let criterion = |order: usize| count as f64 * libm::log(variance(order)) + 2.0 * order as f64 + penalty;
+        let order = (1..size).fold(0, |best, order| if criterion(order) < criterion(best) { order } else { best });
+        let lags: Vec<Vec<f64>> = (0..order).map(|j| (0..order).map(|i| factor[i * size + j]).collect()).collect();
+        let share = f64::EPSILON * order as f64;
+        let coefficients = minimum_norm_solution(&lags, &last[..order], share).unwrap_or_else(|| vec![0.0; order]);
+        let own: Vec<f64> = std::iter::once(1.0).chain(coefficients.iter().map(|c| -c)).collect();
+        let mut filter = vec![0.0; own.len() + difference.len() - 1];
+        difference.iter().enumerate().for_each(|(k, d)| add_multiple(&mut filter[k..k + own.len()], *d, &own));
+        Self { filter, deviation: variance(order).sqrt(), criterion: criterion(order) }
+    }
+
+    fn order(&self) -> usize {
+        self.filter.len() - 1
+    }
+
+    /// Prediction errors of a series in their standard deviations, from a sample on.
+    fn whiten(&self, series: &[f64], first: usize) -> Vec<f64> {
+        let error = |t: usize| self.filter.iter().enumerate().map(|(k, a)| a * series[t - k]).sum::<f64>();
+        (first..series.len()).map(|t| error(t) / self.deviation).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn filter_of_a_random_walk_has_a_root_at_one() {
+        let mut state = 1_u32;
+        let mut walk = vec![0.0];
+        for _ in 0..500 {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            walk.push(walk[walk.len() - 1] + f64::from(state) / f64::from(u32::MAX) - 0.5);
+        }
+        let fit = Autoregression::fit(&[&walk], 10);
+        assert!(fit.filter.iter().sum::<f64>().abs() < 1e-12);
+        assert!((fit.deviation - (1.0_f64 / 12.0).sqrt()).abs() < 0.02);
+        // The prediction errors of a walk are its increments in their standard deviation.
+        let errors = fit.whiten(&walk, 20);
+        let mean_square = inner(&errors, &errors) / 481.0;
+        assert!(errors.len() == 481 && (mean_square - 1.0).abs() < 0.1);
+    }
+}
