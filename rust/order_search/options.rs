@@ -142,8 +142,8 @@ impl Options {
             Estimator::MultiInnovation(innovation) => innovation.check()?,
             Estimator::InstrumentalVariables(settings) => {
                 if settings.iterations == 0 {
-                    let remedy = "take at least one step, or rank by least squares";
-                    return Err(out_of_range("steps of instrumental variables", 0.0, "[1, ∞)", remedy));
+                    let remedy = "use at least one iteration, or rank by least squares";
+                    return Err(out_of_range("iterations of instrumental variables", 0.0, "[1, ∞)", remedy));
                 }
                 settings.check()?;
             }

@@ -103,8 +103,8 @@ impl OutputSimulation {
     /// signals, which are numbered after the signals of the recording.
     ///
     /// # Errors
-    /// As [`NonlinearSystem::check`]; [`Error::Structure`] for outputs that the recording lacks, for an input term with
-    /// the order of its equation, and if the equations would have to hold for filtered signals.
+    /// As [`NonlinearSystem::check`]. [`Error::Structure`] if the recording lacks an output, or if a measured signal of
+    /// the equations passed the sensor filter. [`Error::OutOfRange`] for an input term with the order of its equation.
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};

@@ -293,7 +293,8 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Return the samples since the last call, shape (n, 9).
+    /// Return the samples since the last call, shape (n, 9): two commanded currents \[A\], four angles \[rad\], two
+    /// measured currents \[A\], and the delay \[s\].
     fn take<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let rows: Vec<Vec<f64>> =
             run_attached(|| Ok(std::mem::take(&mut self.rows).iter().map(|r| r.to_vec()).collect()))?;

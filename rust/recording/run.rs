@@ -382,7 +382,7 @@ impl Recording {
         }))
     }
 
-    /// True if the equations hold for filtered signals: a measured signal that passed the filter enters them.
+    /// True if a measured signal that passed the sensor filter enters the equations. They then relate filtered signals.
     #[must_use]
     pub fn is_all_filtered(&self) -> bool {
         let simulated = |signal| (self.is_coupled || self.has_friction) && self.outputs.contains(&signal);

@@ -64,7 +64,7 @@ pub struct Arm {
     substep: f64,
     substeps: usize,
     operators: Vec<Operator>,
-    /// Accelerations per ampere of both motors.
+    /// Acceleration of each angle per ampere of each motor \[rad/(s² A)\].
     input: [[f64; 2]; 4],
     coulomb: [f64; 2],
     /// Matrix (P − h/2·C)⁻¹, where P are the momenta and C the forces per unit rate at the end of the substep.

@@ -162,8 +162,8 @@ def parallel(first: Model, second: Model) -> Model:
     (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
     if a.delay != b.delay:
         raise ModelError(
-            f"the delays are {a.delay:g} s and {b.delay:g} s, and the sum of both is not an equation with one delay of "
-            "its input; add the simulated outputs"
+            f"the delays are {a.delay:g} s and {b.delay:g} s, but a sum of models has one delay of its input; add the "
+            "simulated outputs"
         )
     top = multiply_polynomials(a.top, b.bottom)
     add_polynomial(top, multiply_polynomials(b.top, a.bottom))

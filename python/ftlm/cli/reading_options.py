@@ -53,7 +53,7 @@ class ReadingOptions:
     resample : STEP
         Resample irregular rows to this step [s].
     missing
-        Missing values; weight: outputs only, hold: inputs too.
+        weight: omit missing outputs; hold: also repeat inputs.
     encoding
         Text encoding, such as cp1252; default detected.
     dates

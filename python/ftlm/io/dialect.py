@@ -175,7 +175,7 @@ class Assumption:
 
 
 def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
-    """Return the name of an option value that is given by name or as the character itself.
+    """Return the name of an option value, which is given by its name (``comma``) or by its character (``,``).
 
     Raise DataError for an unknown value.
     """

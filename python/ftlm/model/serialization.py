@@ -30,11 +30,9 @@ STRIBECK_SCHEMA, FIT_SCHEMA, FINDING_SCHEMA, LEVEL_SCHEMA, NONLINEAR_SCHEMA, PIE
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Term of an equation in a model file.
+    """Term ``factor * coefficient * D^order signal`` of an equation in a model file.
 
-    The coefficient is stored without its factor, with the name of the parameter.
-
-    A non-linear term is stored with the text of its expression.
+    `name` is the name of the coefficient as a parameter. A non-linear term is stored with the text of its expression.
     """
 
     signal: str
@@ -57,7 +55,7 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Stribeck term of friction in a model file: coefficient without its factor, and Stribeck speed."""
+    """Stribeck term ``factor * coefficient * exp(-(D y / speed)^2) * sign(D y)`` of friction in a model file."""
 
     coefficient: float
     speed: float
@@ -67,7 +65,7 @@ class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Friction of an equation in a model file: Coulomb coefficient without its factor, and any Stribeck term."""
+    """Coulomb friction ``factor * coefficient * sign(D y)`` in a model file, with any Stribeck term."""
 
     coefficient: float
     factor: float = -1.0

@@ -674,7 +674,7 @@ def _stored_frames(section: Section | None, first: int, end: int) -> list[Any]:
 def _pending_blocks(section: Section | None, first: int, end: int) -> Iterator[CandidateBlock]:
     """Yield the blocks of a batch that remain to be evaluated.
 
-    They are partial blocks, from their checkpoint, and the gaps between stored blocks.
+    They are the partly evaluated blocks, from their checkpoints on, and the gaps between stored blocks.
     """
     blocks: list[CandidateBlock] = []
     if section is not None:

@@ -53,9 +53,9 @@ def finished_count(counts: Counts) -> int:
 Failures = tuple[tuple[Natural, bool], ...]
 #: Rows (index, raw score, coefficients, initial terms by record), counts, failures (index, whether diverged).
 Part = tuple[tuple[Row, ...], Counts, Failures]
-#: Round, candidates followed, end and length of the batch, its limit.
+#: Round, number of evaluated candidates, then end, length and limit of the current chunk of candidates.
 Place = tuple[Natural, Natural, Natural, Natural, float]
-#: Point of resumption of a partial block with the digest of the visiting order, whether it was restarted, and its part.
+#: Position of a partial block with the digest of the evaluation order, whether it was restarted, and its part.
 Checkpoint = tuple[tuple[Natural, Natural, Natural, Natural, float, Natural], bool, Part]
 #: Equation, first candidate, end (exclusive), limit.
 Span = tuple[int, int, int, float]
@@ -195,9 +195,10 @@ class PartialBlock:
 
 @dataclass
 class Section:
-    """Progress of one search as stored: its complete and partial blocks.
+    """Stored progress of one search: its complete blocks of rounds and its partly evaluated blocks.
 
-    Blocks are indexed by their first round, or candidate of a coupled search.
+    A round is a fixed range of candidates. The key of a block is the number of its first round. In a coupled search it
+    is the number of the first candidate.
     """
 
     law: bool = False

@@ -294,7 +294,7 @@ def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[R
         return [runs] if isinstance(runs, Run) else list(runs)
     task = result.task if isinstance(result, Identification) else None
     if task is None:
-        raise ModelError(f"{parameter('inputs', True)} needs runs; give runs")
+        raise ModelError(f"there are no runs whose inputs {parameter('inputs', True)} could plot; give runs")
     return list(task.runs)
 
 

@@ -83,10 +83,10 @@ class RunFit:
 
     @property
     def estimates(self) -> dict[str, tuple[float, float, float]]:
-        """Free parameters with their 95 % intervals; orders first.
+        """Value and both ends of the 95 % interval of each free parameter, by name; orders first.
 
-        Two terms of the deflection differ only in their orders. The lower order belongs to the elasticity, regardless
-        of its name in the fit.
+        The elasticity a D^beta and the damping d D^mu of the deflection differ only in their orders, so a fit may
+        exchange them. The term of the lower order is therefore named a and beta here.
         """
         joint = self.result.joint
         values = {**self.result.orders, **({} if joint is None else joint.coefficients)}

@@ -385,9 +385,9 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
 
 
 def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
-    """Return the recomputed table of the interpretation that is closest to the printed table.
+    """Return the recomputed table closest to the printed one, over all interpretations of the unstated settings.
 
-    Only deflections are also filtered by the sensor filter.
+    Interpretations with the sensor filter apply to deflections only.
     """
     table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][1].orders
     candidates: list[tuple[float, Interpretation, dict[int, Row]]] = []

@@ -43,10 +43,15 @@ class StageParameters:
 
     Parameters
     ----------
-    a, b, d, g, r
-        Coefficients of the hub equation, and inertia ratio r = (J_1 + J_2)/J_2. They also determine the link equation.
+    a, b, d
+        Stiffness, hub friction and link damping per inertia, the coefficients of the hub equation. That of a term of
+        order n has the unit s^(n - 2).
+    g
+        Motor torque per inertia and current [rad/(s^2 A)].
+    r
+        Inertia ratio (J_1 + J_2)/J_2. The link equation follows from it and the coefficients of the hub equation.
     gamma, beta, mu
-        Free orders of the order law, by which every order must lie in [0, 3). The order of both equations is 2.
+        Free orders. The order law gives all others, which must lie in [0, 3). The order of both equations is 2.
     coulomb
         Coulomb friction as an equivalent motor current [A]; 0 for none.
     """

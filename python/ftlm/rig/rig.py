@@ -181,13 +181,14 @@ def _stop_motors(board: Board, reason: str) -> None:
 class SignalHandlers:
     """Handlers of termination signals that are active from start-up to shutdown of a rig.
 
-    In the main thread, a signal closes the output gate and raises an exception. In other threads, `INTERRUPT_WATCH`
-    stops the motors. The object has no reference to a rig, so that the handler table does not keep a rig alive.
+    In the main thread, a signal closes the gate of the board, so that nothing but 0 V can be written, and raises an
+    exception. In other threads, `INTERRUPT_WATCH` stops the motors. The object has no reference to a rig, so that the
+    handler table does not keep a rig alive.
 
     Parameters
     ----------
     deaf
-        Code objects that no signal may interrupt. Signals that arrive while they run are deferred.
+        Code of functions that no signal may interrupt. A signal during such a function is deferred to its end.
     board
         Board whose motors a signal stops, or None.
     """

@@ -83,9 +83,10 @@ class OutputSamples:
 
 
 def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
-    """Return the exponents of t of the initial terms and the offset of an equation, distinct and ascending.
+    """Return the distinct exponents e of the powers t^e that enter an equation, in ascending order.
 
-    All orders must be numbers. The initial states of a sensor filter have the exponents -1, -2 and so on.
+    The powers are the initial terms and the offset. The initial states of a sensor filter are added with the exponents
+    -1, -2 and so on. All orders must have values.
     """
     alpha = item.order.constant
     exponents = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}

@@ -144,7 +144,9 @@ class BarChart(Figure):
             )
         for name, values in self.tables:
             if values.shape != (count,):
-                raise DataError(f"bars of {name!r} have shape {values.shape}, there are {count} names; give one a name")
+                raise DataError(
+                    f"bars of {name!r} have shape {values.shape}, expected {(count,)}; give one value for each name"
+                )
 
     @cached_property
     def tables(self) -> list[tuple[str, Floats]]:

@@ -165,7 +165,7 @@ class OutputResiduals:
 
     @property
     def is_noise(self) -> bool:
-        """Whether no conclusive test shows a correlation of the residuals with a varying input."""
+        """Whether the residuals pass the test of independence from every input that varies."""
         return all(test.passed for test in self.informative_tests.values())
 
     @property

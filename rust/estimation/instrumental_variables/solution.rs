@@ -44,8 +44,8 @@ impl InstrumentalSettings {
         if self.iterations > MAX_ITERATIONS {
             #[allow(clippy::cast_precision_loss)]
             let steps = self.iterations as f64;
-            let remedy = "use fewer steps; estimates that have not converged by then oscillate";
-            return refuse("steps of instrumental variables", steps, &format!("[0, {MAX_ITERATIONS}]"), remedy);
+            let remedy = "use fewer iterations; estimates that have not converged by then oscillate";
+            return refuse("iterations of instrumental variables", steps, &format!("[0, {MAX_ITERATIONS}]"), remedy);
         }
         if !(self.tolerance >= 0.0 && self.tolerance.is_finite()) {
             let remedy = "give the relative change at which the iterations stop";

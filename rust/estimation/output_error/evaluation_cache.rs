@@ -1,6 +1,7 @@
 //! Cache of kernels and spectra across the evaluations of one optimization.
 //!
-//! Kernels of unchanged orders and their spectra are computed once for all runs on a grid.
+//! The kernel of a term is the power series of its fractional operator. A kernel and its spectrum are computed again
+//! only if the order of the term changes. Runs with the same step and filter share them.
 
 use std::cell::RefCell;
 use std::collections::HashMap;

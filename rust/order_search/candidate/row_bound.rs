@@ -1,6 +1,7 @@
 //! Lower bounds of the squared equation error for a row of candidates that differ in one term.
 //!
-//! The varying term comes last in the factorization L D Lᵀ of the products, so the factor of the others is shared.
+//! The varying term comes last in the factorization L D Lᵀ of the correlation matrix. All candidates of the row
+//! therefore share the factor of the other terms.
 
 use crate::order_search::candidate::columns::{part_of, Columns};
 use crate::order_search::candidate::normal_equations::ResidualSumOfSquares;
@@ -9,7 +10,7 @@ use crate::simd::Lanes;
 /// Maximum number of common terms of a row, not counting the varying term.
 const MAX_COMMON_TERMS: usize = 7;
 
-/// Factor L D Lᵀ of the products of all common terms, and the target's residual after them.
+/// Factor L D Lᵀ of the correlation matrix of all common terms, and the residual of the target after their regression.
 pub(crate) struct CommonFactor<'a> {
     squares: &'a ResidualSumOfSquares,
     count: usize,
@@ -17,7 +18,7 @@ pub(crate) struct CommonFactor<'a> {
     /// Rows of L below its unit diagonal.
     lower: [[f64; MAX_COMMON_TERMS]; MAX_COMMON_TERMS],
     inverse: [f64; MAX_COMMON_TERMS],
-    /// Products of the terms with the target, multiplied by L⁻¹.
+    /// Inner products of the terms with the target, multiplied by L⁻¹.
     values: [f64; MAX_COMMON_TERMS],
     common_coefficients: [f64; MAX_COMMON_TERMS],
     norms: [f64; MAX_COMMON_TERMS],

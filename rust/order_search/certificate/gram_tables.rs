@@ -84,8 +84,9 @@ fn level_intervals((low, high): (f64, f64), level: u8) -> (usize, usize) {
     (first, end.max(first + 1) - first)
 }
 
-/// Midpoint and half width of each node, by signal.
+/// Nodes of all signals. A node is the midpoint of an interval of integration orders of one signal.
 struct NodeLayout {
+    /// Signal, midpoint and half width of each node.
     nodes: Vec<(usize, f64, f64)>,
     terms: Vec<(Option<LevelIntervals>, usize)>,
 }

@@ -1,8 +1,9 @@
-//! Lower bound over a cell from the subspace spanned by its columns and their first two derivatives.
+//! Lower bound of the squared equation error over a cell (a box of orders), for nearly dependent regressor columns.
 //!
-//! If the columns are nearly dependent, the coefficients are poorly determined, and the bound of `cell_bound` is
-//! useless. The distance of the output from this subspace still bounds the equation error for coefficients of limited
-//! size, since the subspace omits only terms of third order from the columns.
+//! Such columns determine the coefficients poorly, and the bound of `cell_bound` is then too low to exclude a cell. This
+//! bound is the distance of the output from a subspace. The columns at the midpoint and their first two derivatives by
+//! the order span it. Columns elsewhere in the cell differ from it by terms of third order only, so the bound holds for
+//! coefficients of limited size.
 
 use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPANSION_COLUMNS, MAX_TERMS};
 

@@ -109,7 +109,7 @@ struct Vector {
     /// Vector Fᵀt of the current column, in reversed time.
     here: [Vec<f64>; 2],
     before: [Vec<f64>; 2],
-    /// Factor g (real, imaginary) and rounding-error bound of the current column.
+    /// Projection g of Fᵀt on t for the current column (real and imaginary part), and the bound of its rounding error.
     last: Option<[f64; 3]>,
 }
 

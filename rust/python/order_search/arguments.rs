@@ -214,8 +214,8 @@ pub enum CountsArg {
 }
 /// Part of a result: rows, counts, (index, true if diverged, false if singular) of failures.
 pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
-/// Checkpoint: (batch, number of evaluated candidates, end, size, limit, order), true if the block was restarted,
-/// partial result.
+/// Checkpoint: position, true if the block was restarted, partial result. The position is the batch, the number of its
+/// evaluated candidates, the end, length and limit of the current chunk, and the digest of the evaluation order.
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
 /// Result of batches as Python tuples.
