@@ -240,7 +240,7 @@ def measurements() -> Iterator[str]:
 
 
 def orders(outputs: Sequence[str] = ("theta12", "theta22")) -> Iterator[str]:
-    """Which orders earn their place on the run that was not fitted to, on each stage of the physics."""
+    """Return the free orders that improve the prediction of the validation run, for each stage of the physics."""
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
     yield "| output | physics so far | order free | fitted on | psf, lqr | the order, 95 % |"
     yield "| --- | --- | --- | --- | --- | --- |"

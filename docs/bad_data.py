@@ -193,11 +193,11 @@ def cell(text):
 PAGE = Path(__file__).resolve().parent / "bad_data.md"
 HEAD = """# Bad data
 
-What is wrong with a run, in four formats, and what ftlm said: every line is what this version answers, made by
-`python docs/bad_data.py` and compared by the tests. *Refused* is an error that names the column, the first bad row
-(counted from 0), the count and the way out. *Said* is a run with a warning, an advice or a refusal to identify; its
-numbers are exactly those given. *Taken* is a run without a word: its numbers are those given, and nothing in them
-shows what is wrong. No case ends in another way: nothing is repaired, filled, dropped or clipped unasked.
+This table lists faults of a run in four formats, with the message of ftlm on each. `python docs/bad_data.py` writes it,
+and the tests compare it with the answers of this version. *Refused* is an error that names the column, the first bad
+row (counted from 0), the count and a remedy. *Said* is a run with a warning, an advice or a refusal to identify. Its
+numbers are exactly those given. *Taken* is a run without a message. Its numbers are those given, and nothing in them
+shows the fault. There is no other outcome: data are repaired, filled, dropped or clipped only on request.
 
 """
 

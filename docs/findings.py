@@ -10,11 +10,12 @@ from ftlm.findings import FINDING_LEVELS, finding_catalogue
 PAGE = Path(__file__).with_suffix(".md")
 LEAD = """# Findings
 
-What ftlm says about a result, a run, a selection or a frequency response is a record with a code, a level, a subject
-(run, output, input, parameter, method) and numbers: `result.findings`, a tuple of `ftlm.Finding`. Sentences and
-remedies are rendered from it, and nothing reads them: `result.warnings` are the sentences. Saved models keep the
-records. Verdicts count *do not use* first, then *with care*; a *fact* is worth knowing, a *note* says how data were
-read. What stands in italics is filled in. `docs/findings.py` writes this page from the catalogue.
+A finding (`ftlm.Finding`) is a record of what ftlm reports about a result, a run, a selection or a frequency response.
+It has a code, a level, a subject (run, output, input, parameter, method) and numbers. `result.findings` is the tuple
+of findings, and `result.warnings` has their sentences. Sentences and remedies are formatted from the records, and no
+code depends on their wording. Saved models keep the records. A verdict follows from the most severe level: *do not
+use*, then *with care*. A *fact* and a *note* do not change it; a note states how data were read. Words in italics
+stand for values. `docs/findings.py` writes this page from the catalogue.
 """
 
 
@@ -24,7 +25,7 @@ CHANGED_LEVELS = (
     ("do not use", "growth_not_told", "a pole on the right, by less: 20 of 40 true integrators had one"),
     ("do not use", "plant_unstable", "pieces of the run show that the plant itself is unstable"),
     ("do not use", "not_told_apart", "an infinite standard error"),
-    ("do not use", "numbers_correlated", "a correlation alone, which intervals hold already"),
+    ("do not use", "numbers_correlated", "a correlation alone, which intervals include already"),
     ("do not use", "explains_little", "residuals that follow an input or are not white"),
     ("do not use", "buried_in_noise", "white residuals: the noise is larger than the signal, and nothing is missing"),
     (
@@ -35,29 +36,29 @@ CHANGED_LEVELS = (
     (
         "with care",
         "residuals_not_white",
-        "residuals that follow an input, or of a model that is not told to be complete",
+        "residuals that follow an input, or a model that is not known to be complete",
     ),
     ("with care", "noise_coloured", "residuals that follow no input: 100 of 100 right models under colored noise"),
-    ("with care", "outliers", "up to half of the squares; 40 of 100 runs with a still phase were accused"),
-    ("with care", "outliers_dominate", "more than half of the squares"),
-    ("with care", "channel_off", "an input acts while the output stands still"),
-    ("with care", "signal_constant", "nothing acts: a machine at rest is no dead channel"),
-    ("with care", "loop_found", "feedback that biases a number by a standard error"),
-    ("with care", "loop_harmless", "feedback that biases none by as much"),
-    ("with care", "loop_not_told", "commands and sweeps, of which the data cannot tell: 223 of 370 records"),
+    ("with care", "outliers", "up to half of the sum of squares; it was false on 40 of 100 runs with a phase at rest"),
+    ("with care", "outliers_dominate", "more than half of the sum of squares"),
+    ("with care", "channel_off", "an input acts while the output is constant"),
+    ("with care", "signal_constant", "no input acts: a machine at rest does not have a dead channel"),
+    ("with care", "loop_found", "feedback that biases a parameter by a standard error"),
+    ("with care", "loop_harmless", "feedback that biases no parameter by as much"),
+    ("with care", "loop_not_told", "commands and sweeps, for which the test is inconclusive: 223 of 370 records"),
     ("with care", "intervals_rough", "a property of the intervals, not a fault of the model"),
-    ("with care", "constant_instead_of_past", "both describe the run; one costs fewer numbers"),
-    ("with care", "looked_like_rest", "a history was estimated, as the residuals ask"),
+    ("with care", "constant_instead_of_past", "both describe the run; one needs fewer parameters"),
+    ("with care", "looked_like_rest", "a history was estimated, because the residuals require it"),
     ("fact", "simulated_from_rest", "a comparison that leaves motion out is wrong at its start"),
     ("fact", "rest_assumed", "a constant input: the gain is that of an assumption"),
-    ("fact", "prior_pulls", "coefficients of an order search that its prior moves"),
-    ("none", "second_optimum", "another optimum as good, with other numbers"),
-    ("none", "noise_decides", "an order search whose ranks noise decides"),
-    ("none", "start_not_told", "two starts explain a run, with two gains"),
+    ("fact", "prior_pulls", "coefficients of an order search that its prior changes"),
+    ("none", "second_optimum", "another optimum as good, with other parameters"),
+    ("none", "noise_decides", "an order search in which noise decides the ranks"),
+    ("none", "start_not_told", "two initial conditions explain a run, with two gains"),
     (
         "none",
         "other_intersample_fits",
-        "an input that was not constant between samples, or not linear, as it was taken",
+        "an input whose behavior between samples was not as assumed (constant or linear)",
     ),
     ("none", "drift_fits", "levels that drift, which bias every parameter"),
     ("none", "moves_before_input", "an output that leaves its level before its input changes"),

@@ -92,7 +92,7 @@ def test_one_of_two_orders_tells_a_run_apart():
     assert improves_prediction([1.0, 2.0], told, {"beta2": 0.0, "mu2": 1.0}) is True
 
 
-def test_a_fractional_damping_earns_its_place_where_the_link_has_one(fractional):
+def test_a_fractional_damping_improves_the_prediction_where_the_link_has_one(fractional):
     link = fractional.deflections["theta12"]
     assert link.verdict("fractional damping").earns is True
     assert link.verdict("both fractional").earns is True
@@ -100,12 +100,12 @@ def test_a_fractional_damping_earns_its_place_where_the_link_has_one(fractional)
     for low, high in link.intervals("fractional damping")["mu2"].values():
         assert low < 0.4 < high
     assert verdict_sentence("theta12", link.verdict("fractional damping")) == (
-        "θ₁₂: a fractional order of the damping earns its place."
+        "θ₁₂: a fractional order of the damping improves the prediction."
     )
 
 
 @pytest.mark.slow
-def test_no_fractional_order_earns_its_place_where_orders_are_whole(whole):
+def test_no_fractional_order_improves_the_prediction_where_orders_are_whole(whole):
     for verdict in whole.deflections["theta12"].verdicts:
         assert verdict.earns is False, verdict
 
@@ -174,7 +174,7 @@ def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
     page = cross_validation_page(fractional, tmp_path / "orders.html")
     text = page.read_text()
     first = text[text.index('id="section-1"') : text.index('id="section-2"')]
-    assert "fractional orders earn their place." in first
+    assert "fractional orders improve the prediction." in first
     for title in ("θ₁₂ on second, fitted to first", "θ₁₂ on first, fitted to second"):
         assert title in first
     link = fractional.deflections["theta12"]
@@ -236,15 +236,15 @@ def test_places_are_told_before_and_after_the_rate(fractional, tmp_path):
     assert list(table.rows[1][1:]) == ["yes", "no"]
     assert list(table.rows[2][1:]) == ["yes", "yes"]
     page = cross_validation_page(found, tmp_path / "orders.html").read_text()
-    assert "Does the order earn its place?" in page
+    assert "Does the order improve the prediction?" in page
     assert page.count("θ₁₂, without the rate of the other deflection") >= 2
     said = found.to_dict()["deflections"]["theta12"]
     assert said["without_rate"] == fractional.to_dict()["deflections"]["theta12"]
     assert [s["verdicts"]["fractional damping"]["earns"] for s in (said["without_rate"], said)] == [True, False]
     text = cross_validation_text(found)
     told = text[text.index("θ₁₂, without the rate of the other deflection:") :]
-    assert "θ₁₂: a fractional order of the damping earns its place." in told
-    assert "θ₁₂: a fractional order of the damping does not earn its place." not in told
+    assert "θ₁₂: a fractional order of the damping improves the prediction." in told
+    assert "θ₁₂: a fractional order of the damping does not improve the prediction." not in told
 
 
 def test_stages_are_those_that_all_runs_have(fractional):
