@@ -228,7 +228,6 @@ impl Realization {
                 if !ratio.is_finite() || ratio.abs() < 1.0 {
                     continue;
                 }
-                // State i becomes `factor` times as small.
                 let factor = ratio.round().exp2();
                 (0..n).filter(|&j| j != i).for_each(|j| {
                     self.system[j * n + i] *= factor;

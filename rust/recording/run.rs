@@ -794,7 +794,7 @@ impl Recording {
                 let places: Vec<f64> = times.iter().map(|time| time / step).collect();
                 readings.jumps(&places, &sizes)
             }));
-            // What was not read everywhere drives nothing.
+            // A signal with a missing sample is not an input.
             let values = self.values_at(signal, &at).filter(|values| !values.iter().any(|v| v.is_nan()));
             point_values.push(PointValues { values, is_zero_order_hold: false });
         }

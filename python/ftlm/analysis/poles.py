@@ -127,7 +127,7 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     sizes = {power: math.log(abs(value)) for power, value in polynomial.items() if value}
     if lowest not in sizes or highest not in sizes:
         return None
-    # In units of the mean frequency all coefficients are of a size.
+    # In units of the mean frequency all coefficients have about the same size.
     unit = (sizes[lowest] - sizes[highest]) / (highest - lowest)
     logs = {power: size - sizes[highest] + unit * (power - highest) for power, size in sizes.items()}
     if max(abs(unit), *logs.values()) > MAX_LOG_FREQUENCY:
@@ -466,7 +466,7 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
     `spread` contains the standard deviations of Re w, Im w and ln abs(Re s).
     """
     size, angle = math.exp(w.real), w.imag
-    # Of a pole that hardly anything tells nobody may say that it is real, let alone that it dies away.
+    # A poorly determined pole may be far from the real axis although its interval includes it, so the limit is fixed.
     sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), REAL_AXIS_ANGLE_RAD)
     if angle >= math.pi - max(sure, DISTINCT_ZERO_TOLERANCE) or angle <= DISTINCT_ZERO_TOLERANCE:
         sign = 1.0 if angle <= DISTINCT_ZERO_TOLERANCE else -1.0

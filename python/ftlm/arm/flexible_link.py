@@ -385,7 +385,7 @@ def flexible_link(
             tied = (("a", (ratio,)), ("b", ()), ("d", (ratio,)), ("g", ()))
         coefficient_law += [(f"{c}{d}", -1.0, (f"{c}{h}", *factors)) for c, factors in tied]
         if cross_stage == "inertial" and j == 2:
-            # Both angles of stage 1 turn what stands on its tip.
+            # Both angles of stage 1 rotate stage 2, which is mounted on its tip.
             coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
         link = PARAMETER_SETS[parameters][j]
         values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
@@ -408,7 +408,7 @@ def flexible_link(
     if form == "lagrange" or input_order == "derived":
         structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})
     if not hub:
-        # Nothing else tells the link's two own terms apart: exchanged, they are the same equation.
+        # Only their order ranges distinguish the link's two terms: exchanged, they give the same equation.
         structure = structure.with_orders(
             {f"{n}{2 * j}": DEFLECTION_ORDER_RANGES[n] for j in stages for n in DEFLECTION_ORDER_RANGES}
         )
@@ -437,7 +437,7 @@ def _joint_equations(
             Term(deflection, order(f"mu{n}"), f"d{n}"),
         ]
         if drive is None and "coefficients" in laws:
-            # The hub's motion bends the link by as much as it turns it, whatever the link is made of.
+            # The motion of the hub enters with the coefficient -1, whatever the parameters of the link.
             terms[1] = Term(hub, order(f"gamma{n}"), -1.0, name=f"b{n}")
         if drive is not None:
             terms.append(Term(current, drive, f"g{n}"))
@@ -486,7 +486,7 @@ def _add_cross_inertia(
         return [Term(f"theta{other}{k}", order, f"{c}{n}") for k, c, order in zip((1, 2), "pq", orders, strict=True)]
 
     hub, deflection = pair
-    # The order of D that makes of the rate of a hub its acceleration is alpha_3 - gamma_3, of a link alpha_2 - mu_2.
+    # The derivative from rate to acceleration has the order alpha_3 - gamma_3 for a hub and alpha_2 - mu_2 for a link.
     own = f"mu{d}" if "velocities" in laws else f"gamma{h}"
     return hub if stage == 1 else _append_terms(hub, terms(h, own)), _append_terms(deflection, terms(d, f"mu{d}"))
 

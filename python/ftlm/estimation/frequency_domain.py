@@ -226,7 +226,7 @@ def _fit_response(
     reached = sum(
         f.cost <= first.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
     )
-    # A last race from where the best ended, so that what a wall had cut goes on.
+    # A last fit from the best end point continues steps that a bound had shortened.
     best = _fit_again(problem, racing, first)
     if racing is problem and first.cost < best.cost:
         best = first
@@ -461,7 +461,7 @@ def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: st
         residuals = problem.residuals(fit.values, jacobian=False)[0]
         if _log_likelihood_difference(fit.cost, ranked[0].cost, kind, residuals.size) > SECOND_OPTIMUM_LOG_LIKELIHOOD:
             break
-        # Elements that change places are one and the same model.
+        # Exchanged circuit elements give the same residuals and the same model.
         noise = ranked[0].cost / residuals.size
         if all(float(np.sum((residuals - other) ** 2)) > SAME_MODEL_POWER * noise for other in series):
             optima.append(fit)

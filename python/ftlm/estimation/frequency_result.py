@@ -110,7 +110,7 @@ def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineCh
     phase = np.degrees(np.unwrap(np.angle(response)))
     order = np.argsort(record.frequency, kind="stable")
     at = np.searchsorted(omega, record.frequency[order])
-    # Whole turns are no difference.
+    # Phases that differ by whole turns are equal.
     angles = record.phase[order] - 360.0 * np.round(np.median(record.phase[order] - phase[at]) / 360.0)
     title = f"{symbol(record.output)} from {symbol(record.input)}, {record.name}"
 

@@ -120,7 +120,7 @@ def fit_with_offset_decision(
     try:
         request = replace(structure, offset="constant")
     except ModelError as error:
-        # One of the initial terms that were given is what an offset integrates to.
+        # A given initial term has the power of t to which an offset integrates.
         return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
     twin = constant_input(runs, structure)
     if twin is not None:
@@ -210,7 +210,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
         return None
     evidence = [rest_evidence(run, structure) for run in runs]
     if any(item is not None and item.rows == 0 for item in evidence):
-        # A constant input never tells.
+        # A constant input gives no evidence of rest.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
     for offset in MOTION_OFFSETS:
@@ -260,7 +260,7 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
             near = fit if candidate is None else candidate[1]
             level = hypotheses.fit(request) if fresh else hypotheses.refit(request, near, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):
-                # The optimum under other initial conditions is far from every one with these.
+                # The optimum under other initial conditions is not near any optimum under these.
                 level = hypotheses.fit(request)
         except FtlmError:
             continue
@@ -580,7 +580,7 @@ def assess_fit(fit: Fit) -> Identification:
         tests = run_residual_tests(model, runs, free, lags=DEFAULT_LAGS, sensitivities=_sensitivities(fit))
         criteria = information_criteria(tests, fit.parameters)
     except DataError:
-        # A run that is too short for correlations; everything else can be told.
+        # The run is too short for correlations. All other results are available.
         pass
     plant = unstable_plant_findings(
         fit, replace(model, estimate=_estimate(fit, comparison, None, ())), runs, comparison
@@ -588,7 +588,7 @@ def assess_fit(fit: Fit) -> Identification:
     if plant:
         findings = [*plant, *(f for f in findings if not f.kind.judges_whole_run)]
     if any(f.code == "plant_unstable_in_pieces" for f in plant):
-        # The residuals of simulations that grow say nothing of the model.
+        # Residuals of unstable simulations are no test of the model.
         tests, criteria = None, None
     tests = None if tests is None else _with_feedback_bias(fit, tests)
     if tests is not None:
@@ -602,7 +602,7 @@ def assess_fit(fit: Fit) -> Identification:
         findings = [f for f in findings if f.code != "residuals_not_white" or f.output not in directed]
         explained = bool(missing) and all(f.code != "dynamics_missing" for f in missing)
         if directed and not explained:
-            # No linear structure explains them: what the direction of motion shows is more specific.
+            # No linear structure explains the residuals, so the finding on the direction of motion is more specific.
             missing = []
         if not missing:
             white = {o for o, r in tests.outputs.items() if r.whiteness.passed}

@@ -99,7 +99,7 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
             make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
         )
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
-        # Negated so that a standard error that is not a number counts as too large.
+        # Negated so that a NaN standard error counts as too large.
         if name in unidentifiable:
             continue
         if not errors[name] <= high - low and not _has_bounded_interval(joint, name):
@@ -118,7 +118,7 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
                 make_finding("on_bound", parameter=item.name, what=f"the {item.words}", value=f"{value:g}{unit}")
             )
     for name, value in joint.coefficients.items():
-        # Where the cost is no parabola, its profile knows better.
+        # If the cost is not quadratic, the profile is more accurate than the standard error.
         is_bounded = name in joint.profiles and 0.0 not in joint.profiles[name]
         if name not in unidentifiable and not errors[name] <= abs(value) and not is_bounded:
             findings.append(make_finding("not_different_from_0", parameter=name, value=value, error=errors[name]))
@@ -180,7 +180,7 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
     first = max(MAX_SECOND_SAMPLES // len(runs), MIN_SECOND_RUN_SAMPLES)
     parts = [run.window(0.0, first * run.step) if run.length > 2 * first else run for run in runs]
     optima = [(values, 0.0) for values in far]
-    # An optimum that is another one on all samples is one on the first part, too, where it costs less to find.
+    # A second optimum on all samples is also one on the first part, on which the search is cheaper.
     for some in [parts, runs] if any(part is not run for part, run in zip(parts, runs, strict=True)) else [runs]:
         grid = Objective(problem, some, weights, every=joint.refinement)
         optima = _other_optima(grid, joint.values, [values for values, _ in optima]) if optima else []
@@ -209,7 +209,7 @@ def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> li
             if is_other and cost_there - cost <= SECOND_OPTIMUM_LOG_LIKELIHOOD:
                 optima.append((values, cost_there - cost))
     except FtlmError:
-        # No finite simulation on the way.
+        # The path between the optima has no finite simulation.
         return []
     return optima
 
@@ -217,7 +217,7 @@ def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> li
 def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:
     """Return findings on an unstable optimum, which say whether it or a stable one was chosen."""
     if joint.unstable_optimum is None or joint.unstable_optimum.residual_excess <= 0.0:
-        # One that costs more than the stable one was none.
+        # An unstable optimum with a larger cost than the stable one is no alternative.
         return []
     excess = 100.0 * joint.unstable_optimum.residual_excess
     if not joint.unstable_optimum.is_accepted:
@@ -310,7 +310,7 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
         noise = noise_at_start(y)
         early, slope = float(y[row]) - level, float(y[row + 1] - y[row])
         rows = early / slope if slope else math.inf
-        # A level that walks is no longer where it was, but its last change is one of many.
+        # A drifting level leaves its mean, too. Its last increment is not larger than the others, however.
         increments = np.diff(drop_missing(y[: row + 1]))
         usual = max(noise, float(np.sqrt(np.mean(increments[:-1] ** 2))))
         is_early = abs(early) > EARLY_SIGMAS * noise and abs(increments[-1]) > EARLY_SIGMAS * usual
@@ -326,7 +326,6 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
     """Return a finding on outliers of an output, unless a robust loss was used."""
     if joint.robust is not None:
         return []
-    # In the unit of the output.
     series = [joint.noise[output] * part[output] for part in joint.residuals]
     every = drop_missing(np.concatenate(series))
     outputs = [compared_values(run, structure, output) for run in runs]
@@ -407,7 +406,7 @@ def quantization_step(values: Floats) -> float:
     gaps = gaps[gaps > 1e-9 * max(float(np.abs(levels).max()), float(np.ptp(levels)))] if gaps.size else gaps
     if gaps.size == 0:
         return 0.0
-    # Rounding apart, the least gap is the step; the mean of those close to it tells it better.
+    # The smallest gap is the step with a rounding error. The mean of similar gaps reduces this error.
     step = float(np.mean(gaps[gaps < 1.5 * gaps.min()]))
     multiples = gaps / step
     return step if float(np.abs(multiples - np.rint(multiples)).max()) < QUANTIZATION_STEP_TOLERANCE else 0.0
@@ -417,7 +416,7 @@ def correlation_findings(joint: JointFit) -> list[Finding]:
     """Return findings on groups of parameters that are not separately identifiable, one per group."""
     errors, correlation = joint.standard_errors, np.abs(joint.correlation)
     sizes = {n: abs(v) for n, v in joint.values_by_name.items()}
-    # Negated so that a standard error that is not a number counts as too large.
+    # Negated so that a NaN standard error counts as too large.
     vague = [
         i
         for i, n in enumerate(joint.names)

@@ -316,8 +316,8 @@ def fit_with_initial_conditions(
 
     decided = structure.initial != "auto" or not has_memory(structure) or not structure.is_linear
     if not decided and isinstance(start, History):
-        # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
-        # for more terms, not for fewer.
+        # If few terms suffice on the coarsest grid, only they are fitted on finer grids: discretization errors favor
+        # more terms, not fewer.
         request = replace(structure, initial=start)
         multistart = None if alone else run_multistart(runs, request, threads, progress)
         many = fit_initial_terms(start, refine=False, multistart=multistart)
@@ -436,7 +436,7 @@ def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structu
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
         few = refit_from(joint, runs, replace(request, initial="caputo"), loss)
-        # On the same kind of grid: what a coarse one leaves is not a history.
+        # Both fits use the same grids, because discretization errors of a coarse grid are no evidence of a history.
         many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
         return None

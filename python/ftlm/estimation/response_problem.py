@@ -213,7 +213,7 @@ class ResponseProblem:
                 for n, w in term.order.weights:
                     out[:, self._place[n]] += w * size * log * derivative
                 if not isinstance(term.coefficient, str):
-                    # A known coefficient is one in seconds: in this unit it follows the orders.
+                    # A fixed coefficient is given in seconds. Its value in scaled time depends on the orders.
                     for its, sign in ((item.order, -1.0), (term.order, 1.0)):
                         for n, w in its.weights:
                             out[:, self._place[n]] += sign * w * np.log(self.unit) * size * derivative
@@ -339,7 +339,7 @@ def _points(problem: ResponseProblem) -> Floats:
     axes = list(problem.search_ranges().values())
     has_values = [n in problem.structure.order_values for n in problem.orders]
     delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
-    # A delay that is off by a third of a period at the highest frequency still leads downhill.
+    # An error of a third of a period at the highest frequency is still within reach of the optimum.
     fastest = max(float(r.frequency.max()) for r in problem.records)
     fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
     room = max(MAX_GRID_POINTS // int(np.prod(fine, initial=1)), 60)
@@ -348,7 +348,7 @@ def _points(problem: ResponseProblem) -> Floats:
     free = count - sum(has_values)
     each = int(np.floor((room / max(lattice, 1)) ** (1.0 / free))) if free and lattice <= room else 0
     if (free and each < 4) or (not free and lattice > room):
-        # Too many axes for a lattice: points that fill the box evenly, the same every time.
+        # For too many axes, a low-discrepancy sequence replaces the grid; it is deterministic.
         spread = halton(room, count)
         columns = [
             np.asarray(a)[(spread[:, k] * len(a)).astype(int)] if g else a[0] + spread[:, k] * (a[1] - a[0])
@@ -554,7 +554,7 @@ def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, late: C
     other = next((r for r in problem.records if r.output == outputs.index(name) and r.input == record.input), None)
     if other is None:
         return 0.0
-    # Between measured frequencies, where there are other ones; a start needs no more.
+    # Linear interpolation between the frequencies of the other record suffices for an initial guess.
     order = np.argsort(other.frequency, kind="stable")
     at, x = np.log(record.frequency), np.log(other.frequency[order])
     values = other.response[order]

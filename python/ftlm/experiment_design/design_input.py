@@ -245,7 +245,7 @@ def design_input(
         raise ModelError(
             f"{setting('criterion')} {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
         )
-    # An order is of size 1 by itself; what else is known, is known as a share of itself.
+    # The standard error of an order counts as such, that of any other parameter relative to its value.
     units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in at]
     goal = Criterion(criterion, at, tuple(units))
     seed = check_seed(seed)
@@ -317,7 +317,7 @@ def _design_candidates(
             f"no input of this length makes {', '.join(fit.names[i] for i in goal.indices)} separately identifiable "
             "from the other parameters; name fewer parameters, or make the run longer"
         )
-    # Of each kind the best one: what they lead to differs more than what they are.
+    # The best design of each kind is kept, because kinds lead to different local optima.
     kinds: dict[str, Design] = {}
     for design in sorted(feasible, key=lambda d: -d.score):
         kinds.setdefault(design.name.split(",")[0].split(" by")[0], design)
@@ -507,7 +507,7 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
         if own:
             low, high = max(low, min(own) / 10), min(high, 10 * max(own))
     except FtlmError:
-        # Where its modes cannot be told, the run's own band stands.
+        # Without identifiable modes the band of the run is used.
         pass
     band = f"{low:.2g}:{max(high, 2 * low):.2g}"
     raise ModelError(

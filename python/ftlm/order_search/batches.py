@@ -318,7 +318,7 @@ def _result(future: Future[Any], block: CandidateBlock) -> tuple[float, Any] | N
             raise _executor_error(error) from error
         return None
     if timed is None and not block.with_problem:
-        # The worker has not got what the search is computed from: it goes along the next time.
+        # The worker lacks the problem of the search. The next attempt sends it along.
         block.with_problem = True
         return None
     if not isinstance(timed, tuple) or len(timed) != 2:

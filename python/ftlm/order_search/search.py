@@ -163,7 +163,7 @@ class Job:
 
     def request(self, name: str) -> Request:
         """Return the definition of the search that a checkpoint file stores under a name."""
-        # Hints are not written: they tell a fit where to start and change no search.
+        # Hints are initial guesses of a fit and do not change a search.
         structure = replace(self.structure, hints=UNSET)
         # The records say it, where there is one: what has none is written as it always was.
         object.__setattr__(structure, "offset", UNSET)
@@ -638,7 +638,7 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
             start_time = clock()
             (part.coupled_problem() if job.structure.has_order_law else part.equation_problem()).search(None)
         except FtlmError:
-            # So coarse a lattice may have no candidate, or none with a finite score.
+            # So coarse a grid may have no candidate, or none with a finite score.
             continue
         trials.append((count, clock() - start_time))
         if trials[-1][1] >= PROBE_TIME_S:

@@ -127,7 +127,6 @@ def _draw_lines(axis: Any, chart: LineChart) -> None:
     if chart.bars is not None:
         edges, heights = chart.bars
         axis.bar(edges[:-1], heights, np.diff(edges), align="edge", color=LINE_STYLES[2][0], alpha=0.55)
-    # Measured points are below the curves.
     below_first = sorted(zip(chart.lines, styles, strict=True), key=lambda line: line[0][0] not in chart.dots)
     for (name, values), style in below_first:
         color, _, dashes = LINE_STYLES[style]
@@ -294,7 +293,7 @@ def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[R
         return [runs] if isinstance(runs, Run) else list(runs)
     task = result.task if isinstance(result, Identification) else None
     if task is None:
-        raise ModelError(f"there are no runs whose inputs {parameter('inputs', True)} could plot; give runs")
+        raise ModelError(f"{parameter('inputs', True)} plots the inputs of the runs, but there are no runs; give runs")
     return list(task.runs)
 
 
@@ -622,7 +621,6 @@ def _designed_chart(result: DesignedInput, name: str) -> LineChart:
     run, square = result.run, result.reference
     lines = [("designed", run[name]), (square.name, square[name])]
     limit = next(r.limit for r in result.predicted_extremes if r.name == name)
-    # The shade is what the limits allow.
     bands = [(np.full(run.length, -limit), np.full(run.length, limit))] if math.isfinite(limit) else []
     return replace(signal_chart(run, name), lines=lines, bands=bands, steps=name in run.inputs)
 

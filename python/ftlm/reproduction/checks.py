@@ -96,7 +96,7 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
         return outcomes_by_level
 
     def flips(name: str) -> int:
-        # Pairs of cases that differ in this factor only, and in the outcome.
+        """Return the number of pairs of cases that differ in this factor only and in the outcome."""
         groups = outcomes(lambda factors: tuple(level for n, level in factors.items() if n != name))
         return sum(sum(g) * (len(g) - sum(g)) for g in groups.values())
 

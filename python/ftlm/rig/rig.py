@@ -631,7 +631,7 @@ class Rig:
             # Write 0 V immediately, because the caller may stay in the with statement.
             with contextlib.suppress(Exception):
                 self.board.write((0.0, 0.0))
-            # Whatever a call meets on a board that was shut down meanwhile, the shutdown is its cause.
+            # If the board was shut down meanwhile, the shutdown caused the error of this call.
             reason = self._gate.reason if isinstance(error, Exception) else None
             if reason is None and not isinstance(error, FtlmError):
                 raise

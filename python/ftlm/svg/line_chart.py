@@ -104,7 +104,7 @@ def _scaled_integers(values: Floats) -> list[object]:
         return [0, [None] * values.size]
     low, high = float(finite.min()), float(finite.max())
     largest = max(abs(low), abs(high))
-    # Beyond twelve digits of the largest value a browser's numbers have no whole ones.
+    # Integers of more than about twelve digits would not be exact in a browser.
     fine = max((high / READOUT_LEVELS - low / READOUT_LEVELS), largest * 1e-12, 1e-290)
     power = math.floor(math.log10(fine))
     scaled = values / 10.0**power
@@ -273,7 +273,7 @@ class LineChart(Figure):
         neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
         if not neutral:
             return low, high, []
-        # A simulation that runs away would flatten what it is to be compared with.
+        # A diverging simulation would flatten the measured curve.
         bottom, top = limits(neutral, 0.0)
         reach = MAX_STRAY_HEIGHTS * (top - bottom)
         floor, ceiling = bottom - reach, top + reach
@@ -323,7 +323,7 @@ class LineChart(Figure):
         parts = [*plot.grid(across, upward), self._curves(plot, narrow=narrow), text_group(texts)]
         data = {} if self.log_x or self.log_y or self.stems else _zoomable(plot, across, upward)
         if self.slider and not (narrow or self.log_x or self.log_y):
-            # A page of many charts has few points a line, and room for as few to be read out.
+            # A page with many charts has few points a line, and so has the readout.
             values = [(line.name, line.style, line.y) for line in lines]
             places = max(2, self.points // 2)
             data["data_readings"] = slider_readout(lines[0].x, values, self.x_label, self.y_label, places)

@@ -454,8 +454,8 @@ def _run_errors(
     missed = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
         for e in model.equations
-        # Nor has one with friction: the sign of a measured velocity is that of its noise, most of all at rest.
-        # Nor has one with a non-linear term that has no value.
+        # An equation with friction has no equation error, because noise determines the sign of a measured velocity
+        # at rest. Gaps and undefined non-linear terms have none either.
         if e.output not in gaps and e.friction is None and all(np.isfinite(full.of(t.column)).all() for t in e.terms)
     }
     return _RunErrors(full.step, initial, simulated, outputs, {o: full.of(o) for o in model.outputs}, missed)
@@ -466,7 +466,7 @@ def _pooled_comparison(
 ) -> Comparison:
     """Return the comparison that pools the errors of all runs."""
     equation_error, output_error = _pooled_errors(parts)
-    # The runs' own figures may be known where those of all of them are not.
+    # Single runs may have equation errors although the pooled one is undefined.
     rubbed = {e.output for e in model.equations if e.friction is not None}
     gaps = {name for run in runs for name in run.missing_samples}
     unequated = {
@@ -527,7 +527,7 @@ def near_identity_findings(
             for t in item.terms
             if t.column == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
         ]
-        # Negated so that a figure that is not a number counts as bad; an equation error that is not known says nothing.
+        # Negated so that NaN counts as bad. An undefined equation error is no evidence.
         unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
         worse = not output.nr <= MAX_ERROR_RATIO * equation.nr and not unknown
         useless = not output.nr <= MAX_NORMALIZED_RESIDUAL
@@ -595,7 +595,7 @@ def validation_fit_findings(estimation_fits: Mapping[str, float], validation: Co
     findings = []
     for other, _, figures in validation.per_run:
         for output, f in figures.items():
-            # Negated so that a fit that is not a number counts as lost.
+            # Negated so that a NaN fit counts as a drop.
             if (
                 np.isfinite(estimation_fits.get(output, np.nan))
                 and not f.fit >= estimation_fits[output] - MAX_FIT_DROP_POINTS
@@ -648,7 +648,7 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
     reasons = [f"{words}." for words in describe_missing_equation_errors(unequated)]
     own = 1 + len(_METRIC_LABELS)
     if unequated and all(cell is None for row in rows for cell in row[1:own]):
-        # Four columns of nothing would push what is known off a narrow screen.
+        # Four empty columns would push the others off a narrow screen.
         shown_rows: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
         single = (("", 1), ("output error (simulation)", 4))
         return Table(

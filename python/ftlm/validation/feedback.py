@@ -407,7 +407,7 @@ class _Innovations:
         `offset` is an additional delay of the outputs in samples.
         """
         rows = self._rows(offset)
-        # Through the same weights, so that the score is orthogonal to what was estimated.
+        # The same weights make the score orthogonal to the estimated parameters.
         columns = _project_out(self.past[rows], self._regressors(rows, offset), self.weights[rows])
         return *_largest_score_ratio(clipped[rows], columns), rows
 
@@ -434,7 +434,7 @@ class _Innovations:
             response = self._response(columns, rows) if state == "found" else ()
             return FeedbackTest(state, reason, ratio, share, count, same_row=signed, response=response)
 
-        # No two signals that were made beforehand explain most of what is new in a rough input.
+        # Without feedback, past outputs cannot explain most of the innovation of a rough input.
         if share >= CERTAIN_SHARE and self.scale >= ROUGH_SHARE and ratio >= CERTAIN_RATIO:
             return result("found")
         doubt = ""
@@ -450,7 +450,7 @@ class _Innovations:
             return result("none", "" if ratio <= 1 else "too little to matter")
         if self._ratio_with_noisy_input(rows) <= 1:
             return result("undecided", "a closed loop, or noise in the measured input")
-        # A loop acts all the time. Two signals that were made beforehand agree on one stretch by chance.
+        # A loop acts during the whole run. Independent signals are correlated by chance on one part only.
         gains = np.array([part.sum() for part in np.array_split(fit * target, STEADY_PARTS)])
         if np.median(gains) < STEADY_SHARE * max(float(gains.sum()), 1e-300):
             return result("undecided", "only one part of the run shows it")
@@ -522,7 +522,7 @@ class _Innovations:
             divisor[0] = 1.0
             divisor[1 : 1 + law.size] = -law[: x.size - 1]
             whole = _core.series_divide(x, divisor)
-            # An unstable law of the past would outgrow the input itself.
+            # An unstable filter would make the result larger than the input.
             size = float(np.std(whole)) if np.all(np.isfinite(whole)) else math.inf
             out.append(self.deviation * (whole if size <= 1.0 else x))
         return tuple(out)

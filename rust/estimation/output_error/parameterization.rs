@@ -481,7 +481,6 @@ fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
         rows.swap(pivot_count, at);
         let pivot = rows[pivot_count].clone();
         for (i, (often, power)) in rows.iter_mut().enumerate() {
-            // The pivot row is divided by the pivot.
             let by = if i == pivot_count { 1.0 - 1.0 / pivot.0[j] } else { often[j] / pivot.0[j] };
             often.iter_mut().zip(&pivot.0).for_each(|(v, p)| *v -= by * p);
             power.iter_mut().zip(&pivot.1).for_each(|(v, p)| *v -= by * p);

@@ -311,7 +311,6 @@ impl<'a> SliceTables<'a> {
         let both = off[0] + off[1];
         let (p, q, p_most, q_most) = (bilinear(ps), bilinear(qs), largest(&ps) + both, largest(&qs) + both);
 
-        // Moduli of the coefficients and their rounding-error bounds.
         let trace = self.others.trace + sums * sums / independence;
         let all = self.common.weighted_size
             + self.base_coefficients.iter().map(|c| c.abs()).sum::<f64>()

@@ -203,7 +203,6 @@ impl Problem {
         let elements = (width + 1) * (width + 1);
         let mut sum = vec![0.0; elements];
         let mut unweighted = if options.ranks_by_gram_matrix() { vec![0.0; elements] } else { Vec::new() };
-        // Inverse prior covariances by the sums of squares of unweighted columns.
         let precisions = |squares: &[f64]| -> Vec<f64> {
             let precision = |&of: &f64| match options.estimator {
                 Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,

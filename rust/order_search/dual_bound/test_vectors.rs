@@ -219,7 +219,6 @@ pub(super) fn divisor_effects(
             }
         }
     }
-    // Accumulate the steps to path lengths.
     for place in groups..out.len() {
         let before = out[place - groups][3];
         out[place][3].iter_mut().zip(before).for_each(|(way, before)| *way += before);
