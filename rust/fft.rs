@@ -280,7 +280,7 @@ mod tests {
         }
         assert_eq!(keep(&mut plans, next + 2), 1);
         assert!(plans.find(long).is_none() && plans.find(next).is_some() && plans.find(short).is_some());
-        // Made anew, it is the same.
+        // A plan that is computed again works.
         assert!(is_sound(&plan(long)));
     }
 

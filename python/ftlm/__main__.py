@@ -18,7 +18,7 @@ _OWNS_INTERRUPT = (
 )
 if _OWNS_INTERRUPT:
     signal.signal(signal.SIGINT, _leave)
-# Nothing of what is imported is garbage, and looking for it would cost a twentieth of the start.
+# Imports create no garbage, and the collector would take a twentieth of the start-up time.
 gc.disable()
 # The handler above must be in place during this import.
 from ftlm.cli import main  # noqa: E402

@@ -328,7 +328,7 @@ def group_findings(findings: Iterable[Finding]) -> tuple[FindingGroup, ...]:
     for place, item in enumerate(unique(findings)):
         alone = place if item.kind.topic == "other" else 0
         by.setdefault((FINDING_LEVELS.index(item.level), order.index(item.kind.topic), alone), []).append(item)
-    # A finding with a remedy of its own says more than one with that of its topic.
+    # Findings with a specific remedy precede those with the remedy of their topic.
     return tuple(FindingGroup(tuple(sorted(by[key], key=lambda item: not item.kind.remedy))) for key in sorted(by))
 
 

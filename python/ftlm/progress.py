@@ -146,7 +146,7 @@ class Progress:
             return
         passed = max(time.monotonic() - self._start, 1e-9)
         text = f"{100 * count // total:.0f} %"
-        # Of work without a count of its own a person wants to know the share alone.
+        # For work without countable units only the fraction is shown.
         if not isinstance(total, ShareTotal):
             text += f" of {total:,.0f}" if self._current_bar().console.width >= WIDE_TERMINAL_COLUMNS else ""
             text += f" {count / passed:,.0f}/s"

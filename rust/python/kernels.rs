@@ -208,7 +208,7 @@ pub fn multi_innovation_rows<'py>(
         let mut coefficient_rows = Vec::new();
         for (rows, target) in batch.values.chunks(count.max(1) * width.max(1)).zip(target.chunks(count.max(1))) {
             stop.check()?;
-            // One column after another.
+            // The estimators need contiguous columns.
             let flat: Vec<f64> = (0..width).flat_map(|j| rows.iter().skip(j).step_by(width).copied()).collect();
             let columns: Vec<&[f64]> = flat.chunks_exact(target.len()).collect();
             coefficient_rows.extend(if path {

@@ -235,7 +235,7 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
         b = np.zeros((omega.size, len(names), len(inputs)), dtype=np.complex128)
         for i, item in enumerate(items):
             lhs, right = equation_polynomials(item, names)
-            # Divided by s^alpha at high and left as it is at low frequencies, numbers keep their range.
+            # Division by s^alpha at high frequencies avoids overflow.
             scale = np.maximum(omega, 1.0) ** -item.order.constant
             for j, polynomial in enumerate(lhs):
                 a[:, i, j] = scale * value_at(polynomial, s)

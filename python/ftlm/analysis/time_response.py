@@ -79,7 +79,7 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     """
     check_model(model)
     if time is None:
-        # A model that is not linear has no poles, and no time of its own that a program could tell.
+        # A non-linear model has no poles from which a settling time follows.
         span = settling_time(model) if model.structure.is_linear else 10.0
         time = np.linspace(0.0, span, DEFAULT_TIME_POINTS)
     instants = as_floats("time", time)
@@ -108,7 +108,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
     scaled = matrix[np.ix_(rows, rows)] / np.outer(size[rows], size[rows])
     weights, directions = np.linalg.eigh(scaled)
     total: Floats = np.zeros(1)
-    # Of the model alone, lest every step is refined with the covariance of another one.
+    # Without its estimate, the model is simulated alone, without the uncertainty band.
     bare = replace(model, estimate=None)
     for weight, direction in zip(weights.tolist(), directions.T, strict=True):
         if weight <= MIN_VARIANCE_RATIO * float(weights[-1]):
@@ -120,7 +120,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
                 step_response(with_parameter_vector(bare, numbers + side), time) for side in (shift, -shift)
             )
         except FtlmError:
-            # So vague that a tenth of a standard deviation is not a model any more: there is no band to be drawn.
+            # A change by a tenth of a standard deviation gives no valid model, so there is no band.
             return None
         change = (above - below) / (2 * DEVIATION_STEP_RATIO)
         total = total + (np.diff(change) / (time[1] - time[0]) if impulse else change) ** 2

@@ -191,7 +191,7 @@ class Session:
             If the file exceeds a size limit or there are too many files.
         """
         free = self.check_room(name, size)
-        # Its name is taken from here on; a second one of that name gets another.
+        # The name is reserved here, so that a second upload of the same name gets another one.
         file, byte_count = File(secrets.token_hex(8), free, 0), 0
         self.files[file.key] = file
         try:
@@ -437,14 +437,14 @@ def _record_progress(model: Model, message: Mapping[str, Any]) -> None:
         model.phase, model.share, model.time_left = str(message["phase"]), None, ""
         model.phase_started_at = time.monotonic()
     elif message.get("total") and model.phase.startswith(SELECTION_PHASE):
-        # Candidates come up as others are fitted: a share of those known so far would go back.
+        # Fits add candidates, so a fraction of the known ones could decrease.
         model.time_left = f"{message['done']} of {message['total']} candidates known so far are fitted"
     elif message.get("total"):
         share = min(max(float(message["done"]) / float(message["total"]), 0.0), 1.0)
         passed = time.monotonic() - model.phase_started_at
         model.share = share
         if share > 0.02 and passed > 1.0:
-            # What is measured takes the place of what was expected.
+            # The measured rate replaces the estimate made before the start.
             model.phase = model.phase.partition(", about")[0]
             model.time_left = format_time_left(passed * (1.0 - share) / share)
 

@@ -130,7 +130,7 @@ class WebApplication:
                 for name, value in SECURITY_HEADERS.items():
                     headers.setdefault(name, value)
                 if message["status"] in (403, 404, 413, 415):
-                    # What is left of a refused body is not waited for.
+                    # The rest of a refused body is not read.
                     headers["connection"] = "close"
             elif scope["method"] == "HEAD":
                 message["body"] = b""
@@ -148,7 +148,7 @@ class WebApplication:
         except FtlmError as error:
             answer = json_response({"error": self._words(error)}, 400)
         except Exception as error:
-            # The page must be told; a traceback would name folders of this machine.
+            # The page gets the type of the error only, because a traceback would contain paths of this machine.
             answer = json_response({"error": f"a fault in ftlm itself ({type(error).__name__})"}, 500)
         await answer(scope, receive, send_secured)
 
@@ -211,7 +211,7 @@ class WebApplication:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
             raise HTTPException(415, "a file must be sent as application/octet-stream, not as a form")
         header = request.headers.get("content-length")
-        # Of more digits than Python reads none is a size; what comes is counted whatever is said.
+        # Longer numbers are ignored. The received bytes are counted in any case.
         size = (
             int(header) if header is not None and header.isascii() and header.isdigit() and len(header) < 20 else None
         )

@@ -62,7 +62,7 @@ class Reports(Progress):
 
 def main() -> None:
     """Run the task that is read from standard input."""
-    # What anything prints must not stand between the answers.
+    # Output of libraries must not mix with the answers.
     stream = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     reports = Reports(stream)

@@ -100,11 +100,11 @@ def version(
 
 def main() -> None:
     """Run the program."""
-    # Who closes an output, as `>&-` does, wants none; what is opened next must not take its place.
+    # A stream may be closed, as by `>&-`. The next opened file must not get its descriptor.
     sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
-        # A terminal that knows no Greek must not take a result away after an hour's work.
+        # Characters that a terminal cannot encode must not raise an error after a long computation.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     escape_standard_streams()

@@ -158,7 +158,7 @@ def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
     `what` and `way_out` are the failed computation and the remedy in its message.
     """
     with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
-        # SciPy warns of a matrix whose solution has no digits.
+        # SciPy only warns of a singular matrix.
         warnings.simplefilter("error", RuntimeWarning)
         try:
             yield
@@ -251,8 +251,8 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         if len(poles_before) == len(poles) and np.max(np.abs(poles_before - poles) / np.abs(poles)) < POLE_TOLERANCE:
             break
     residues = _residues(s, exact, integrates, poles)
-    # Of a model with fewer poles than were asked for the others do nothing, and no observer would find their states.
-    # Nor those of a second integral beside the one that is there.
+    # Poles beyond the order of the model have negligible residues, and no observer would find their states.
+    # The same holds for a second integral.
     at, is_significant = 1, []
     slow = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(integrates) else 0.0
     for p in poles:

@@ -187,7 +187,7 @@ class Plant:
         matrix = covariance_of(self.model)
         if matrix is None:
             return []
-        # A number that hardly anything tells has an infinite variance; it is drawn as wide as numbers go.
+        # A non-identifiable parameter has an infinite variance, which is replaced by a large one for sampling.
         matrix = np.nan_to_num(matrix, nan=0.0, posinf=1e12, neginf=-1e12)
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         spread = vectors * np.sqrt(np.maximum(values, 0.0))

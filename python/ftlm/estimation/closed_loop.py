@@ -83,7 +83,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     findings = []
     for name in inputs:
         output = np.concatenate([run[name] for run in runs])
-        # Every coefficient too many takes a share of the noise with it: the least Bayesian criterion.
+        # The model with the smallest BIC is chosen, because every superfluous coefficient fits noise.
         fits = [columns @ minimum_norm_solution(columns, output, 1e-10) for columns in laws]
         costs = [_criterion(output - fit, columns.shape[1]) for fit, columns in zip(fits, laws, strict=True)]
         best = int(np.argmin(costs))
@@ -155,6 +155,6 @@ def run_with_inputs(run: Run, values: Mapping[str, Floats]) -> Run:
 
 def mark_reference_fit(fit: Fit, reference: str, findings: Sequence[Finding]) -> Fit:
     """Return a fit whose settings and findings name the reference signal that it used."""
-    # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
+    # Noise in a closed loop is colored even if the model is complete. Intervals take the color into account.
     own = [f for f in fit.findings if f.code != "residuals_not_white"]
     return replace(fit, findings=[*own, *findings], settings={**fit.settings, "reference": reference})

@@ -55,7 +55,7 @@ def with_intervals(
     from there.
     """
     count = len(joint.names) + joint.initial_terms
-    # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
+    # With fewer than two samples per parameter the residuals do not determine the noise level.
     if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * count):
         return joint, []
     if intervals == "auto" and joint.unstable_optimum is not None and joint.unstable_optimum.at_stability_limit:
@@ -73,13 +73,13 @@ def with_intervals(
                 joint, problem, runs, names, DEFAULT_INTERVAL_LEVEL, threads=threads, progress=progress, budget=budget
             )
         except FtlmError:
-            # No finite simulation where the weights of the last descent are taken anew: what is known stays.
+            # There is no finite simulation with the new weights, so the previous result is kept.
             return joint, findings
         pulse_count += profile.evaluations * pulses
         if profile.lower_optimum is None or turn == MAX_RESTARTS:
             break
         if not profile.lower_on_finer_grid:
-            # What only this grid carries is a mode of the scheme; along it the cost tells nothing of the numbers.
+            # An optimum on this grid only is a mode of the scheme, so its cost is no evidence about the parameters.
             return joint, findings
         start = dict(zip(problem.names, profile.lower_optimum.tolist(), strict=True))
         start_count, level = len(joint.starts), joint.noise

@@ -89,7 +89,7 @@ def fit_with_instruments(
             try:
                 trial_moments = _evaluate_moments(data_objective, clean, trial)
             except FtlmError:
-                # No finite simulation that far.
+                # The simulation diverges after a step of this length.
                 continue
             if _moment_norm(trial_moments) < level:
                 values, moments = trial, trial_moments
@@ -201,7 +201,7 @@ def estimate_output_error(
         free = FreeProblem.of(replace(structure, initial="rest"))
         guess = values_of_model(free, begin, more or {}) if isinstance(begin, Model) else begin
         begins = warm_starts(free, guess)
-    # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
+    # Progress assumes one fit, since a second one (with or without a history) is rare. Profiles take about a third.
     course = ShareTracker(progress)
     joint = joint_fit or fit_with_initial_conditions(
         answers or task.runs,
@@ -227,11 +227,11 @@ def estimate_output_error(
     if answers is None:
         findings += multistart_findings(joint, problem, task.runs)
     if start == "rest" and joint.initial != "rest":
-        # The first value alone would tell a comparison otherwise.
+        # A comparison would otherwise assume rest from the first value alone.
         structure = request = replace(structure, initial="history")
         findings.append(make_finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
     coefficients = problem.coefficients_by_name(list(joint.coefficients.values()))
-    # On another run the start is resolved anew.
+    # On another run the initial conditions are determined again.
     identified = request.with_orders(joint.orders).with_coefficients(coefficients)
     return Fit(
         Task(task.runs, structure),
@@ -261,7 +261,7 @@ def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[floa
     """Return the covariance of all orders and coefficients of the model; None if one is not identifiable."""
     jacobian = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
     with np.errstate(invalid="ignore", over="ignore"):
-        # Of directions that the runs do not see covariances are not numbers, or beyond them.
+        # Covariances of non-identifiable directions are NaN or overflow.
         spread = jacobian @ joint.covariance @ jacobian.T
     return tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None
 
@@ -293,14 +293,14 @@ def fit_at_best_orders(
         rank = coupled_rank(task, settings, m, searches["stage"])
         orders = searches["stage"].table[rank - 1].orders
     if m is None and method == "instrumental-variables":
-        # Coefficients without the bias of noise show that of the step: all samples, once the orders are found.
+        # Instrumental variables remove the noise bias, so the bias of the step matters: use all samples.
         m = min(MAX_IV_PULSES, *(run.length - 1 for run in task.runs))
     at_orders = structure.with_orders(orders)
     fit = estimate_coefficients(task.runs, at_orders, settings, m)
     errors: Mapping[str, float] = fit.errors
     free = structure.with_orders({n: v for n, v in orders.items() if n in fixed_orders(task)})
     if free.order_names and fit.errors:
-        # At orders that are themselves estimates, those of the coefficients alone are too sure.
+        # Standard errors of the coefficients at fixed orders are too small if the orders are estimates.
         errors = errors_with_orders(task.runs, free, {**orders, **fit.values}) or {}
     model = make_model(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
     edges = [(n, v) for search in searches.values() for n, v in search.at_grid_edge.items()]

@@ -142,7 +142,7 @@ def core_arguments(structure: Structure) -> Any:
     """Return the arguments, by keyword, from which the compiled core builds a structure with chosen initial terms."""
     signals, hints = record_signals(structure), structure.hints or Hints()
     states = structure.filter_states(structure.initial)
-    # What is free does not hang on an offset that is still to be decided.
+    # The free parameters do not depend on an offset that is not decided yet.
     offset: Offset = "none" if structure.offset == "auto" else structure.offset
 
     def order(of: Order) -> tuple[float, list[tuple[str, float]]]:

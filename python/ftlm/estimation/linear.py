@@ -100,7 +100,6 @@ def _estimate_coefficients(
         else:
             raw = _multi_innovation(item, records, settings, settings.prior_covariance)
             if settings.prior_covariance is not None:
-                # A prior so weak that the data alone decide.
                 weak = _multi_innovation(item, records, settings, min(settings.prior_covariance * 1e12, 1e300))
                 fit.findings.extend(_prior_findings(item.output, raw, weak, settings))
         fit.values.update(named_coefficients(item, raw))
@@ -171,7 +170,7 @@ def step_bias_findings(
     try:
         coarser = estimate_coefficients(runs, structure, settings, fit.m // 2).values
     except FtlmError:
-        # A step that leaves no estimate tells nothing about half of it.
+        # Without an estimate on the coarser step there is no estimate of the bias.
         return []
     changes = {n: abs(coarser[n] - fit.values[n]) / 3 / e for n, e in fit.errors.items() if e > 0}
     worst = max(changes, key=lambda n: changes[n], default="")
@@ -179,7 +178,7 @@ def step_bias_findings(
         return []
     carried = min(run.length - 1 for run in runs)
     finer = f"raise m, up to {carried}, or " if fit.m < carried else ""
-    # Far from the limit a third of the move says no more than that it is large.
+    # Far from the limit of zero step, a third of the change is only a rough estimate of the bias.
     amount = f"about {changes[worst]:.2g}" if changes[worst] <= 10 else "more than 10"
     return [make_finding("step_bias", parameter=worst, m=fit.m, amount=amount, finer=finer)]
 

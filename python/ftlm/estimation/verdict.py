@@ -393,7 +393,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
         return
     looped = has_loop_noise_model(result.settings)
     outputs = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE_RESIDUAL_RATIO}
-    # A model that is wrong leaves what a periodic input repeats, which looks like a loop: first what it lacks.
+    # Residuals of an incomplete model under a periodic input resemble feedback, so missing terms come first.
     coupled = [f for f in result.findings if f.code == "coupling_missing" and f.output in outputs]
     unread = {(f.output, f.input) for f in coupled}
     following = {

@@ -411,7 +411,7 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
         fit.refinement,
     )
     own = [i for i, n in enumerate(problem.names) if n not in values]
-    # They are told from the second sample on; at the first, a run from rest shows nothing of them.
+    # They are identifiable from the second sample on: at the first, a run from rest does not depend on them.
     responses = derivatives[own].reshape(len(own), len(fit.outputs), rows)
     responses = np.pad(responses, ((0, 0), (0, 0), (1, 0)))[..., :rows]
     return orthonormal(responses.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T

@@ -109,7 +109,7 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
     own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
     orders, coefficients, _ = fit.problem.split(fit.values)
     chain = fit.problem.number_jacobian(orders, coefficients)
-    # What drives an equation is measured, or follows with it.
+    # The other outputs in an equation are simulated or measured, depending on the coupling.
     drives = (
         gains
         if coupling == "simulated"

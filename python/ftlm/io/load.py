@@ -192,7 +192,7 @@ def run_from_tables(
     roles = _assume_roles(selection, pool, signals) if header is None else ()
     _check_disjoint_roles(selection, pool)
     if not selection.outputs:
-        # A column with a word among its numbers is no signal by its name.
+        # A column with text among its numbers is not taken as a signal by its name.
         words = next((f"; {c.problem}" for c in pool.columns if c.problem is not None and not c.blank), "")
         raise DataError(
             "no output is named, and the roles of the columns are not clear from their names; name the signals with "

@@ -340,7 +340,7 @@ class Store:
     def _begin(self, requests: Sequence[Request] | None, *, recover: bool) -> None:
         payloads, corruption = self._file.read()
         if requests is not None and not payloads and corruption is None:
-            # A payload read back must be the one asked for: what would not survive is found before any work.
+            # The stored request is compared with the given one, so that encoding errors appear before the search.
             payloads = [RECORD_ENCODER.encode(Requests(ALGORITHM_VERSION, __version__, tuple(requests)))]
             self._file.append(payloads)
         self.contents = contents = contents_of(self.path, payloads, corruption)
@@ -438,6 +438,6 @@ class Store:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and issubclass(kind, DataError):
-            # Writing failed: what waits would fail too, and hide why.
+            # After a failed write, pending writes would fail too and hide the cause.
             self._waiting.clear()
         self.close()

@@ -121,7 +121,7 @@ class OrderCertificate:
                 f"certificate: nothing is proved of all orders with {intervals} ({separations}): {self.open_cells} of "
                 f"{cells} are left; narrow the intervals, keep orders farther apart, or allow more boxes"
             )
-        # Rounded up: a share that is said must be true.
+        # Rounded up, so that the printed bound holds.
         share = math.ceil(1000 * self.proved_tolerance - 1e-4) / 10
         text = (
             f"certificate: no orders with {intervals} ({separations}), on the order grid or between, have an RMS "

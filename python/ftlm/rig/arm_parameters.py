@@ -78,7 +78,7 @@ class StageParameters:
         h, k = 2 * stage - 1, 2 * stage
         hub = {f"a{h}": self.a, f"b{h}": self.b, f"d{h}": self.d, f"g{h}": self.g}
         if form == "lagrange":
-            # J_1/J_2 is r - 1.
+            # By the definition of r, J_1/J_2 is r - 1.
             return hub | {f"a{k}": -self.a * (self.r - 1.0), f"d{k}": -self.d * (self.r - 1.0)}
         return hub | {f"a{k}": -self.a * self.r, f"b{k}": -self.b, f"d{k}": -self.d * self.r, f"g{k}": -self.g}
 

@@ -149,14 +149,14 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
     if run.sample_times is not None and run.missing_samples:
         return None
     if any(np.nanstd(run[n]) == 0.0 for n in outputs):
-        # An output that never moves shows nothing, such as that of a run which is to be simulated.
+        # A constant output gives no evidence, for example in a run that is only an input for a simulation.
         return None
     moves = [_rows_of_change(run[n]) for n in inputs]
     quiet = min((int(rows[0]) for rows in moves if rows.size), default=0)
     if quiet >= START_SETTINGS.quiet_rows:
         levels = {}
         visible = any(run[n][0] != 0.0 for n in inputs)
-        # A command that is held and changed again and again may have been so before: quiet rows must be long then.
+        # A command that changes often may have changed before the run, so a longer quiet phase is required.
         has_held_input = visible and any(np.count_nonzero(np.diff(run[n])) > 1 for n in inputs)
         for name in outputs:
             noise = noise_at_start(run[name])

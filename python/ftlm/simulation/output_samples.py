@@ -195,7 +195,7 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
             simulate_samples(each, run, FIRST_REFINEMENT, None, times) for each in (short, long)
         )
     except ModelError:
-        # The coarse grid makes the equations unsolvable; finer ones need not.
+        # The equations are singular on this coarse grid, but perhaps not on finer ones.
         return long
     terms = sum(map(len, ours.values())), sum(map(len, theirs.values()))
     residuals = [*output_residuals(outputs, few)], [*output_residuals(outputs, many)]
@@ -315,7 +315,7 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
 
 def _is_reportable(residuals: StartResiduals) -> bool:
     """Whether a history explains a run so much better than rest that a finding is worthwhile."""
-    # An overflow is infinite, and nothing is reported where both are.
+    # Overflows give infinity. If both values are infinite, there is no finding.
     with np.errstate(over="ignore", invalid="ignore"):
         ends = [end / residuals.sizes[:, None] for end in (residuals.rest, residuals.history)]
         rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) for end in ends)

@@ -106,7 +106,7 @@ def fit_history(
     target_left, forced_left = (
         rows - linear_combinations(basis, projections(basis, rows)) for rows in (target, forced)
     )
-    # Where no input moves, the past is all that moves an output.
+    # If no input changes, only the past moves the output.
     size = float(np.mean((forced_left if np.any(driven) else target_left) ** 2))
     mixed = []
     for group in past:

@@ -71,7 +71,7 @@ def simulate_refined(
     shifted, levels = deviations(run, model.structure)
     result = None
     if model.structure.initial == "auto":
-        # A run that may have been in motion may as well have rested at its level.
+        # A run without evidence of motion may also start from rest at its level.
         rest = replace(model, structure=replace(model.structure, initial="rest"))
         result = _simulate_refined(rest, shifted, None, tolerance, max_m, on_grid)
         model = replace(model, structure=replace(model.structure, initial=conditions_in_motion(model.structure)))

@@ -37,11 +37,11 @@ def check_new(path: str | os.PathLike[str], *, force: bool) -> Path:
     if file.is_dir():
         raise DataError(f"{file} is a folder; name a file in it")
     status = _link_status(file)
-    # A dangling link is a file that someone meant to be there.
+    # A dangling link counts as an existing file.
     if status is not None and not force:
         raise DataError(f"{file} exists; choose another name, or overwrite it with {parameter('force', True)}")
     if status is not None and not stat.S_ISREG(status.st_mode):
-        # A device of the system would be gone, and what stands behind a link is not what was asked for.
+        # A rename would replace a device, and would replace a link instead of its target.
         kind = "a link" if stat.S_ISLNK(status.st_mode) else "a device, pipe or socket"
         raise DataError(f"{file} is {kind}, no regular file, and is not overwritten; choose another name")
     return file
@@ -92,7 +92,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
     """
     file = check_new(path, force=force)
     try:
-        # In its folder, since no rename crosses disks; short, so that long names have room.
+        # In the same folder, since a rename cannot cross file systems. Names have a maximum length.
         beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
         status = _link_status(file)
         # Never through a link that another program left. The permissions are those that a new file has here, or those
@@ -112,7 +112,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
         except FileExistsError:
             with contextlib.suppress(OSError):
                 beside.unlink()
-            # Somebody made it between the check and now.
+            # Another program created the file after the check.
             check_new(file, force=False)
             raise
         except BaseException:
@@ -187,7 +187,7 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
                 return stream.read(max_bytes)
         os.close(descriptor)
     except (OSError, ValueError) as error:
-        # What no file system takes is not put into words as it is.
+        # The path may be too long or unprintable for a message.
         name = str(file)
         path_text = (
             name if name.isprintable() and len(name) <= MAX_NAME_CHARACTERS else short_repr(name, MAX_NAME_CHARACTERS)

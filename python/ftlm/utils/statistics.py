@@ -43,7 +43,7 @@ def estimate_noise(samples: Floats) -> float:
     bends = np.diff(samples, 2)
     bends = bends[~np.isnan(bends)]
     if bends.size == 0:
-        # No three neighbours were read: those that were stand closest.
+        # No three neighboring samples are present: use the samples that are, in order.
         bends = np.diff(samples[~np.isnan(samples)], 2)
     return robust_deviation(bends) / float(np.sqrt(6.0))
 

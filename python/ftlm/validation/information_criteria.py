@@ -82,7 +82,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     k = count + tests.initial_terms + len(tests.outputs)
     likelihood = 0.0
     for name, output in tests.outputs.items():
-        # A residual of exactly nothing has no finite likelihood.
+        # A residual of exactly 0 has an infinite likelihood.
         level = 2 * math.log(output.rms) if 0 < output.rms < math.inf else math.copysign(math.inf, output.rms - 1)
         likelihood -= 0.5 * counts[name] * (math.log(2 * math.pi) + 1 + level)
     return criteria_of_likelihood(likelihood, k, samples)
@@ -100,7 +100,7 @@ def criteria_of_likelihood(log_likelihood: float, parameters: int, samples: int)
 def information_table(information: InformationCriteria) -> Table:
     """Return a table of AIC, AICc, BIC, and the numbers of parameters and samples."""
     criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
-    # Differences count, not sizes: all digits before the point.
+    # Only differences matter, so all digits before the decimal point are shown.
     rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]
     rows += [["numbers estimated", information.parameters], ["samples", information.samples]]
     note = (

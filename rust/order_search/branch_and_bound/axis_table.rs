@@ -210,7 +210,6 @@ impl AxisTable {
             let v = |i: usize| values[i * stride + at];
             ((v(i - 1) - v(i)) + (v(i + 1) - v(i))).abs()
         };
-        // Second differences at a value.
         let bent = |i: usize, g: usize| -> [Wide; 2] {
             let (a, b, c) = (
                 &self.vector_products[(i - 1) * groups + g],

@@ -79,7 +79,7 @@ impl<'a> CommonFactor<'a> {
         self.norms[i] = squares.norms()[column];
         let last = value * self.inverse[i];
         self.residual -= value * last;
-        // What the others make of this column, from the last one back; so much less is left for them to do.
+        // Back substitution: regression of this column on the previous ones, which changes their coefficients.
         let mut sum = whole;
         for j in (0..i).rev() {
             row[j] = self.lower[i][j];
@@ -178,7 +178,7 @@ impl<'a> CommonFactor<'a> {
             error[n] = self.residual - value[n] * last[n];
             size[n] = squares.norms()[squares.target()] + last[n].abs() * norms[n];
         }
-        // What the others make of the changing column, from the last one back; so much less is left for them to do.
+        // Back substitution: regression of the varying column on the common ones, which changes their coefficients.
         for j in (0..count).rev() {
             for l in j + 1..count {
                 for n in 0..L {

@@ -179,7 +179,6 @@ impl InfeasibilityProof {
             if convex < k - 1 && factorise(&self.errors, k, &mut self.factor) < k - 1 {
                 return false;
             }
-            // Minimizer of the form, with last coordinate 1.
             self.at[k - 1] = 1.0;
             for i in (0..k - 1).rev() {
                 let mut value = -self.factor[packed_index(k - 1, i)];

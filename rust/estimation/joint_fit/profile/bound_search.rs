@@ -171,7 +171,7 @@ impl BoundSearch {
             let took = refit_result.as_ref().map_or(lap, |refit_result| refit_result.evaluations);
             self.evaluations += took;
             if lap < MAX_REFIT_EVALUATIONS && took >= lap {
-                // A refit that is cut short tells nothing.
+                // An interrupted refit is no bound of the profile.
                 self.origin = Some(refit_result.unwrap_or(origin));
                 return Ok(BoundOutcome::Paused);
             }
@@ -180,7 +180,7 @@ impl BoundSearch {
                 return Ok(BoundOutcome::Found(self.side_of(self.start + self.side * distance)));
             }
         }
-        // A bound between two points of which the outer one has a cost; else the cost never rose that far.
+        // The interval is bounded only if some finite cost beyond the threshold was computed.
         let risen = self.outside.is_finite() && self.points.iter().any(|(_, rise)| *rise >= self.width * self.width);
         let bound = if risen { self.start + self.side * self.outside } else { self.side * f64::INFINITY };
         Ok(BoundOutcome::Found(self.side_of(bound)))
@@ -216,7 +216,7 @@ impl BoundSearch {
             Some(refit_result) if rise <= width => {
                 (self.inside, self.within) = (self.way, refit_result);
                 if self.way >= self.outside {
-                    // The outer point was a refit that had lost its way.
+                    // The refit at the outer point did not find the optimum.
                     self.outside = f64::INFINITY;
                 }
                 if self.way >= self.farthest {
@@ -226,7 +226,7 @@ impl BoundSearch {
             }
             _ => {
                 if self.way >= self.outside {
-                    // Followed closely, it is out as well: the profile jumps here, or the simulation diverges.
+                    // Small steps confirm that the outer point is outside: the profile jumps here, or the simulation diverges.
                     self.way = f64::NAN;
                     return None;
                 }
@@ -238,7 +238,7 @@ impl BoundSearch {
         let scale = outside.min((self.start + self.side * inside).abs()).max(BRACKET_SCALE_RATIO * outside);
         let narrow = closed && outside - inside <= BOUND_TOLERANCE * scale;
         if near && !narrow && inside < following && following < outside.min(self.farthest) {
-            // Newton's next step is worth more there than one of a size given beforehand.
+            // Close to the bound, Newton's step is more accurate than a step of fixed ratio.
             self.way = following;
         } else if !closed {
             let gain = rise - self.reached;
