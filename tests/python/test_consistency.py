@@ -46,7 +46,7 @@ def changed():
 def test_a_machine_that_stays_is_one_model(same):
     assert same.consistent is True
     assert same.names == ("motor 0 to 6 s", "motor 6 to 12 s")
-    assert same.reason.startswith("The same model as far as the parts tell: the 95 % intervals of every number overlap")
+    assert same.reason.startswith("The same model within its uncertainty: the 95 % intervals of every")
     assert same.distance < same.limit
     assert same.degrees == 3
     # Each part predicts the other as well as itself.
@@ -140,7 +140,7 @@ def test_a_number_that_a_part_does_not_tell_agrees_with_any(same):
     assert joint_distance(none) == (None, 0)
     found = replace(same, results=tuple(none), differences=tuple(differences(none)), distance=None, degrees=0)
     assert found.consistent is None
-    assert found.reason == "Not told: no number is known by two parts"
+    assert found.reason == "Inconclusive: no parameter is identifiable from two segments"
 
 
 def test_intervals_by_profile_are_compared_by_the_ends_that_face_each_other(same):

@@ -293,7 +293,7 @@ def parse_structures(recipe: FitRequest) -> list[Structure]:
             "leave these options at their defaults"
         )
     if not 0.0 <= recipe.share <= 0.8:
-        raise ModelError(f"share = {recipe.share!r} of the run for validation; keep from 0 to 0.8")
+        raise ModelError(f"share = {recipe.share!r} of the run for validation is outside [0, 0.8]; use a smaller share")
     return recipe.structures()
 
 

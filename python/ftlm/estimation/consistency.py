@@ -30,7 +30,7 @@ from ftlm.validation.comparison import compare
 #: Default number of segments of one run.
 DEFAULT_SEGMENTS = 2
 #: Table entries for the comparison of two intervals.
-DISJOINT_TEXT, OVERLAP_TEXT, NOT_IDENTIFIABLE_TEXT = "apart", "overlap", "not told"
+DISJOINT_TEXT, OVERLAP_TEXT, NOT_IDENTIFIABLE_TEXT = "disjoint", "overlap", "not identifiable"
 #: Largest ratio of an interval bound to the Wald bound for which the covariance is used.
 MAX_ASYMMETRY_RATIO = 2.0
 #: Runs differ by a delay if inputs shifted by at most so many rows leave less than this share of the residuals of
@@ -115,7 +115,7 @@ class Consistency(ReportMixin):
     def _joint_test_text(self) -> str:
         if self.distance is None or not self.degrees:
             return ""
-        return f"{self.distance:.3g} where chance leaves less than {self.limit:.3g} in 99 of 100 cases"
+        return f"statistic {self.distance:.3g}, 99 % limit {self.limit:.3g}"
 
     def _values(self, part: int) -> dict[str, float]:
         return values_of(self.results[part])
@@ -136,18 +136,18 @@ class Consistency(ReportMixin):
         """Conclusion in one sentence, with the parameters and segments that decide it."""
         comparable = [d for d in self.differences if not math.isnan(d.difference_in_errors)]
         if self.consistent is None:
-            return "Not told: no number is known by two parts"
+            return "Inconclusive: no parameter is identifiable from two segments"
         if self.consistent:
-            words = "The same model as far as the parts tell: the 95 % intervals of every number overlap; the farthest "
-            words += f"from each other: {self.describe_difference(comparable[0])}"
-            return words + (f"; all numbers together: {self._joint_test_text}" if self._joint_test_text else "")
+            words = "The same model within its uncertainty: the 95 % intervals of every parameter overlap; the largest "
+            words += f"difference: {self.describe_difference(comparable[0])}"
+            return words + (f"; all parameters together: {self._joint_test_text}" if self._joint_test_text else "")
         far = [d for d in comparable if d.disjoint]
         if far:
             words = f"Not the same model: {'; '.join(self.describe_difference(d) for d in far)}"
-            return words + (f"; all numbers together: {self._joint_test_text}" if self._exceeds_limit else "")
+            return words + (f"; all parameters together: {self._joint_test_text}" if self._exceeds_limit else "")
         return (
-            f"Not the same model: the 95 % intervals of each number overlap, but all numbers together do not agree "
-            f"({self._joint_test_text}); the farthest from each other: {self.describe_difference(comparable[0])}"
+            f"Not the same model: the 95 % intervals of each parameter overlap, but all parameters together differ "
+            f"({self._joint_test_text}); the largest difference: {self.describe_difference(comparable[0])}"
         )
 
     @property
@@ -190,11 +190,11 @@ class Consistency(ReportMixin):
                 [*cells, None if math.isnan(worst.difference_in_errors) else worst.difference_in_errors, verdict]
             )
         return Table(
-            "Numbers of each part, with 95 % intervals",
-            ("number", *self.names, "standard errors between", "95 % intervals"),
+            "Parameters of each segment, with 95 % intervals",
+            ("parameter", *self.names, "difference in standard errors", "95 % intervals"),
             rows,
             wrap=True,
-            note="Standard errors between: of the difference, of the two parts that are farthest apart.",
+            note="The difference is that of the two segments that differ most, divided by its standard error.",
         )
 
     def fits_table(self) -> Table:
@@ -204,17 +204,17 @@ class Consistency(ReportMixin):
             for k, name in enumerate(self.names)
             for output in self.cross_validation[k][k]
         ]
-        return Table("Fit of each part's model on each part, in %", ("model of", *self.names), rows)
+        return Table("Fit of each segment's model on each segment, in %", ("model of", *self.names), rows)
 
     def _page(self) -> Page:
         first = Section(
-            "Whether it is one model",
+            "Test for one model",
             paragraphs=[f"{self.reason}."],
             warnings=list(self.warnings),
             tables=[self.numbers_table(), self.fits_table()],
         )
         sections = [Section(n, paragraphs=str(r).splitlines()) for n, r in zip(self.names, self.results, strict=True)]
-        lead = {True: "the same model", False: "not the same model", None: "not told"}[self.consistent]
+        lead = {True: "the same model", False: "not the same model", None: "inconclusive"}[self.consistent]
         return Page("Parts of a run", [first, *sections], lead)
 
     def to_frame(self) -> Any:

@@ -71,7 +71,7 @@ class _BadCells:
         cell_text = repr(text if len(text) <= 40 else text[:40] + "…")
         way_out = "correct or remove these rows"
         if not text:
-            what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
+            what = "empty cell" + (", or one with an error or an uncomputed formula" if self.sheet else "")
             way_out = _fill_hint()
         elif is_gap(text):
             what = f"{cell_text} stands for no number"

@@ -85,12 +85,14 @@ class Layout:
             if value is not None:
                 object.__setattr__(self, option, _word(option, value, words))
         if self.separator == self.decimal == "comma":
-            raise DataError(f"{layout_fields('separator', 'decimal')} are both a comma; cells could not be told apart")
+            raise DataError(
+                f"{layout_fields('separator', 'decimal')} are both a comma; cells could not be distinguished"
+            )
         if self.thousands is not None and self.thousands == self.decimal:
             raise DataError(f"{layout_fields('thousands', 'decimal')} are both a {self.decimal}; change one of them")
         if self.separator == self.thousands == "space":
             raise DataError(
-                f"{layout_fields('separator', 'thousands')} are both a space; cells could not be told apart"
+                f"{layout_fields('separator', 'thousands')} are both a space; cells could not be distinguished"
             )
         if self.dates is not None and self.dates not in DATE_ORDERS:
             raise DataError(

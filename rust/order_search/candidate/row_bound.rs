@@ -57,7 +57,7 @@ impl<'a> CommonFactor<'a> {
 
     /// Add term `i` to the factor.
     #[inline(always)]
-    #[allow(clippy::needless_range_loop)] // triangles, whose elements are told by their places
+    #[allow(clippy::needless_range_loop)] // triangular arrays, indexed by row and column
     fn extend(&mut self, i: usize) {
         let (squares, column) = (self.squares, self.columns[i]);
         let whole = squares.product(column, column);
@@ -145,7 +145,7 @@ impl<'a> CommonFactor<'a> {
 
     /// Flag of each of L candidates: true if no coefficients reduce its squared equation error to the limit.
     #[inline(always)]
-    #[allow(clippy::needless_range_loop)] // triangles of lanes, whose elements are told by their places
+    #[allow(clippy::needless_range_loop)] // triangular arrays of lanes, indexed by row and column
     fn exclusion_flags<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
         let squares = self.squares;
         let whole = changing.of(squares.diagonal());

@@ -1,8 +1,8 @@
 //! Lower bound of the squared equation error over a cell (a box of orders), for nearly dependent regressor columns.
 //!
-//! Such columns determine the coefficients poorly, and the bound of `cell_bound` is then too low to exclude a cell. This
-//! bound is the distance of the output from a subspace. The columns at the midpoint and their first two derivatives by
-//! the order span it. Columns elsewhere in the cell differ from it by terms of third order only, so the bound holds for
+//! Such columns determine the coefficients poorly, and the bound of `cell_bound` is then too low to exclude a cell.
+//! This bound is the distance of the output from a subspace. The columns at the midpoint and their first two
+//! derivatives by the order span it. Columns elsewhere in the cell differ from it by terms of third order only, so the bound holds for
 //! coefficients of limited size.
 
 use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPANSION_COLUMNS, MAX_TERMS};

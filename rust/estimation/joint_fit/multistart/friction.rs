@@ -123,8 +123,8 @@ fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<
             let names: Vec<&str> = source.runs().iter().map(Recording::name).collect();
             let (output, names) = (&structure.signals[item.output], names.join(", "));
             let what = format!(
-                "{output} never moves beyond its noise in {names}, and a body that only rests tells nothing but that \
-                 its friction is not exceeded"
+                "{output} never moves beyond its noise in {names}, and the friction of a body at rest has only a lower \
+                 bound"
             );
             return Err(Error::Recording { what, remedy: "add a run in which the body slides".into() });
         }

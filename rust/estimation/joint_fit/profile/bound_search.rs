@@ -226,7 +226,8 @@ impl BoundSearch {
             }
             _ => {
                 if self.way >= self.outside {
-                    // Small steps confirm that the outer point is outside: the profile jumps here, or the simulation diverges.
+                    // Small steps confirm that the outer point is outside: the profile jumps here, or the simulation
+                    // diverges.
                     self.way = f64::NAN;
                     return None;
                 }
