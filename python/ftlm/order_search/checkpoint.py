@@ -195,7 +195,7 @@ class PartialBlock:
 
 @dataclass
 class Section:
-    """Stored progress of one search: its complete blocks of rounds and its partly evaluated blocks.
+    """Progress of one search in a checkpoint file: complete blocks of rounds and partly evaluated blocks.
 
     A round is a fixed range of candidates. The key of a block is the number of its first round. In a coupled search it
     is the number of the first candidate.
