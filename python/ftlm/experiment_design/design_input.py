@@ -507,7 +507,7 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
         if own:
             low, high = max(low, min(own) / 10), min(high, 10 * max(own))
     except FtlmError:
-        # Without identifiable modes the band of the run is used.
+        # Without modes of the model the band of the run is used.
         pass
     band = f"{low:.2g}:{max(high, 2 * low):.2g}"
     raise ModelError(

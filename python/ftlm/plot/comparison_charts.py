@@ -270,7 +270,7 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
 
 def correlation_chart(output: str, signal: str, test: CorrelationTest, *, label: str = "") -> LineChart:
     """Return the chart of the correlations of an output's residual with a signal; "" stands for the residual itself."""
-    # Lag 0 of an autocorrelation is 1 and says nothing.
+    # Lag 0 of an autocorrelation is always 1.
     keep = test.lags != 0 if not signal else np.ones(test.lags.size, dtype=bool)
     values = test.values[keep]
     band = np.full(values.size, test.band)

@@ -98,7 +98,7 @@ def behavior_lines(model: Model) -> list[str]:
     if model.structure.has_nonlinear_terms:
         return ["  no poles and no gain: only a linear model has them, such as linearized(at=…) about a point"]
     lines: list[str] = []
-    # Equations that cannot be solved for their outputs together have neither; everything else can be told.
+    # Equations that cannot be solved for their outputs together have neither modes nor gains.
     with contextlib.suppress(FtlmError):
         model_modes = modes(model)
         grows = any(mode.unstable for mode in model_modes)

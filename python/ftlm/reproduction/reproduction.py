@@ -335,7 +335,7 @@ def run_jobs(
                 stop.set()
                 for future in under_way:
                     future.cancel()
-            # After a failure the other jobs end in KeyboardInterrupt, which says nothing.
+            # After a failure the other jobs end in KeyboardInterrupt, which is not the cause.
             ended = [f.result() for f in under_way if f in finished]
     whole.end()
     return ended

@@ -46,7 +46,7 @@ class InformationCriteria:
     def __str__(self) -> str:
         return (
             f"AIC {self.aic:.6g}, AICc {self.aicc:.6g}, BIC {self.bic:.6g} "
-            f"({self.parameters} numbers estimated from {self.samples} samples)"
+            f"({self.parameters} parameters estimated from {self.samples} samples)"
         )
 
 
@@ -102,7 +102,7 @@ def information_table(information: InformationCriteria) -> Table:
     criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
     # Only differences matter, so all digits before the decimal point are shown.
     rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]
-    rows += [["numbers estimated", information.parameters], ["samples", information.samples]]
+    rows += [["parameters", information.parameters], ["samples", information.samples]]
     note = (
         "Lower is better, among models of the same outputs on the same runs. Orders, coefficients, initial terms and "
         "one noise level an output count as numbers."
