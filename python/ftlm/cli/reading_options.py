@@ -53,7 +53,7 @@ class ReadingOptions:
     resample : STEP
         Resample irregular rows to this step [s].
     missing
-        weight: omit missing outputs; hold: also repeat inputs.
+        Missing values: weight omits outputs; hold repeats inputs.
     encoding
         Text encoding, such as cp1252; default detected.
     dates
