@@ -182,23 +182,23 @@ def jittered(plant: Plant, rng: np.random.Generator) -> ftlm.Run:
 
 @dataclass(frozen=True)
 class Case:
-    """What befalls a record, how it is identified, and the words that name the cause."""
+    """What befalls a record, how it is identified, and the codes of findings that name the cause."""
 
     make: Callable[[Plant, np.random.Generator], ftlm.Run]
-    words_of_warning: tuple[str, ...] = ()
+    codes: tuple[str, ...] = ()
     method: str | ftlm.OutputError = "output-error"
 
 
 CASES = {
     "white": Case(nothing),
     "white, huber": Case(nothing, method=ftlm.OutputError(loss="huber")),
-    "coloured": Case(coloured, ("not white",)),
-    "disturbed": Case(disturbed, ("not white",)),
+    "coloured": Case(coloured, ("noise_coloured", "residuals_not_white")),
+    "disturbed": Case(disturbed, ("noise_coloured", "residuals_not_white")),
     "quantised": Case(quantised, ("quantised",)),
-    "outliers": Case(with_outliers, ("huber",)),
+    "outliers": Case(with_outliers, ("outliers", "outliers_dominate")),
     "outliers, huber": Case(with_outliers, method=ftlm.OutputError(loss="huber")),
     "unread": Case(unread),
-    "lost": Case(with_lost_rows, ("held",)),
+    "lost": Case(with_lost_rows, ("data_note",)),
     "jitter": Case(jittered),
 }
 
@@ -214,7 +214,7 @@ def fit(task: tuple[str, str, int]) -> tuple[list[float], list[float], bool, flo
     values, errors = result.orders | result.coefficients, result.standard_errors
     z = [(values[n] - true) / errors[n] for n, true in plant.truth.items()]
     off = [values[n] - true for n, true in plant.truth.items()]
-    is_reported = any(word in warning for word in case.words_of_warning for warning in result.warnings)
+    is_reported = any(finding.code in case.codes for finding in result.findings)
     return z, off, is_reported, seconds
 
 
@@ -246,7 +246,7 @@ def main() -> None:
                 covered = ", ".join(
                     f"{n} {int(c)}" for n, c in zip(plant.truth, np.sum(np.abs(z) < 1.96, axis=0), strict=True)
                 )
-                reports = sum(e[2] for e in ended) if CASES[name].words_of_warning else "-"
+                reports = sum(e[2] for e in ended) if CASES[name].codes else "-"
                 lines.append(
                     f"| {name} | {plant_name} | {covered} of {len(z)} | {np.abs(z.mean(axis=0)).max():.2f} "
                     f"| {np.median(spread / base):.2f} | {reports} | {np.mean([e[3] for e in ended]):.1f} |"
