@@ -247,7 +247,7 @@ def test_false_alarms_on_a_panel_of_ordinary_records():
 
 
 #: Seeds of the figures in the docs; mechanisms were mended on 1 to 13.
-PANEL_SEEDS = (21, 22, 23)
+PANEL_SEEDS = (131, 132)
 
 
 def spoilt(fault: str, kind: str, seed: int) -> tuple[ftlm.Run, ftlm.Structure]:
