@@ -31,12 +31,18 @@ const RANK_TOLERANCE: f64 = 1e-10;
 /// # fn main() -> ftlm::error::Result<()> {
 /// use ftlm::estimation::generalized_least_squares::prediction_ratio;
 /// use ftlm::parallel::Stop;
-/// // Alternating noise about a mean of 0.5, and the same noise without a mean.
-/// let noise: Vec<f64> = (0..200).map(|k| if k * k % 7 < 3 { 0.1 } else { -0.1 }).collect();
-/// let constant = vec![vec![1.0 / 200.0_f64.sqrt(); 200]];
+/// // White noise of random signs, about a mean of 0.5 and about 0.
+/// let mut state = 1_u32;
+/// let mut sign = || {
+///     state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+///     if state >> 31 == 0 { 0.1 } else { -0.1 }
+/// };
+/// let noise: Vec<f64> = (0..200).map(|_| sign()).collect();
 /// let shifted: Vec<f64> = noise.iter().map(|v| v + 0.5).collect();
-/// let ratio = |e: &[f64]| prediction_ratio(&[], &constant, e, &[vec![0..200]], 5, &Stop::default());
-/// assert!(ratio(&shifted)? > 100.0 && ratio(&noise)? < 20.0);
+/// let constant = vec![vec![1.0 / 200.0_f64.sqrt(); 200]];
+/// let ratio = |e: &[f64]| prediction_ratio(&[], &constant, e, &[vec![0..200]], 2, &Stop::default());
+/// // The 99 % quantile of chi-squared of one degree is 6.6.
+/// assert!(ratio(&shifted)? > 6.6 && ratio(&noise)? < 6.6);
 /// # Ok(())
 /// # }
 /// ```

@@ -158,7 +158,7 @@ fn dependent_terms_are_named_and_dependent_initial_terms_dropped() {
     let found = least_squares::fit(std::slice::from_ref(&copied), &doubled, &FREE, &Initial::Rest);
     assert_eq!(found, Err(Error::Singular { index: 3, count: 4 }));
     let message = found.unwrap_err().to_string();
-    assert!(message.starts_with("regressor 3 of 4 is a combination of the others"), "{message}");
+    assert!(message.starts_with("regressor 3 of 4 is a linear combination of the others"), "{message}");
     // One of them fixed: nothing is dependent any more.
     let fixed = [None, Some(1.0), None, None];
     assert!(least_squares::fit(&[copied], &doubled, &fixed, &Initial::Rest).is_ok());
