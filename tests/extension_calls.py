@@ -447,6 +447,11 @@ class Sound:
 
     autocovariances = whitening_filter
 
+    def prediction_ratio(self):
+        basis = np.ascontiguousarray(np.linalg.qr(self.normal((90, 4)))[0].T)
+        blocks = self.one([[(0, 50), (50, 90)]], [[(0, 50)], [(50, 90)]])
+        return basis[: self.one(0, 2, 3)], basis, self.normal(90), blocks, self.one(0, 3, 10)
+
     def arx_model(self):
         return [self.normal(50), self.normal(40)], [[self.normal(50), self.normal(40)]], self.one(0, 3, 10)
 

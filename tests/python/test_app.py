@@ -611,7 +611,7 @@ def test_models_side_by_side_are_those_to_be_trusted_first(used):
         ({"method": "magic"}, "method = 'magic'"),
         ({"offset": "much"}, "offset = 'much'"),
         ({"loss": "none"}, "loss = 'none'"),
-        ({"share": 0.95}, "from 0 to 0.8"),
+        ({"share": 0.95}, "outside [0, 0.8]"),
         ({"share": "x"}, "is not a number"),
         ({"share": True}, "is not a number"),
         ({"estimation": "nobody"}, "no file is chosen"),

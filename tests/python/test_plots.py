@@ -151,7 +151,7 @@ def test_a_fit_has_its_inputs_where_they_are_asked_for(joint, small_run):
     figure = saved(ftlm.plot.fit(joint, inputs=True))
     assert [a.get_ylabel() for a in figure.axes] == ["y [rad]", "residual", "u [A]"]
     assert len(ftlm.plot.fit(joint.model, [small_run, small_run], inputs=True).axes) == 6
-    with pytest.raises(ftlm.errors.ModelError, match="inputs=True needs runs"):
+    with pytest.raises(ftlm.errors.ModelError, match="there are no runs"):
         ftlm.plot.fit(joint.comparison, inputs=True)
 
 
