@@ -205,13 +205,13 @@ impl<'a> MultistartState<'a> {
     fn optimize_starts(&mut self) -> Result<()> {
         let mut starts = self.starts.clone();
         loop {
-            let glanced = self.laps.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
-            let mut glanced = merge_duplicates(&glanced, is_same_iterate);
+            let screened = self.laps.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
+            let mut screened = merge_duplicates(&screened, is_same_iterate);
             if self.coarse.sampling.pulses_per_sample > 1 {
                 // Nearly all of these were optimized on the coarser grid.
-                glanced.truncate(competitive_candidates(&glanced).len().max(MIN_SURVIVORS));
+                screened.truncate(competitive_candidates(&screened).len().max(MIN_SURVIVORS));
             }
-            self.candidates = self.laps.run(self.free, &self.coarse, &glanced, FIRST_BUDGET_EVALUATIONS)?;
+            self.candidates = self.laps.run(self.free, &self.coarse, &screened, FIRST_BUDGET_EVALUATIONS)?;
             self.first.clone_from(&self.candidates);
             if self.coarse.sampling.pulses_per_sample >= MAX_PULSES_PER_SAMPLE {
                 return Ok(());
