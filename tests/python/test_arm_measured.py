@@ -166,3 +166,22 @@ def test_where_one_signal_stands_for_the_rest_there_is_no_machine(runs) -> None:
     assert found.fit["theta22"] > 92.0
     assert found.coefficients["b4"] == pytest.approx(-0.83, abs=0.05)
     assert found.orders["beta4"] < 0.02
+
+
+@needs_data
+def test_freeing_the_order_of_an_input_costs_nothing_on_a_short_step() -> None:
+    # A screening that ends too early, or a fit that is stopped in its flat valley, takes another start of the run.
+    angles = {"theta11": "th11_deg", "theta12": "th12_deg"}
+    whole = ftlm.load(DATA / "two_link_steps" / "lqg_30.csv", time="t_s", outputs=angles)
+    u, y = whole["theta11"][::4], whole["theta12"][::4]
+    run = ftlm.Run.from_arrays(step=4 * whole.step, inputs={"u": u}, outputs={"y": y}, intersample={"u": "foh"})
+    squares = []
+    for order in ("2", "gamma"):
+        found = ftlm.identify(
+            run,
+            ftlm.equation(f"D^2 y = d D^mu y + a y + b D^{order} u"),
+            method=ftlm.OutputError(intervals="quadratic"),
+        )
+        assert found.joint is not None
+        squares.append(found.joint.noise["y"] ** 2)
+    assert squares[1] <= 1.001 * squares[0]

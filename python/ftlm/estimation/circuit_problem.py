@@ -12,13 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ftlm.data.frequency_data import FrequencyData
-from ftlm.estimation.response_problem import (
-    MAX_EXPONENT,
-    MAX_STARTS,
-    ResponseProblem,
-    ResponseRecord,
-    halton,
-)
+from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseProblem, ResponseRecord, halton
 from ftlm.structure.circuit import Circuit, impedance_and_derivatives
 from ftlm.utils.validation import Complex, Floats
 

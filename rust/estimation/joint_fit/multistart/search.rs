@@ -166,7 +166,7 @@ fn integer_order_optima(
     let mut candidates = Vec::new();
     for less in integer_order_problems(free, near) {
         // With fixed orders most initial guesses lead to the same optimum.
-        let ended = optimize_submodel(&less.free, course, coarse, (MAX_FINAL_SURVIVORS, f64::INFINITY))?;
+        let ended = optimize_submodel(&less.free, course, coarse, MAX_FINAL_SURVIVORS, f64::INFINITY)?;
         candidates.extend(ended.iter().take(1).map(|runner| less.embed(runner)));
     }
     Ok(candidates)
@@ -180,7 +180,8 @@ fn optimize_submodel(
     free: &ParameterSet,
     course: MultistartContext<'_>,
     coarse: &Objective<'_>,
-    (going, level): (usize, f64),
+    going: usize,
+    level: f64,
 ) -> Result<Vec<Candidate>> {
     let part = leading_part(free, course.source, SELECTION_INTERVALS)?;
     if let Some(candidates) = integer_order_multistart(free, course.for_submodel(), part)? {
@@ -269,7 +270,7 @@ impl<'a> MultistartState<'a> {
             return self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>());
         }
         let level = self.candidates.first().map_or(f64::INFINITY, Candidate::cost_per_residual);
-        let ended = optimize_submodel(&less.free, self.course, &self.coarse, (MIN_SURVIVORS, level))?;
+        let ended = optimize_submodel(&less.free, self.course, &self.coarse, MIN_SURVIVORS, level)?;
         self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>())
     }
 
