@@ -172,7 +172,8 @@ def test_where_one_signal_stands_for_the_rest_there_is_no_machine(runs) -> None:
 def test_freeing_the_order_of_an_input_costs_nothing_on_a_short_step() -> None:
     # A screening that ends too early, or a fit that is stopped in its flat valley, takes another start of the run.
     angles = {"theta11": "th11_deg", "theta12": "th12_deg"}
-    whole = ftlm.load(DATA / "two_link_steps" / "lqg_30.csv", time="t_s", outputs=angles)
+    units = dict.fromkeys(angles, "deg")
+    whole = ftlm.load(DATA / "two_link_steps" / "lqg_30.csv", time="t_s", outputs=angles, units=units)
     u, y = whole["theta11"][::4], whole["theta12"][::4]
     run = ftlm.Run.from_arrays(step=4 * whole.step, inputs={"u": u}, outputs={"y": y}, intersample={"u": "foh"})
     squares = []
