@@ -21,8 +21,9 @@ const RANK_TOLERANCE: f64 = 1e-10;
 /// Twice the logarithm of the likelihood ratio of two nested regressions under autoregressive noise, at least 0.
 ///
 /// `residuals` are regressed on the columns `few` and `many`, each set orthonormal. `outputs` are the samples of each
-/// run by output; each output has its own noise of at most `most` lags. Each set has its own order: that which is needed
-/// without the further columns can imitate them. Both are evaluated on the same samples. O(k² N) for k columns or lags.
+/// run by output; the noise of each output has at most `most` lags. The order of the noise is chosen for each set alone,
+/// because an autoregression of high order can imitate a missing column. The larger order limits both final fits, which
+/// predict the same samples. O(k² N) for k columns or lags.
 ///
 /// # Errors
 /// [`Error::Length`] for a column of another length, [`Error::Interrupted`].

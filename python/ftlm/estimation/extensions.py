@@ -492,8 +492,8 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
 def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs: Runs) -> list[Extension]:
     """Return the structure with a constant load that starts at an unknown time; [] for several or irregular runs.
 
-    From the parameters of each of `starts`, the step is put at the time at which a load, with the parameters adapted to
-    it, explains most of the residuals. The model is fitted again, until the time does not change.
+    The search starts from the parameters of each fit in `starts`. It places the step at the time at which a load and
+    changes of the parameters explain most of the residuals, and fits the model again, until the time does not change.
     """
     (item,), (run, *others) = structure.equations, runs
     if others or run.sample_times is not None:

@@ -13,8 +13,8 @@ use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 
 /// Relative cost decrease predicted for a full step below which an optimization has converged.
 pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
-/// Such a decrease times the number of residuals, for a fit that is only compared with others: the increase of twice
-/// the log-likelihood by a full step below which an optimization has converged.
+/// Increase of twice the log-likelihood predicted for a full step below which a fit that is only compared with others
+/// has converged.
 const COMPARISON_LIKELIHOOD_TOLERANCE: f64 = 2e-4;
 /// Largest acceptable discretization error, in standard deviations of the noise.
 const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
@@ -125,7 +125,7 @@ impl<'a> Objective<'a> {
 
     /// Objective whose optimizations end as soon as the likelihood hardly increases, for comparisons of fits.
     ///
-    /// Along a flat valley, where the data leave parameters undetermined, these are far fewer evaluations.
+    /// If the data determine a parameter poorly, the cost has a flat valley, along which this saves most evaluations.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn for_comparison(self) -> Self {
