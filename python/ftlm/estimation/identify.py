@@ -173,6 +173,9 @@ class Hypotheses:
 def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
     """Return the fit of a structure, with a constant level added to each output if the runs prefer one."""
     fit = hypotheses.fit(structure)
+    constant = _fit_with_constant(fit, structure, hypotheses)
+    if constant is not None:
+        return constant
     restart = _fit_in_motion(fit, structure, hypotheses)
     if restart is not None:
         return restart
@@ -194,6 +197,42 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     return replace(fit, findings=[*fit.findings, *offset_findings])
 
 
+def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
+    """Return the fit of an integrating plant with a constant in its equations; None if the runs do not prefer it.
+
+    An integrating plant responds to the offset of an input sensor by a drift, which no level of its output describes.
+    The fit has initial guesses of its own, because a fit that lacks the constant may end at any wrong optimum.
+    """
+    automatic = structure.initial == "auto" and structure.offset == "none"
+    if fit.joint is None or not automatic or fit.task.structure.offset != "none" or not _integrates(structure):
+        return None
+    if has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
+        return None
+    request = replace(structure, offset="constant")
+    try:
+        candidate = hypotheses.fit(request)
+    except FtlmError:
+        return None
+    joint = candidate.joint
+    if joint is None or joint.unstable_optimum is not None:
+        return None
+    constants = len(fit.task.runs) * len(structure.equations)
+    worse = max((fit.joint, joint), key=lambda either: math.prod(either.noise.values()))
+    if fit_score(joint, worse, constants) >= fit_score(fit.joint, worse):
+        return None
+    whole = _fit_in_motion(candidate, request, hypotheses) or hypotheses.take(request, candidate)
+    about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
+    return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **about)])
+
+
+def _integrates(structure: Structure) -> bool:
+    """Whether an equation has no term in its own output, so that it determines only derivatives of the output."""
+    return not all(
+        any(term.signal == item.output and not term.order.names and term.order.constant == 0 for term in item.terms)
+        for item in structure.equations
+    )
+
+
 def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
     """Return a fit with unknown initial values if the runs clearly refute rest despite quiet first samples.
 
@@ -202,7 +241,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
     kept.
     """
     joint, runs = fit.joint, fit.task.runs
-    automatic = structure.initial == "auto" and structure.offset == "none" and structure.is_linear
+    automatic = structure.initial == "auto" and structure.offset in ("none", "constant") and structure.is_linear
     if joint is None or not automatic or joint.initial != "rest":
         return None
     slow = has_colored_residuals(joint)
@@ -213,7 +252,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
         # A constant input gives no evidence of rest.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
-    for offset in MOTION_OFFSETS:
+    for offset in MOTION_OFFSETS if structure.offset == "none" else (structure.offset,):
         request = replace(structure, initial="caputo", offset=offset)
         levels = len(runs) * len(fit.model.outputs) * (offset == "level")
 
@@ -398,8 +437,8 @@ def identify(
         ``.settings["offset_test"]``; the structure is fitted with the constant and, if it is not significant, again
         without. Default: that of the structure. Each run has its own values, which are in ``.comparison.offsets``. An
         offset cannot be distinguished from initial terms for a nonzero past (``"history"``). A run that rests at a
-        level before an input changes gets ``"level"`` by default. A finding reports a missing constant with a large
-        effect.
+        level before an input changes gets ``"level"`` by default, and an integrating plant gets ``"constant"`` if its
+        runs prefer it. A finding reports a missing constant with a large effect.
     bounds
         (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
     m

@@ -1,13 +1,16 @@
 //! Multistart for equations with friction: linear fits with the measured sign of the velocity are the initial guesses.
 //!
 //! With the measured sign of the velocity the equation is linear. While the body sticks, the sign is noise; the bias is
-//! acceptable for an initial guess. Fits without friction add guesses with several amounts of friction. Stribeck friction
+//! acceptable for an initial guess. Fits without friction add guesses with several amounts of friction. If no guess
+//! leads to the noise level, the optima of the structure without friction are initial guesses, too. Stribeck friction
 //! starts from the best fits with Coulomb friction.
 
 use std::collections::BTreeMap;
 
-use super::halving::{FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS};
-use super::search::{optimize_on_coarse_grids, run_multistart, MultistartContext};
+use super::halving::{sort_by_cost, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS};
+use super::search::{
+    none_if_invalid_model, optimize_on_coarse_grids, run_multistart, MultistartContext, NOISE_FLOOR_FACTOR,
+};
 use super::sliding_body::fit_sliding_body;
 use crate::equation::Initial;
 use crate::error::{Error, Result};
@@ -63,13 +66,46 @@ pub fn run_friction_multistart(free: &ParameterSet, course: MultistartContext<'_
     let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
     let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
     let starts = initial_guesses(free, course, &grid)?;
-    optimize_on_coarse_grids(free, &grid, &starts, course.threads)
+    let mut reached = optimize_on_coarse_grids(free, &grid, &starts, course.threads)?;
+    let is_at_noise = reached.first().is_some_and(|c| c.cost_per_residual() <= NOISE_FLOOR_FACTOR * course.floor);
+    if !is_at_noise && !has_stribeck_body(structure) {
+        // The structure without friction is nested in this one, so its optima are initial guesses.
+        let more = frictionless_guesses(free, course, &grid)?;
+        reached.extend(optimize_on_coarse_grids(free, &grid, &more, course.threads)?);
+        reached = sort_by_cost(reached);
+    }
+    Ok(reached)
+}
+
+/// Initial guesses from the optima without friction: zero friction, and fractions of the input force.
+fn frictionless_guesses(
+    free: &ParameterSet,
+    course: MultistartContext<'_>,
+    grid: &Objective<'_>,
+) -> Result<Vec<Candidate>> {
+    let (linear, source) = without_friction(&free.structure, course.source)?;
+    let own = MultistartContext { listener: None, ..course };
+    let optima = none_if_invalid_model(run_on(&linear, &source, own))?.unwrap_or_default();
+    let mut guesses = Vec::new();
+    for optimum in optima.iter().take(MAX_FINAL_SURVIVORS) {
+        let values = values_of(&linear, optimum);
+        guesses.push(guess_at(free, &values, format!("{}, without friction", optimum.origin))?);
+        guesses.extend(force_guesses(free, grid, &values, &optimum.origin)?);
+    }
+    Ok(guesses)
+}
+
+/// Problem and recordings without friction.
+fn without_friction(structure: &ParametricStructure, source: &Recordings) -> Result<(ParameterSet, Recordings)> {
+    let mut runs = source.runs().to_vec();
+    runs.iter_mut().for_each(|run| run.has_friction = false);
+    Ok((ParameterSet::from_structure(with_friction(structure, |_| None))?, Recordings::new(runs)?))
 }
 
 fn initial_guesses(free: &ParameterSet, course: MultistartContext<'_>, grid: &Objective<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     let bodies = bodies(structure).count();
-    if self::bodies(structure).any(|(_, friction)| has_stribeck(friction)) {
+    if has_stribeck_body(structure) {
         let less = ParameterSet::from_structure(with_friction(structure, |friction| Some(without_stribeck(friction))))?;
         let reached = run_friction_multistart(&less, course)?;
         let best = reached.iter().take(MAX_FINAL_SURVIVORS);
@@ -142,6 +178,10 @@ fn with_friction(
         ..item.clone()
     };
     ParametricStructure { equations: structure.equations.iter().map(of).collect(), ..structure.clone() }
+}
+
+fn has_stribeck_body(structure: &ParametricStructure) -> bool {
+    bodies(structure).any(|(_, friction)| has_stribeck(friction))
 }
 
 fn has_stribeck(friction: &FrictionParameters) -> bool {
@@ -450,28 +490,18 @@ fn coulomb_guesses(
     runner: &Candidate,
 ) -> Result<Vec<Candidate>> {
     let (mut values, origin) = (values_of(signed, runner), &runner.origin);
-    let named: Vec<(&ParametricEquation, f64, &String)> = bodies(&free.structure)
-        .filter_map(|(item, friction)| Some((item, friction.coulomb.0, friction.coulomb.1.name()?)))
-        .collect();
-    if named.is_empty() {
+    let coulomb = free_coulomb_coefficients(&free.structure);
+    if coulomb.is_empty() {
         return Ok(vec![guess_at(free, &values, origin.clone())?]);
     }
-    let with_forces = |values: &Values, forces: &[f64], ratio: f64, of: &str| {
-        let mut values = values.clone();
-        values.extend(named.iter().zip(forces).map(|((.., name), force)| ((*name).clone(), ratio * force)));
-        guess_at(free, &values, format!("{origin}, friction {} of {of}", format_general(ratio, 6)))
-    };
     let mut out = Vec::new();
-    let measured: Vec<f64> = named.iter().map(|(.., name)| value_at(&values, name).max(0.0)).collect();
+    let measured: Vec<f64> = coulomb.iter().map(|(.., name)| value_at(&values, name).max(0.0)).collect();
     if measured.iter().any(|value| *value > 0.0) {
         for ratio in MEASURED_SIGN_RATIOS {
-            out.push(with_forces(&values, &measured, ratio, "the measured sign")?);
+            out.push(guess_with_friction(free, &values, &measured, ratio, &format!("{origin}, measured sign"))?);
         }
     }
-    let linear = ParameterSet::from_structure(with_friction(&free.structure, |_| None))?;
-    let mut runs = grid.source().runs().to_vec();
-    runs.iter_mut().for_each(|run| run.has_friction = false);
-    let source = Recordings::new(runs)?;
+    let (linear, source) = without_friction(&free.structure, grid.source())?;
     let coarse = Objective::new((&linear.problem, &source, grid.stop()), grid.weights.clone(), grid.sampling, false)?;
     let start = guess_at(&linear, &values, String::new())?.result.iterate;
     let optimum = match coarse.minimize_in(&linear.problem_at(&start, false, &[]), &start, FIRST_BUDGET_EVALUATIONS) {
@@ -481,16 +511,46 @@ fn coulomb_guesses(
         Ok(optimum) => Candidate { result: optimum, origin: String::new(), duplicates: Vec::new() },
     };
     values.extend(values_of(&linear, &optimum));
-    let largest = |(item, factor, _): &(&ParametricEquation, f64, _)| {
-        Ok(largest_input_force(grid.source(), item, &values)? / factor)
-    };
-    let forces = named.iter().map(largest).collect::<Result<Vec<f64>>>()?;
-    if forces.iter().any(|force| *force > 0.0) {
-        for ratio in COULOMB_FORCE_RATIOS {
-            out.push(with_forces(&values, &forces, ratio, "what drives")?);
-        }
-    }
+    out.extend(force_guesses(free, grid, &values, origin)?);
     Ok(out)
+}
+
+/// Free Coulomb coefficients, with their equations and factors.
+fn free_coulomb_coefficients(structure: &ParametricStructure) -> Vec<(&ParametricEquation, f64, &String)> {
+    bodies(structure)
+        .filter_map(|(item, friction)| Some((item, friction.coulomb.0, friction.coulomb.1.name()?)))
+        .collect()
+}
+
+/// Initial guess whose Coulomb friction of each body is a multiple of a force.
+fn guess_with_friction(
+    free: &ParameterSet,
+    values: &Values,
+    forces: &[f64],
+    ratio: f64,
+    origin: &str,
+) -> Result<Candidate> {
+    let mut values = values.clone();
+    for ((.., name), force) in free_coulomb_coefficients(&free.structure).into_iter().zip(forces) {
+        values.insert(name.clone(), ratio * force);
+    }
+    guess_at(free, &values, format!("{origin}, friction times {}", format_general(ratio, 6)))
+}
+
+/// Initial guesses of Coulomb friction from fractions of the largest input force on each body.
+fn force_guesses(free: &ParameterSet, grid: &Objective<'_>, values: &Values, origin: &str) -> Result<Vec<Candidate>> {
+    let coulomb = free_coulomb_coefficients(&free.structure);
+    let force = |(item, factor, _): &(&ParametricEquation, f64, _)| {
+        Ok(largest_input_force(grid.source(), item, values)? / factor)
+    };
+    let forces = coulomb.iter().map(force).collect::<Result<Vec<f64>>>()?;
+    if forces.iter().all(|force| *force <= 0.0) {
+        return Ok(Vec::new());
+    }
+    COULOMB_FORCE_RATIOS
+        .iter()
+        .map(|&ratio| guess_with_friction(free, values, &forces, ratio, &format!("{origin}, input force")))
+        .collect()
 }
 
 /// Initial guesses of Stribeck friction from a fit with Coulomb friction alone.
