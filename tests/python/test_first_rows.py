@@ -475,6 +475,55 @@ def test_gains_of_a_panel_of_first_rows():
     assert 0.9 <= np.mean(covered) <= 0.99
 
 
+def test_an_integrator_with_an_offset_of_its_input_sensor_agrees_with_linear_regression():
+    # D y = b (u - 0.3) from rest is y = b ∫u - 0.3 b t, linear in both coefficients.
+    g = np.random.default_rng(11)
+    u, h = np.repeat(g.choice([-1.0, 0.6], 48), 25), 0.01
+    time, area = h * np.arange(u.size), h * np.concatenate([[0.0], np.cumsum(u + 0.3)[:-1]])
+    y = 2.0 * (area - 0.3 * time) + 0.01 * g.standard_normal(u.size)
+    (slope, drift), *_ = np.linalg.lstsq(np.stack([area, time], axis=1), y, rcond=None)
+    result = ftlm.identify(run_of(u + 0.3, y, h), ftlm.equation("D y = b u"))
+    assert "constant_estimated" in codes(result)
+    assert result.coefficients["b"] == pytest.approx(slope, rel=1e-5)
+    assert result.comparison.offsets[0]["y"]["constant"] == pytest.approx(drift, rel=1e-4)
+
+
+INTEGRATORS = [
+    ("D y = b u", [2.0], [1.0, 0.0]),
+    ("D^2 y = a1 D y + b u", [20.0], [1.0, 3.0, 0.0]),
+    ("D^3 y = a2 D^2 y + a1 D y + b u", [300.0], [1.0, 4.0, 60.0, 0.0]),
+]
+
+
+@pytest.mark.parametrize("first", [0, 317])
+@pytest.mark.parametrize("bias", [0.03, 0.3])
+@pytest.mark.parametrize(("words", "num", "den"), INTEGRATORS)
+def test_an_integrating_plant_has_its_rate_despite_an_offset_of_its_input(words, num, den, bias, first):
+    for seed in range(3):
+        g = np.random.default_rng([seed, 3])
+        u = np.repeat(g.choice([-1.0, -0.5, 0.5, 1.0], 30), 40)
+        y = plant(num, den, u, 0.01)
+        y = y + 0.01 * np.std(y) * g.standard_normal(u.size)
+        result = ftlm.identify(run_of(u[first:] + bias, y[first:], 0.01), ftlm.equation(words))
+        error = abs(result.coefficients["b"] - num[0])
+        assert error < 4 * result.standard_errors["b"]
+        assert error < 0.05 * num[0]
+
+
+def test_colored_noise_of_an_integrator_is_rarely_taken_for_an_offset():
+    estimated = []
+    for seed in range(20):
+        g = np.random.default_rng([seed, 7])
+        u = np.repeat(g.choice([-1.0, -0.5, 0.5, 1.0], 30), 40)
+        noise = lfilter([1.0], [1.0, -0.9], g.standard_normal(u.size))
+        y = plant([20.0], [1.0, 3.0, 0.0], u, 0.01)
+        y = y + 0.05 * np.std(y) * noise / np.std(noise)
+        result = ftlm.identify(run_of(u, y, 0.01), ftlm.equation("D^2 y = a1 D y + b u"))
+        estimated.append("constant_estimated" in codes(result))
+        assert abs(result.coefficients["b"] - 20.0) < 4 * result.standard_errors["b"]
+    assert sum(estimated) <= 2
+
+
 def test_a_level_is_found_on_a_record_that_is_too_long_for_the_offset_test(monkeypatch):
     monkeypatch.setattr("ftlm.estimation.identify.MAX_OFFSET_TEST_SAMPLES", 100)
     g = np.random.default_rng(5)

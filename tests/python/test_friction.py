@@ -14,6 +14,7 @@ from ftlm import _core
 from ftlm.errors import DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.linear import Streaming
+from ftlm.estimation.output_error import fit_output_error
 from numbered_problem import NumberedProblem
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
@@ -410,3 +411,33 @@ def test_the_initial_values_of_a_long_ring_down_are_found() -> None:
     found = truth.compare(rest.with_outputs({"x": x}))
     assert found.initial[0]["x"][0.0] == pytest.approx(0.1, rel=1e-3)
     assert found.output_error["x"].rmse == pytest.approx(2e-5, rel=0.1)
+
+
+def hub(seed: int, load: float, disturbance: float) -> ftlm.Run:
+    """A hub with friction, a constant load and an unmeasured disturbance, in a loop; explicit Euler steps of 2 ms."""
+    g, step, substeps = np.random.default_rng(seed), 0.02, 10
+    reference = np.repeat(g.choice([-25, 25, 0, 10], 10), 100)
+    push = disturbance * np.repeat(g.standard_normal(40), 25)
+    currents, angles, angle, speed = [], [], 0.0, 0.0
+    for target, force in zip(reference, push, strict=True):
+        current = np.clip(0.03 * (target - angle) - 0.004 * speed, -0.7, 0.7)
+        currents.append(current)
+        angles.append(angle)
+        for _ in range(substeps):
+            torque = 1500.0 * current - 5.0 * speed + load + force
+            if speed == 0.0 and abs(torque) < 200.0:
+                continue
+            direction = np.sign(speed) if speed else np.sign(torque)
+            later = speed + step / substeps * (torque - 200.0 * direction)
+            speed = 0.0 if later * speed < 0.0 else later
+            angle += step / substeps * speed
+    return run_of(np.array(currents), step, np.array(angles) + 0.02 * g.standard_normal(reference.size))
+
+
+@pytest.mark.parametrize(("seed", "load", "disturbance"), [(0, 0.0, 50.0), (2, 60.0, 50.0), (11, 60.0, 150.0)])
+def test_friction_never_fits_worse_than_the_equation_without_it(seed, load, disturbance):
+    run, linear = hub(seed, load, disturbance), "D^2 y = a1 D y + b u"
+    frictionless, dry = (
+        fit_output_error([run], ftlm.equation(words, initial="rest")) for words in (linear, f"{linear} - fc*sign(D y)")
+    )
+    assert dry.noise["y"] < 1.001 * frictionless.noise["y"]

@@ -129,6 +129,14 @@ def test_a_model_that_explains_nothing_is_not_to_be_used():
     assert "explains little of y (fit" in poor.verdict.reason
 
 
+def test_a_failed_validation_never_advises_the_method_of_the_fit(found):
+    other_plant = record(CHIRP, words="D^1.8 y = -0.6 D^0.8 y - 90 y + 4 u", seed=2, name="chirp")
+    lost = found.validate(other_plant).verdict
+    assert lost.level == "do not use"
+    assert "output-error" not in lost.sentence
+    assert "output-error" not in saved_verdict(found.model, [found.model.compare(other_plant)]).sentence
+
+
 def test_a_closed_loop_is_named():
     poor = ftlm.identify(loop("closed, coloured, biased", 0), ftlm.equation("D^alpha y = a y + b u"))
     judged = poor.verdict

@@ -204,7 +204,7 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
     The fit has initial guesses of its own, because a fit that lacks the constant may end at any wrong optimum.
     """
     automatic = structure.initial == "auto" and structure.offset == "none"
-    if fit.joint is None or not automatic or fit.task.structure.offset != "none" or not _integrates(structure):
+    if fit.joint is None or not automatic or fit.task.structure.offset != "none" or not structure.integrates:
         return None
     if has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
         return None
@@ -223,14 +223,6 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
     whole = _fit_in_motion(candidate, request, hypotheses) or hypotheses.take(request, candidate)
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
     return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **about)])
-
-
-def _integrates(structure: Structure) -> bool:
-    """Whether an equation has no term in its own output, so that it determines only derivatives of the output."""
-    return not all(
-        any(term.signal == item.output and not term.order.names and term.order.constant == 0 for term in item.terms)
-        for item in structure.equations
-    )
 
 
 def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:

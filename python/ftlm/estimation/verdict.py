@@ -143,7 +143,7 @@ def verdict(result: Identification, validation: Comparison | None = None) -> Ver
     runs = () if validation is None or unstable else (validation,)
     repeated = validation is not None and any(f.code in REPEATED_RUN_CODES for f in validation.findings)
     has_validation = bool(runs) and not repeated
-    against = _combined_verdict([*result_findings(result)], result.fit, runs, has_validation)
+    against = _combined_verdict([*result_findings(result)], result.fit, runs, has_validation, result.method)
     if against is not None:
         return against
     fits = ", ".join(f"{o} {f.fit:.4g} %" for o, f in (validation or result.comparison).output_error.items())
@@ -163,12 +163,21 @@ def _describe_residuals(result: Identification) -> str:
 
 
 def _combined_verdict(
-    own: Sequence[Finding], estimation_fits: Mapping[str, float], runs: Sequence[Comparison], has_validation: bool
+    own: Sequence[Finding],
+    estimation_fits: Mapping[str, float],
+    runs: Sequence[Comparison],
+    has_validation: bool,
+    method: str = "",
 ) -> Verdict | None:
-    """Return the verdict from the findings of a fit and from its comparisons with other runs; None without findings."""
+    """Return the verdict from the findings of a fit by a method and from its comparisons with other runs.
+
+    Without findings it is None.
+    """
     buried = [f.output for f in own if f.code in POOR_FIT_CODES]
     findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
     findings += [f for comparison in runs for f in _validation_losses(estimation_fits, comparison)]
+    # Remedies never advise the method of the fit.
+    findings = [replace(f, method=method) for f in findings]
     own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
     return verdict_from([*own_first, *findings, *own, *([] if has_validation else [make_finding("not_validated")])])
 
@@ -196,7 +205,8 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
         own += saved_findings(estimate)
         estimation_fits = {n: f for n, f in estimate.fit.items() if f is not None}
         is_repeated = any(name in estimate.runs for c in validation for name, _, _ in c.per_run)
-        judgement = _combined_verdict(own, estimation_fits, validation, bool(validation) and not is_repeated)
+        is_validated = bool(validation) and not is_repeated
+        judgement = _combined_verdict(own, estimation_fits, validation, is_validated, estimate.method)
     if judgement is not None:
         return judgement
     fits = ", ".join(f"{o} {f.fit:.4g} %" for c in validation for o, f in c.output_error.items())

@@ -217,6 +217,14 @@ class Structure:
         return not (self.has_friction or self.has_nonlinear_terms)
 
     @property
+    def integrates(self) -> bool:
+        """Whether an equation has no term in its own output, so that it determines only derivatives of the output."""
+        return not all(
+            any(term.signal == item.output and not term.order.names and term.order.constant == 0 for term in item.terms)
+            for item in self.equations
+        )
+
+    @property
     def friction_equations(self) -> tuple[int, ...]:
         """Indices of the equations with friction."""
         return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)

@@ -16,7 +16,7 @@ from ftlm.estimation.nuisance_parameters import has_white_residuals
 from ftlm.estimation.output_error import JointFit
 from ftlm.simulation.discretization import compared_values
 from ftlm.structure.parser import equation
-from ftlm.structure.structure import Structure
+from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
 from ftlm.structure_selection.cross_validation import (
     Trial,
@@ -65,8 +65,8 @@ class IntegerOrderForm:
     integrator
         Whether there is a pole at s = 0, so that the equation has no term in the output itself.
     offset
-        Kind of offset of each run: ``"none"``; ``"level"``, a constant added to the output; or ``"ramp"``, a linear
-        trend.
+        Kind of offset of each run: ``"none"``; ``"level"``, a constant added to the output, or with an integrator to
+        the input; or ``"ramp"``, a linear trend.
     friction
         Coulomb friction: ``"none"``; ``"derivative"``, which opposes the derivative of the output (a position); or
         ``"output"``, which opposes the output itself (a speed).
@@ -99,7 +99,16 @@ class IntegerOrderForm:
             slope = problem.tanh_slope if self.friction == "output" else math.inf
             text += " " + friction_term(output, f"fc{end}", slope)
         delay = problem.input_delays(delayed=self.delayed)
-        return equation(text, delay=delay, offset=self.offset, initial=problem.initial)
+        return _with_offset(equation(text, delay=delay, initial=problem.initial), self.offset)
+
+
+def _with_offset(structure: Structure, offset: str) -> Structure:
+    """Return a structure with an offset; the level of an integrating plant is a constant in its equation.
+
+    No level of the output describes the response of an integrator to the offset of an input sensor.
+    """
+    level = "constant" if structure.integrates else "level"
+    return replace(structure, offset=check_offset(level if offset == "level" else offset))
 
 
 def _derivative(order: int, name: str) -> str:
@@ -351,7 +360,8 @@ class AutomaticSelection:
         delayed = bool(fits and fits[0].form and fits[0].form.delayed)
         speed = IntegerOrderForm(1, 0, delayed=delayed, offset=offset, friction="output")
         changes_sign = math.isfinite(self.problem.tanh_slope)
-        for form in ([speed] if changes_sign else []) + [replace(speed, order=2, friction="derivative")]:
+        position = replace(speed, order=2, friction="derivative")
+        for form in ([speed] if changes_sign else []) + [position, replace(position, integrator=True)]:
             if fits and not has_white_residuals(fits[0].joint):
                 # Negative friction would drive the motion.
                 friction_fits = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
@@ -396,7 +406,7 @@ class AutomaticSelection:
 
         def structure(text: str, *, delayed: bool = False) -> Structure:
             delay = self.problem.input_delays(delayed=delayed)
-            return equation(text, delay=delay, offset=form.offset, initial=self.problem.initial)
+            return _with_offset(equation(text, delay=delay, initial=self.problem.initial), form.offset)
 
         late = {} if best is None else {n: v for n, v in best.joint.values_by_name.items() if n.startswith("delay_")}
 

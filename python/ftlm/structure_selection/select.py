@@ -324,7 +324,7 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
         order_values={n: v for s in structures for n, v in s.order_values.items()},
         delay={n: v for s in structures for n, v in s.delay.items()},
         free_delays={n: v for s in structures for n, v in s.free_delays.items()},
-        offset=max((s.offset for s in structures), key=("none", "level", "ramp").index),
+        offset=max((s.offset for s in structures), key=("none", "level", "constant", "ramp").index),
     )
     if any(w.joint is not None and w.joint.initial != "rest" for w in winners):
         combination = replace(combination, initial="caputo")
