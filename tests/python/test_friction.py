@@ -434,7 +434,7 @@ def hub(seed: int, load: float, disturbance: float) -> ftlm.Run:
     return run_of(np.array(currents), step, np.array(angles) + 0.02 * g.standard_normal(reference.size))
 
 
-@pytest.mark.parametrize(("seed", "load", "disturbance"), [(0, 0.0, 50.0), (2, 60.0, 50.0), (11, 60.0, 150.0)])
+@pytest.mark.parametrize(("seed", "load", "disturbance"), [(21, 0.0, 50.0), (2, 60.0, 150.0), (24, 60.0, 50.0)])
 def test_friction_never_fits_worse_than_the_equation_without_it(seed, load, disturbance):
     run, linear = hub(seed, load, disturbance), "D^2 y = a1 D y + b u"
     frictionless, dry = (
