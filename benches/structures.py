@@ -146,7 +146,7 @@ def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
     if there is None:
         folds = Folds.of(runs, "runs" if len(runs) > 1 else "blocks")
         there = validate_fit(describe_structure(structure), structure, folds, fit(folds.runs, structure, []))
-        there = replace(there, bic=schwarz_criterion(there.joint, there.parameters, scatter_of(selection)))
+        there = replace(there, bic=schwarz_criterion(there.joint, scatter_of(selection)))
     for word, trial in {"truth": there, "winner": selection.winner, "best": selection.trials[0]}.items():
         row[word] = {"name": trial.name, "numbers": trial.parameters, "bic": trial.bic, "scores": trial.scores}
     return row

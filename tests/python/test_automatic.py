@@ -47,6 +47,19 @@ def test_auto_finds_a_delay_zeros_feedthrough_and_an_integrator(
     assert found.best.model.compare(other).fit["y"] > truth - 0.5
 
 
+@pytest.mark.parametrize("bias", [0.0, 0.5])
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "words"),
+    [([5.0], [1.0, 0.0], "D^1 y = b0 u"), ([60.0], [1.0, 6.0, 0.0], "D^2 y = a1 D^1 y + b0 u")],
+)
+def test_auto_finds_an_integrator_despite_an_offset_of_its_input_sensor(numerator, denominator, words, bias):
+    run, _ = record(numerator, denominator, seed=3, hold=20)
+    biased = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"] + bias}, outputs={"y": run["y"]})
+    best = ftlm.select(biased, "auto").best
+    assert str(best.task.structure) == words + (" + c" if bias else "")
+    assert best.coefficients["b0"] == pytest.approx(numerator[0], rel=0.03)
+
+
 def test_auto_finds_the_level_of_an_output_rather_than_a_pole_and_a_zero_at_zero() -> None:
     # An oven that is kept at 55 degrees by 20 %, and is then heated twice.
     u = np.full(800, 20.0)

@@ -40,6 +40,7 @@ from ftlm.estimation.nonlinear_checks import nonlinear_findings
 from ftlm.estimation.nuisance_parameters import (
     DEFAULT_PULSES_PER_SAMPLE,
     OffsetTest,
+    constant_input,
     fit_score,
     fit_without_history,
     has_colored_residuals,
@@ -214,11 +215,7 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
     except FtlmError:
         return None
     joint = candidate.joint
-    if joint is None or joint.unstable_optimum is not None:
-        return None
-    constants = len(fit.task.runs) * len(structure.equations)
-    worse = max((fit.joint, joint), key=lambda either: math.prod(either.noise.values()))
-    if fit_score(joint, worse, constants) >= fit_score(fit.joint, worse):
+    if joint is None or joint.unstable_optimum is not None or not _is_preferred(joint, fit.joint):
         return None
     whole = _fit_in_motion(candidate, request, hypotheses) or hypotheses.take(request, candidate)
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
@@ -246,10 +243,9 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
     for offset in MOTION_OFFSETS if structure.offset == "none" else (structure.offset,):
         request = replace(structure, initial="caputo", offset=offset)
-        levels = len(runs) * len(fit.model.outputs) * (offset == "level")
 
-        def is_better(candidate: JointFit, *, most: float = least, levels: int = levels) -> bool:
-            return fit_score(candidate, joint, levels) < most
+        def is_better(candidate: JointFit, *, most: float = least) -> bool:
+            return fit_score(candidate, joint) < most
 
         try:
             other = hypotheses.refit(request, fit, is_better)
@@ -258,7 +254,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
         if other is None or other.joint is None or other.joint.unstable_optimum is not None:
             continue
         if slow or has_white_residuals(other.joint):
-            least, candidate = fit_score(other.joint, joint, levels), (request, other)
+            least, candidate = fit_score(other.joint, joint), (request, other)
     if candidate is None:
         return None
     whole = hypotheses.take(*candidate)
@@ -275,14 +271,12 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
     """
     if fit.joint is None:
         return None
-    best, numbers = fit.joint, 0
+    best = fit.joint
     candidate: tuple[Structure, Fit] | None = None
     margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
-    more = len(fit.task.runs) * len(fit.model.outputs)
 
     def is_preferred(joint: JointFit) -> bool:
-        worse = max((best, joint), key=lambda candidate: math.prod(candidate.noise.values()))
-        return fit_score(joint, worse, more) < fit_score(best, worse, numbers) + margin
+        return _is_preferred(joint, best, margin)
 
     for initial in LEVEL_STARTS:
         request = replace(structure, initial=initial, offset="level")
@@ -296,7 +290,7 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
         except FtlmError:
             continue
         if level is not None and level.joint is not None and is_preferred(level.joint):
-            best, candidate, numbers, margin = level.joint, (request, level), more, 0.0
+            best, candidate, margin = level.joint, (request, level), 0.0
     if candidate is None:
         return None
     whole = hypotheses.take(*candidate)
@@ -305,6 +299,12 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
     # Another run may start otherwise.
     model = replace(whole.model, structure=replace(whole.model.structure, initial=structure.initial))
     return replace(whole, model=model, findings=[*whole.findings, make_finding("level_estimated", **about)])
+
+
+def _is_preferred(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
+    """Whether a fit has the lower criterion, with the noise color of the fit with larger residuals."""
+    worse = max((other, joint), key=lambda either: math.prod(either.noise.values()))
+    return fit_score(joint, worse) < fit_score(other, worse) + margin
 
 
 def _suggests_level(fit: Fit) -> bool:
@@ -354,16 +354,6 @@ def _history_offset_findings(fit: Fit) -> list[Finding]:
     less = joint.initial_terms - few.initial_terms
     outputs = ", ".join(fit.model.outputs)
     return [make_finding("constant_instead_of_past", output=outputs, terms=joint.initial_terms, fewer=less)]
-
-
-def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
-    """Return the name of an input with a free coefficient that is constant in every run, or None."""
-    for item in structure.equations:
-        for term in item.terms:
-            plain = term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
-            if plain and all(term.signal in r.inputs and float(np.ptp(r[term.signal])) == 0.0 for r in runs):
-                return term.signal
-    return None
 
 
 def fit_offset_test(fit: Fit) -> OffsetTest | None:

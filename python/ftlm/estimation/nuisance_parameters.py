@@ -15,7 +15,14 @@ from ftlm.data.sampling import MAX_SAMPLE_VALUE, drop_missing
 from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.objective import Iterate, Objective, covariance
-from ftlm.estimation.output_error import JointFit, Loss, fit_output_error, run_multistart, start_from_values
+from ftlm.estimation.output_error import (
+    JointFit,
+    Loss,
+    fit_output_error,
+    level_count,
+    run_multistart,
+    start_from_values,
+)
 from ftlm.findings import Finding, make_finding
 from ftlm.simulation.initial_conditions import (
     START_SETTINGS,
@@ -259,6 +266,16 @@ def _initial_responses(point: Iterate, blocks: list[list[tuple[int, int]]], size
     return columns
 
 
+def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
+    """Return the name of an input with a free coefficient that is constant in every run, or None."""
+    for item in structure.equations:
+        for term in item.terms:
+            plain = term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
+            if plain and all(term.signal in r.inputs and float(np.ptp(r[term.signal])) == 0.0 for r in runs):
+                return term.signal
+    return None
+
+
 def unrequested_offset_findings(test: OffsetTest | None, outputs: Sequence[str]) -> list[Finding]:
     """Return a finding if an offset that the user did not request would explain part of the residuals."""
     if test is None or not test.exceeds(UNREQUESTED_OFFSET_LEVEL, size=MIN_OFFSET_SIZE_RATIO):
@@ -336,13 +353,13 @@ def fit_with_initial_conditions(
     return past if fit_score(past, joint) < fit_score(joint, joint) else joint
 
 
-def fit_score(joint: JointFit, reference: JointFit, levels: int = 0) -> float:
-    """Return the information criterion of a fit, by which initial conditions are compared; lower is better.
+def fit_score(joint: JointFit, reference: JointFit) -> float:
+    """Return the information criterion of a fit, by which initial conditions and offsets are compared.
 
-    The noise color is that of the fit `reference`. `levels` are constants that are counted like initial terms.
+    Lower is better. The noise color is that of the fit `reference`.
     """
     own, others = _pooled_residuals(joint), _pooled_residuals(reference)
-    return start_score(own, joint.initial_terms + levels, others)
+    return start_score(own, joint.initial_terms, others)
 
 
 def has_colored_residuals(joint: JointFit) -> bool:
@@ -408,7 +425,8 @@ def refit_if_accepted(
             residuals=[
                 {o: e / max(deviation[o], 1e-300) for o, e in part.items()} for part in grid.residuals(screening)
             ],
-            initial_terms=sum(len(terms) for run in screening.outcome["initial"] for terms in run),
+            initial_terms=sum(len(terms) for run in screening.outcome["initial"] for terms in run)
+            + level_count(runs, structure),
         )
         if not accepts(screened):
             return None

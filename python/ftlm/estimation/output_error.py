@@ -157,7 +157,7 @@ class JointFit:
     inputs
         Estimated delays [s], saturations and dead zones by name, such as ``delay_u`` and ``sat_u``.
     initial, initial_terms
-        Kind of the fitted initial terms, and the number of their coefficients over all runs.
+        Kind of the fitted initial terms, and the number of coefficients of initial terms and offsets over all runs.
     robust
         Summary of a robust loss; None for squares.
     robust_weights
@@ -364,9 +364,14 @@ def fit_output_error(
         starts=answer["starts"],
         survivors=answer["survivors"],
         initial=structure.initial,
-        initial_terms=answer["initial_terms"],
+        initial_terms=answer["initial_terms"] + level_count(runs, structure),
         unstable_optimum=None if answer["growth"] is None else UnstableOptimum(*answer["growth"]),
     )
+
+
+def level_count(runs: Sequence[Run], structure: Structure) -> int:
+    """Return the number of output levels over all runs, which the core does not count as initial terms."""
+    return len(runs) * len(structure.outputs) if structure.offset == "level" else 0
 
 
 def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:

@@ -20,7 +20,6 @@ from ftlm.structure.structure import Structure, check_offset
 from ftlm.structure_selection.candidates import describe_structure
 from ftlm.structure_selection.cross_validation import (
     Trial,
-    parameter_count,
     residual_variance_inflation,
     schwarz_criterion,
 )
@@ -172,12 +171,11 @@ class OutputProblem:
 
 @dataclass(frozen=True)
 class FittedForm:
-    """Form with its fit, number of parameters, variance inflation of the residuals, and BIC."""
+    """Form with its fit, variance inflation of the residuals, and BIC."""
 
     structure: Structure
     joint: JointFit
     form: IntegerOrderForm | None
-    parameters: int
     variance_inflation: float
     bic: float = math.inf
 
@@ -185,9 +183,7 @@ class FittedForm:
 def _rank(fits: Sequence[FittedForm]) -> list[FittedForm]:
     """Return fits sorted by BIC, best first; BIC uses the smallest variance inflation among them."""
     inflation = min((f.variance_inflation for f in fits), default=1.0)
-    return sorted(
-        (replace(f, bic=schwarz_criterion(f.joint, f.parameters, inflation)) for f in fits), key=lambda f: f.bic
-    )
+    return sorted((replace(f, bic=schwarz_criterion(f.joint, inflation)) for f in fits), key=lambda f: f.bic)
 
 
 @dataclass
@@ -233,8 +229,7 @@ class AutomaticSelection:
         fits_of_form = []
         for (structure, form, _), joint in zip(items, joints, strict=True):
             if isinstance(joint, JointFit):
-                count = parameter_count(structure, joint, self.evaluator.folds)
-                fits_of_form.append(FittedForm(structure, joint, form, count, residual_variance_inflation(joint)))
+                fits_of_form.append(FittedForm(structure, joint, form, residual_variance_inflation(joint)))
             else:
                 self.evaluator.trials.append(self.evaluator.validate(describe_structure(structure), structure, joint))
         return _rank(fits_of_form)
@@ -459,7 +454,7 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
         # A canceled pole and zero at s = 0 are equivalent to a level, or with the initial terms to a drift.
         forms += [lower, *(replace(lower, offset=o) for o in ("level", "ramp"))]
         forms.append(replace(lower, integrator=form.integrator))
-    return [f for f in dict.fromkeys(forms) if f.zeros >= 0 and f.order > int(f.integrator)]
+    return [f for f in dict.fromkeys(forms) if f.zeros >= 0 and f.order > 0]
 
 
 def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:

@@ -503,15 +503,15 @@ def residual_variance_inflation(joint: JointFit) -> float:
     return max([1.0, *(variance_inflation(drop_missing(e)) for part in joint.residuals for e in part.values())])
 
 
-def schwarz_criterion(joint: JointFit, parameters: int, inflation: float) -> float:
+def schwarz_criterion(joint: JointFit, inflation: float) -> float:
     """Return the Schwarz criterion (BIC) of a fit; doi:10.1214/aos/1176344136.
 
     The number of samples is divided by `inflation`.
 
-    Initial terms count as parameters, because a canceled pole and zero add one that can model a level.
+    Initial terms and offsets count as parameters: the initial term of a canceled pole and zero can model a level.
     """
     samples = joint.samples / inflation
     each = samples / max(len(joint.noise), 1)
     return sum(each * 2.0 * math.log(max(v, 1e-300)) for v in joint.noise.values()) + (
-        parameters + joint.initial_terms
+        len(joint.names) + joint.initial_terms
     ) * math.log(samples)

@@ -409,9 +409,7 @@ def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
     and still predict worse.
     """
     inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
-    return [
-        t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, t.parameters, inflation)) for t in ranked
-    ]
+    return [t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, inflation)) for t in ranked]
 
 
 def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: Identification) -> list[Finding]:

@@ -450,8 +450,7 @@ class StepwiseSelection:
         if not fits:
             return []
         inflation = min(residual_variance_inflation(j) for _, j in fits)
-        count = [parameter_count(self._build(c), j, self.work.folds) for c, j in fits]
-        every = [FittedVariant(c, j, schwarz_criterion(j, n, inflation)) for (c, j), n in zip(fits, count, strict=True)]
+        every = [FittedVariant(c, j, schwarz_criterion(j, inflation)) for c, j in fits]
         return sorted(every, key=lambda f: f.bic)
 
     def _eliminate_backward(self, best: Trial, at: FittedVariant) -> None:
