@@ -161,7 +161,7 @@ def test_charts_are_named_for_those_who_cannot_see_them(page):
     fits = 2 * 2  # outputs, runs
     residuals = 2 * 2 * 2  # outputs; itself and the current; runs
     bode, maps = 2 * 2, 1
-    inputs, series = 2, 2 * fits  # over time and how often
+    inputs, series = 2, 2 * fits  # over time and histogram
     own = 1 + 2  # poles, steps
     assert len(charts) == 2 * (fits + inputs + residuals + series + bode + maps + own)  # wide and narrow
     assert all('role="img"' in c and "viewBox" in c for c in charts)
@@ -527,6 +527,14 @@ def test_ticks_are_sane(seed):
     assert len(set(found.labels)) == len(found.labels)
 
 
+def test_no_tick_label_leaves_the_drawing():
+    chart = LineChart([0.01, 1.0, 1e4], [("model", [1.0, 2.0, 3.0])], title="", x_label="f", y_label="y", log_x=True)
+    (last,) = re.findall(r'<text x="([0-9.]+)"[^>]*text-anchor="(\w+)"[^>]*>10000<', chart.narrow)
+    assert last == (f"{axes.NARROW_WIDTH_PX:.1f}", "end")
+    middle = re.findall(r'<text [^>]*text-anchor="middle"[^>]*>([^<]+)<', chart.narrow)
+    assert "1" in middle
+
+
 def test_ticks_are_round():
     assert axes.ticks(0, 10, 5).labels == ["0", "2", "4", "6", "8", "10"]
     assert axes.ticks(-0.1, 0.1, 5).labels == ["−0.10", "−0.05", "0.00", "0.05", "0.10"]
@@ -819,7 +827,7 @@ def test_models_stand_side_by_side_as_bars(identified, square, sine):
 
 def test_residuals_over_time_are_those_of_the_comparison(identified):
     figures = residual_series(identified.comparison, units=identified.model.units, label="estimation")
-    assert [f.title.rpartition(": ")[2] for f in figures] == ["over time", "how often"] * 2
+    assert [f.title.rpartition(": ")[2] for f in figures] == ["over time", "histogram"] * 2
     missed = identified.comparison.measured["theta11"][0] - identified.comparison.simulated["theta11"][0]
     assert f"from {number(float(missed.min()), 4)} to {number(float(missed.max()), 4)}" in figures[0].svg
     assert "[rad]" in figures[1].svg

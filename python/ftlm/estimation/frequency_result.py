@@ -515,7 +515,7 @@ class FrequencyIdentification:
         )
         rows: list[list[Cell]] = [_error_row("estimation", e) for e in self.errors]
         rows += [] if validation is None else [_error_row("validation", e) for e in validation.errors]
-        heads = ("data", "record", "response", "error, % rms", "largest, %", "at [rad/s]")
+        heads = ("data", "record", "response", "error, % rms", "largest, %", "at [Hz]")
         notes = [w for r in self.data for w in r.warnings]
         figures = [relative_residual_figure(self.system, record) for record in self.data]
         residuals = Section(
@@ -527,6 +527,7 @@ class FrequencyIdentification:
             ],
             figures=self.figures() if new else figures,
             small=True,
+            collapsed=bool(new),
         )
         return write_page(
             path,
@@ -623,4 +624,11 @@ def _errors_in_words(errors: Sequence[ResponseError]) -> list[str]:
 
 def _error_row(what: str, error: ResponseError) -> list[Cell]:
     pair = f"{error.output} from {error.input}"
-    return [what, error.name, pair, number(error.rms, 3), number(error.largest, 3), number(error.at, 4)]
+    return [
+        what,
+        error.name,
+        pair,
+        number(error.rms, 3),
+        number(error.largest, 3),
+        number(error.at / (2.0 * math.pi), 4),
+    ]

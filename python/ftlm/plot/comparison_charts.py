@@ -69,7 +69,7 @@ def comparison_charts(
             points=points,
             slider=True,
             bands=_bands_of_lines(bands_by_output[name]) if name in bands_by_output else (),
-            caption=f"Simulation: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}."
+            caption=f"Simulation: fit {number(figures.fit)}\u00a0%."
             + (" Shade: 95 % confidence band of the simulation." if name in bands_by_output else ""),
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)
@@ -154,7 +154,7 @@ def residual_rows(
             rows.append([over_time])
             if np.sum(np.isfinite(missed)) >= 2:
                 words = "Line: the normal curve of the same mean and deviation."
-                rows[-1].append(histogram(missed, title=f"{what}: how often", x_label=axis, caption=words))
+                rows[-1].append(histogram(missed, title=f"{what}: histogram", x_label=axis, caption=words))
     return rows
 
 

@@ -354,8 +354,8 @@ def correlation_sections(joint: JointFit | None) -> list[Section]:
     if joint is None or len(joint.names) < 2:
         return []
     words = (
-        "Two numbers whose correlation is near 1 or −1 can be moved together with little harm: the runs know what they "
-        "make together better than each. That matters where a standard error is large as well."
+        "Two parameters whose correlation is near 1 or −1 can change together with little effect on the fit. Their "
+        "combination is then better determined than each of them."
     )
     values = np.clip(joint.correlation, -1.0, 1.0)
     figure = CorrelationMap(joint.names, values, title="Correlations of the estimates")
@@ -394,7 +394,7 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     if words:
         return Section("Frequency response", words)
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
-    words = "Exact, orders as they are; the equations together, from what is not modelled."
+    words = "Exact response of all equations together at the fractional orders, without approximation."
     if model.estimate is None or model.estimate.covariance is None:
         has_errors = model.estimate is None or None not in model.estimate.standard_errors.values()
         lacking = "This estimator gives no covariance" if has_errors else "The runs do not identify all parameters"

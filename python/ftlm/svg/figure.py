@@ -198,7 +198,11 @@ class PlotArea:
         pairs = zip(upward.values, upward.labels, strict=True)
         marks = [svg_text(self.left - 6, float(self.y_pixels(v)) + 4, label, "end") for v, label in pairs]
         pairs = zip(across.values, across.labels, strict=True)
-        marks += [svg_text(float(self.x_pixels(v)), bottom + 16, label, "middle") for v, label in pairs]
+        for v, label in pairs:
+            x = float(self.x_pixels(v))
+            # A label at the right end would leave the drawing if it were centered.
+            fits = x + text_width(label) / 2 <= width - 4
+            marks.append(svg_text(x if fits else width, bottom + 16, label, "middle" if fits else "end"))
         x_text, y_text = (
             truncate_text(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER_WIDTH_PX))
             for label, axis in zip(names, axes, strict=True)

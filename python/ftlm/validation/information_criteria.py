@@ -104,7 +104,7 @@ def information_table(information: InformationCriteria) -> Table:
     rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]
     rows += [["parameters", information.parameters], ["samples", information.samples]]
     note = (
-        "Lower is better, among models of the same outputs on the same runs. Orders, coefficients, initial terms and "
-        "one noise level an output count as numbers."
+        "Lower is better, among models of the same outputs on the same runs. The parameters include orders, "
+        "coefficients, initial terms and one noise standard deviation for each output."
     )
     return Table("Information criteria", ("criterion", "value"), rows, note=note)
