@@ -28,6 +28,8 @@ def same(first, second):
     ("text", "plain"),
     [
         ("y'' + 2 y' + y = u", "D^2 y = -2 D y - 1 y + u"),
+        ("ÿ + 2 ẏ + y = u", "D^2 y = -2 D y - 1 y + u"),
+        ("x\u0308_1 = -2 x\u0307_1 - x_1 + u", "D^2 x_1 = -2 D x_1 - 1 x_1 + u"),
         ("D^2 y + 0.5 D^0.5 y + y = 2 u", "D^2 y = -0.5 D^0.5 y - y + 2 u"),
         ("dy/dt = -y + u", "D y = -y + u"),
         ("d^2 y/dt^2 + 3 dy/dt = u", "D^2 y = -3 D y + u"),

@@ -63,6 +63,18 @@ MAX_LEIBNIZ_TOKENS = 8
 #: Signs of printed texts, by the symbols of the grammar.
 _PRINTED_SIGNS = str.maketrans("−·⋅×", "-***")
 _SUPERSCRIPT_PATTERN = re.compile("[⁰¹²³⁴-⁹]+")
+#: A signal under combining dots, with the rest of its name.
+_DOTTED_PATTERN = re.compile(r"([^\W\d_])([\u0307\u0308\u20db]+)(\w*)")
+#: Order of the derivative that a combining dot, two dots and three dots stand for.
+_DOT_ORDERS = {"\u0307": 1, "\u0308": 2, "\u20db": 3}
+
+
+def _prime_notation(dotted: re.Match[str]) -> str:
+    """Return a signal with combining dots as the signal with primes."""
+    letter, dots, rest = dotted.groups()
+    return f"{letter}{rest}{chr(39) * sum(_DOT_ORDERS[dot] for dot in dots)}"
+
+
 #: What follows the name of an offset in parentheses, by the kind of offset.
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
 #: Functions that an error message names where they are applied to a signal.
@@ -132,6 +144,8 @@ class EquationParser:
 
     def __init__(self, text: str, signals: Collection[str] = ()) -> None:
         text = _SUPERSCRIPT_PATTERN.sub(lambda power: "^" + unicodedata.normalize("NFKC", power[0]), text)
+        text = _DOTTED_PATTERN.sub(_prime_notation, unicodedata.normalize("NFD", text))
+        text = unicodedata.normalize("NFC", text)
         self.text = text
         self._signals = signals
         self._depth = 0
