@@ -63,6 +63,13 @@ SEARCH = (
 )
 
 
+def test_help_is_a_command_as_well() -> None:
+    assert CliRunner().invoke(app, ["help"]).output == CliRunner().invoke(app, ["--help"]).output
+    for name in ("identify", "open"):
+        assert CliRunner().invoke(app, ["help", name]).output == CliRunner().invoke(app, [name, "--help"]).output
+    assert CliRunner().invoke(app, ["help", "nonsense"]).exit_code == 2
+
+
 def test_two_commands_from_a_file_to_a_validated_model(folder: Path) -> None:
     found = run_command("identify", "square.csv", *SEARCH, "-o", "model.json", "--report", "page.html", cwd=folder)
     assert found.returncode == 0, found.stderr
