@@ -420,11 +420,29 @@ def test_mat_matrices_vectors_and_what_is_skipped(tmp_path, compress):
     assert load(path, outputs=["row"], step=1).step == 1
     assert load(path, outputs=["row"], time="V.1").step == 0.002
     messages(["time", "step="], lambda: load(path, outputs=["row"]))
-    for name in ("word", "cell", "struct", "cube", "z", "none"):
+    for name in ("word", "cell", "cube", "z", "none"):
         messages([repr(name), "not in", "not read", f"{name!r} ("], lambda name=name: load(path, outputs=[name]))
     for name in ("V", "V.0", "V.4", "V(:,4)", "V(:,99999999999999999999)", "row.1"):
         messages([repr(name), "the columns are 'V.1', 'V.2'"], lambda name=name: load(path, outputs={"y": name}))
     messages(["positions"], lambda: load(path, outputs={"y": 0}))
+
+
+@pytest.mark.parametrize("others", [{}, {"rate": 100.0}])
+def test_mat_struct_fields_are_columns_of_one_table(tmp_path, others):
+    t = np.arange(50) * 0.01
+    u, y = np.sign(np.sin(9 * t)), np.cos(t)
+    struct = {"t": t[:, None], "u": u, "y": y[:, None], "comment": "bench 3"}
+    scipy.io.savemat(tmp_path / "s.mat", {"data": struct, **others})
+    run = load(tmp_path / "s.mat", inputs=["u"], outputs=["y"])
+    assert run.step == pytest.approx(0.01)
+    np.testing.assert_array_equal(run["u"], u)
+    np.testing.assert_array_equal(run["y"], y)
+
+
+def test_mat_structs_that_share_field_names_stay_apart(tmp_path):
+    t = np.arange(50.0)
+    scipy.io.savemat(tmp_path / "s.mat", {"a": {"t": t, "u": t}, "b": {"t": t, "u": -t}})
+    assert [c.name for c in open_file(tmp_path / "s.mat").columns] == ["a.t", "a.u", "b.t", "b.u"]
 
 
 def test_mat_time_of_a_named_vector_single_precision_and_nan(tmp_path):

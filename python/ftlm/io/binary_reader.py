@@ -93,12 +93,15 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     kinds: dict[str, str] = {}
     size = 0
     names: set[str] = set()
+    structs: list[str] = []
     for name, shape, kind in list_variables(matlab, path):
         if name in names:
             raise UnreadableError(f"the variable {name!r} is in it twice")
         names.add(name)
         count = math.prod(map(int, shape))
-        if kind not in NUMERIC_MATLAB_CLASSES:
+        if kind == "struct" and count == 1:
+            structs.append(name)
+        elif kind not in NUMERIC_MATLAB_CLASSES:
             skipped[name] = str(kind)
         elif len(shape) != 2:
             skipped[name] = f"{len(shape)} dimensions"
@@ -114,7 +117,24 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     if len(names) > MAX_ARRAYS:
         raise UnreadableError(f"it holds {len(names)} variables, more than {MAX_ARRAYS}", "save a part of it")
     # With mat_dtype=True SciPy drops imaginary parts; the stored type loses nothing.
-    loaded = matlab.loadmat(path, mat_dtype=False, variable_names=list(kinds)) if kinds else {}
+    wanted = [*kinds, *structs]
+    loaded = matlab.loadmat(path, mat_dtype=False, variable_names=wanted) if wanted else {}
+    for name in structs:
+        for field, values in struct_fields(loaded.pop(name)):
+            # Fields of the only struct keep their own names, as `t` of `data.t`.
+            whole = field if len(structs) == 1 and field not in names else f"{name}.{field}"
+            is_table = isinstance(values, numpy.ndarray) and values.ndim == 2 and values.dtype.kind in "biuf"
+            if not is_table or values.size == 0 or whole in loaded:
+                skipped[whole] = "no column of numbers"
+                continue
+            size += 8 * values.size
+            kinds[whole] = "single" if values.dtype == numpy.float32 else "double"
+            loaded[whole] = values
+    if size > budget or len(kinds) > MAX_ARRAYS:
+        raise UnreadableError(
+            f"with its structs the arrays take more than {SIZE_LIMIT} bytes or {MAX_ARRAYS} columns",
+            "save a part of it",
+        )
     header: dict[str, Any] = {"arrays": [], "skipped": skipped}
     arrays = []
     for name, kind in kinds.items():
@@ -127,6 +147,13 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
         header["arrays"].append({"name": name, "rows": values.shape[0], "columns": values.shape[1], "type": kind})
         arrays.append(values)
     return header, arrays
+
+
+def struct_fields(struct: Any) -> list[tuple[str, Any]]:
+    """Return (name, array) of every field of a struct; [] if it is none."""
+    if getattr(struct, "size", 0) != 1 or struct.dtype.names is None:
+        return []
+    return [(field, struct[field].ravel()[0]) for field in struct.dtype.names]
 
 
 def list_variables(matlab: Any, path: str) -> list[tuple[str, tuple[int, ...], str]]:
