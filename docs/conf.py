@@ -10,7 +10,7 @@ sys.path.insert(0, str(HERE))
 
 project = "ftlm"
 author = "the ftlm authors"
-copyright = "MIT licence"
+copyright = "the ftlm authors, MIT license"
 version = release = ftlm.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "formulas"]
