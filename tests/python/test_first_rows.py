@@ -534,6 +534,19 @@ def test_a_level_is_found_on_a_record_that_is_too_long_for_the_offset_test(monke
     assert gain_of(found) == pytest.approx(1.2, rel=0.01)
 
 
+def test_a_given_offset_of_none_prevents_a_level_and_a_constant():
+    g = np.random.default_rng(5)
+    u = np.repeat(g.choice([-1.0, 1.0], 40), 25)
+    noise = 0.01 * g.standard_normal(u.size)
+    at_level = run_of(u, 30.0 + plant([1.2], [0.5, 1.0], u, 0.05) + noise, 0.05)
+    biased = run_of(u + 0.3, plant([2.0], [1.0, 0.0], u, 0.05) + noise, 0.05)
+    for run, words, code in ((at_level, WORDS, "level_estimated"), (biased, "D y = b u", "constant_estimated")):
+        assert code in codes(ftlm.identify(run, ftlm.equation(words)))
+        given = ftlm.identify(run, ftlm.equation(words), offset="none")
+        assert given.model.structure.offset == "none"
+        assert code not in codes(given)
+
+
 def test_a_level_is_found_where_a_fit_without_it_fails():
     # Its mean is below three deviations of the output, which alone would show a level.
     g = np.random.default_rng(1)

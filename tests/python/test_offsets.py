@@ -324,10 +324,13 @@ def test_the_hub_of_the_arm_runs_free_with_an_offset_of_the_current():
         units={"theta11": "deg", "theta12": "deg"},
     )
     structure = ftlm.equation("D^2 theta11 = -d D theta11 + b I1 + k theta12")
-    without, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="constant")
+    without, found = (ftlm.identify(run, structure, offset=offset) for offset in ("none", "constant"))
     assert without.fit["theta11"] < 70
     assert found.fit["theta11"] > 85
     assert found.information.bic < without.information.bic - 1000
+    default = ftlm.identify(run, structure)
+    assert default.fit["theta11"] == pytest.approx(found.fit["theta11"], abs=0.01)
+    assert "constant_estimated" in {f.code for f in default.findings}
 
 
 # ------------------------------------------------------------------------------------------------ found by its test

@@ -145,12 +145,15 @@ class Hypotheses:
     ----------
     fit
         Function that fits a structure.
+    decides_offset
+        Whether a level or a constant may be added to a structure without an offset.
     complete
         Function that adds all confidence intervals to a joint fit of a structure; None if :attr:`fit` already gives
         them.
     """
 
     fit: Callable[[Structure], Fit]
+    decides_offset: bool
     complete: Callable[[Structure, JointFit | None], Fit] | None = None
 
     def take(self, structure: Structure, fit: Fit) -> Fit:
@@ -204,7 +207,7 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
     An integrating plant responds to the offset of an input sensor by a drift, which no level of its output describes.
     The fit has initial guesses of its own, because a fit that lacks the constant may end at any wrong optimum.
     """
-    automatic = structure.initial == "auto" and structure.offset == "none"
+    automatic = structure.initial == "auto" and structure.offset == "none" and hypotheses.decides_offset
     if fit.joint is None or not automatic or fit.task.structure.offset != "none" or not structure.integrates:
         return None
     if has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
@@ -241,7 +244,8 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
         # A constant input gives no evidence of rest.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
-    for offset in MOTION_OFFSETS if structure.offset == "none" else (structure.offset,):
+    offsets = MOTION_OFFSETS if structure.offset == "none" and hypotheses.decides_offset else (structure.offset,)
+    for offset in offsets:
         request = replace(structure, initial="caputo", offset=offset)
 
         def is_better(candidate: JointFit, *, most: float = least) -> bool:
@@ -269,7 +273,7 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
     means suggest a level, the optimum moves far and automatic initial guesses are used. Otherwise the fit starts from
     the optimum without a level.
     """
-    if fit.joint is None:
+    if fit.joint is None or not hypotheses.decides_offset:
         return None
     best = fit.joint
     candidate: tuple[Structure, Fit] | None = None
@@ -413,14 +417,13 @@ def identify(
         :func:`ftlm.equation`; by default those of the structure. With ``"auto"``, runs of an unstable plant under
         control may be split into pieces with their own initial values, because a simulation of a whole run diverges.
     offset
-        ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor bias, a load or
-        unmodeled friction. ``"level"``: an unknown constant that is added to each output. ``"ramp"``: such a constant
-        and a linear drift. ``"auto"``: a constant in the equations if it is significant at 99 %, with the statistic in
-        ``.settings["offset_test"]``; the structure is fitted with the constant and, if it is not significant, again
-        without. Default: that of the structure. Each run has its own values, which are in ``.comparison.offsets``. An
-        offset cannot be distinguished from initial terms for a nonzero past (``"history"``). A run that rests at a
-        level before an input changes gets ``"level"`` by default, and an integrating plant gets ``"constant"`` if its
-        runs prefer it. A finding reports a missing constant with a large effect.
+        ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor bias or a load.
+        ``"level"``: an unknown constant that is added to each output. ``"ramp"``: such a constant and a linear drift.
+        ``"auto"``: a constant in the equations if it is significant at 99 %, with the statistic in
+        ``.settings["offset_test"]``. Each run has its own values, which are in ``.comparison.offsets``. An offset
+        cannot be distinguished from initial terms for a nonzero past (``"history"``). Default: that of the structure;
+        if it has none, runs in motion get ``"level"``, and an integrating plant ``"constant"``, if they fit the runs
+        better. ``"none"`` prevents this, except for a run that rests at a level before an input changes.
     bounds
         (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
     m
@@ -467,7 +470,8 @@ def identify(
     PACKAGE_LOGGER.info(
         "identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), estimator.name
     )
-    result = assess_fit(_fit_runs(several, structure, estimator, m=m, threads=threads, progress=progress))
+    fit = _fit_runs(several, structure, estimator, offset is None, m=m, threads=threads, progress=progress)
+    result = assess_fit(fit)
     duration = next((f.numbers["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
     without_reference = isinstance(estimator, OutputError) and estimator.reference is None
     if duration is not None and structure.initial == "auto" and without_reference:
@@ -485,6 +489,7 @@ def _fit_runs(
     runs: Runs,
     structure: Structure,
     estimator: EstimationMethod,
+    decides_offset: bool,
     *,
     m: int | None,
     threads: int | None,
@@ -503,11 +508,12 @@ def _fit_runs(
             raise ModelError(f"the method {estimator.name!r} fitted a {type(fit).__name__}, not a Fit")
         return fit
 
-    light, hypotheses = getattr(estimator, "hypothesis", None), Hypotheses(estimate)
+    light, hypotheses = getattr(estimator, "hypothesis", None), Hypotheses(estimate, decides_offset)
     if light is not None:
         course = ShareTracker(progress)
         hypotheses = Hypotheses(
             partial(estimate, method=light, report=course.subtask(HYPOTHESES_SHARE, 0.9)),
+            decides_offset,
             lambda request, joint: estimate(request, report=course.subtask(1.0, 1.0), fitted=joint),
         )
     return fit_with_offset_decision(runs, structure, estimate, hypotheses)
@@ -547,7 +553,7 @@ def identify_pieces(
     """
     pieces = as_runs([piece for run in runs for piece in run.split(duration)])
     request = replace(structure, initial="caputo")
-    result = assess_fit(_fit_runs(pieces, request, method or OutputError(), m=m, threads=threads, progress=None))
+    result = assess_fit(_fit_runs(pieces, request, method or OutputError(), True, m=m, threads=threads, progress=None))
     notes = [note for run in runs for note in data_notes(run)]
     findings = (*result.findings, *notes, make_finding("runs_split", pieces=len(pieces), seconds=duration))
     estimate = result.model.estimate
