@@ -143,6 +143,12 @@ class FittedExtension:
     fit: JointFit
     criterion: float
 
+    @property
+    def is_physical(self) -> bool:
+        """Whether a coefficient that must be positive is; friction with a negative one is another, unknown effect."""
+        name = self.extension.positive_coefficient
+        return not name or self.fit.coefficients[name] > 0.0
+
 
 @dataclass(frozen=True)
 class ExtensionTests:
@@ -187,9 +193,8 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
             fits += fit_each(_input_extensions(structure, joint, runs, names))
             fits += fit_each(_friction_extensions(structure, joint, runs))
             fits += fit_each(_load_step_extensions(structure, [joint, *offset_fits[:1]], runs))
-        best = _best_extension(fits, own)
-        clear = best is not None and best.criterion <= own - MIN_CRITERION_DECREASE
-        findings = _extension_findings(best, structure, joint, runs, names, about) if best and clear else []
+        best = _clear_extension([f for f in fits if f.is_physical], own) or _clear_extension(fits, own)
+        findings = _extension_findings(best, structure, joint, runs, names, about) if best else []
     except FtlmError:
         # The fit to the first samples failed, with which extensions are compared.
         return ExtensionTests([])
@@ -204,13 +209,13 @@ def _extension_findings(
     names: Sequence[str],
     about: Mapping[str, str],
 ) -> list[Finding]:
-    """Return the finding on the best extension, or ``dynamics_missing`` if its residuals fail a residual test.
+    """Return the finding on the best extension, or ``dynamics_missing`` if it fails a residual test or is not physical.
 
     An extension by another intersample behavior is reported only if it changes a parameter by over one standard error.
     """
     missing = [make_finding("dynamics_missing", input=enumerate_names(names), **about)] if names else []
     extension, refit = best.extension, best.fit
-    if not _passes_residual_tests(best, runs):
+    if not best.is_physical or not _passes_residual_tests(best, runs):
         return missing
     if extension.code == "offset_missing":
         change = _largest_change(joint, refit)
@@ -359,19 +364,18 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
     return min(fits, key=lambda f: max(f.fit.noise.values()), default=None)
 
 
-def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
-    """Return the extension with the lowest criterion; None if none is below that of the original structure.
+def _clear_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
+    """Return the extension with the lowest criterion; None if it is not clearly below that of the original structure.
 
     Extensions are listed by preference. A later one must be better than an earlier one by `MIN_CRITERION_GAP`.
     """
     best: FittedExtension | None = None
     for item in fits:
-        positive = item.extension.positive_coefficient
-        if item.fit.unstable_optimum is not None or (positive and not item.fit.coefficients[positive] > 0.0):
+        if item.fit.unstable_optimum is not None:
             continue
         if item.criterion < (own_criterion if best is None else best.criterion - MIN_CRITERION_GAP):
             best = item
-    return best
+    return best if best is not None and best.criterion <= own_criterion - MIN_CRITERION_DECREASE else None
 
 
 def _delay_findings(
