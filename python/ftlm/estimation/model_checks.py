@@ -89,8 +89,6 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
     findings = []
     if not joint.converged:
         findings.append(make_finding("not_converged"))
-    if not joint.step_converged:
-        findings.append(make_finding("step_moves_estimate", pulses=joint.refinement))
     findings += _unstable_optimum_findings(joint)
     errors = joint.standard_errors
     unidentifiable = [n for n in joint.names if math.isinf(errors[n])]
@@ -250,11 +248,18 @@ def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) 
 
 
 def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[Finding]:
-    """Return findings on the color of residuals, outliers, quantization and interpolated nonuniform samples."""
+    """Return findings on discretization, color of residuals, outliers, quantization and interpolated samples.
+
+    Residuals at the level of rounding errors give no finding: standard errors are as small, and no change of an
+    estimate by a part of them matters.
+    """
     exact = joint.exact_outputs(runs)
     outputs = [o for o in problem.structure.outputs if o not in exact]
     coloured = [o for o in sorted(outputs) if not all(is_white(part[o]) for part in joint.residuals)]
-    findings = [make_finding("residuals_not_white", output=output) for output in coloured]
+    findings = []
+    if outputs and not joint.step_converged:
+        findings.append(make_finding("step_moves_estimate", pulses=joint.refinement))
+    findings += [make_finding("residuals_not_white", output=output) for output in coloured]
     for output in outputs:
         findings += _outlier_findings(runs, problem.structure, joint, output)
         findings += _quantization_findings(runs, problem.structure, output, joint.noise[output])
