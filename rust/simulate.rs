@@ -153,7 +153,7 @@ fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f6
             .get_mut(i)
             .ok_or_else(|| Error::Structure {
                 what: format!("an initial term of equation {i}"),
-                remedy: format!("there are {equations}, from 0"),
+                remedy: format!("use an index from 0 to {}", equations.saturating_sub(1)),
             })?
             .push((exponent, 1.0));
     }

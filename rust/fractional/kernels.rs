@@ -94,7 +94,8 @@ pub fn second_difference(eta: f64, n: usize) -> (f64, f64) {
     SecondDifferences::new(eta).value_and_slope(n)
 }
 
-/// Even binomial coefficients C(η+1, 2k), k = 1 … K, and their derivatives with respect to η. All n share them.
+/// Even binomial coefficients C(η+1, 2k), k = 1 … K, and their derivatives with respect to η. They give the second
+/// differences `v_n` for all n.
 pub(crate) struct SecondDifferences {
     eta: f64,
     coefficients: [f64; TERMS_NEAR],
@@ -119,7 +120,8 @@ impl SecondDifferences {
         Self { eta, coefficients, slopes }
     }
 
-    /// Sum Σ_k a_k x^k of the terms above rounding error at this distance, smallest first.
+    /// Sum Σ_k a_k x^k with a = `coefficients` and x = `shrink` = centre^{−2}. Only terms above the rounding error are
+    /// added, smallest first.
     fn sum(coefficients: &[f64; TERMS_NEAR], centre: usize, shrink: f64) -> f64 {
         let terms = if centre < FAR_DISTANCE_PULSES { TERMS_NEAR } else { TERMS_FAR };
         coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink)
@@ -138,7 +140,7 @@ impl SecondDifferences {
         self.near_value_and_slope(n, power, logarithm)
     }
 
-    /// Second difference `v_n` from (n−1)^{η+1}.
+    /// Second difference `v_n` of [`second_difference`]. `power` is (n−1)^{η+1}.
     #[allow(clippy::cast_precision_loss)]
     fn near_value(&self, n: usize, power: f64) -> f64 {
         match n {
@@ -152,7 +154,8 @@ impl SecondDifferences {
         }
     }
 
-    /// Second difference `v_n` and its derivative in η, from (n−1)^{η+1} and ln(n−1).
+    /// Second difference `v_n` and its derivative with respect to η. `power` is (n−1)^{η+1}, and `logarithm` is
+    /// ln(n−1).
     #[allow(clippy::cast_precision_loss)]
     fn near_value_and_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let value = self.near_value(n, power);
@@ -173,7 +176,7 @@ const MIN_SIEVE_TERMS: usize = 256;
 /// Number of kernel values computed by the long binomial sum. Later values use the formula for large distances.
 const LONG_SUM_TERMS: usize = 64;
 
-/// Number of terms of the even binomial sum above rounding error at a distance of at least [`LONG_SUM_TERMS`]. The
+/// Number of terms K of the even binomial sum that exceed the rounding error for c = `centre` ≥ [`LONG_SUM_TERMS`]. The
 /// omitted terms are below c^{−2K}.
 const fn terms_at(centre: usize) -> usize {
     match centre {
@@ -184,7 +187,8 @@ const fn terms_at(centre: usize) -> usize {
 }
 
 impl SecondDifferences {
-    /// Second difference `v_n` at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1}.
+    /// Second difference `v_n` of [`second_difference`] for n = `centre` + 1 > [`LONG_SUM_TERMS`]. `power` is
+    /// centre^{η+1}.
     #[allow(clippy::cast_precision_loss)]
     fn far_value(&self, centre: usize, power: f64) -> f64 {
         let shrink = 1.0 / (centre as f64 * centre as f64);
@@ -192,8 +196,8 @@ impl SecondDifferences {
         2.0 * power * sum
     }
 
-    /// Second difference `v_n` and its derivative in η at n = centre + 1 > [`LONG_SUM_TERMS`] from centre^{η+1} and ln
-    /// centre.
+    /// Second difference `v_n` and its derivative with respect to η for n = `centre` + 1 > [`LONG_SUM_TERMS`]. `power`
+    /// is centre^{η+1}, and `logarithm` is ln centre.
     #[allow(clippy::cast_precision_loss)]
     fn far_value_and_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let shrink = 1.0 / (centre as f64 * centre as f64);

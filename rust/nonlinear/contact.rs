@@ -72,7 +72,8 @@ pub(super) struct BodyState {
 pub(super) struct BodyDerivatives {
     /// Initial output and velocity of each body.
     pub(super) starts: Vec<(f64, f64)>,
-    /// Derivative of the gain from the friction of each body to its own end velocity.
+    /// Derivative of each body's friction gain with respect to the parameter. The gain is the change of the body's
+    /// velocity at the end of a pulse per unit of its friction force in the pulse.
     gains: Vec<f64>,
     /// Derivatives of fc, fs and vs of each body.
     laws: Vec<[f64; 3]>,
@@ -96,9 +97,9 @@ pub(super) struct ContactSolver<'a> {
 }
 
 impl ContactOperators {
-    /// Friction problem of bodies with these laws. `channels` are the state channels of the output and of the end
-    /// velocity of each body. `gains` are the weights of the sources in each state channel within a pulse, row-major.
-    /// The friction forces are the last sources.
+    /// Friction problem of bodies with these friction laws. `channels` holds, for each body, the state channels of its
+    /// output and of its velocity at the end of a pulse. `gains` holds the weight of each source in each state channel
+    /// within a pulse, row-major. The friction forces are the last sources.
     pub(super) fn new(
         laws: Vec<FrictionLaw>,
         channels: &[(usize, usize)],
@@ -126,7 +127,7 @@ impl ContactOperators {
         self.problem.count()
     }
 
-    /// State channel of the output of each body, which is the index of its equation.
+    /// State channel of each body's output. It equals the index of the body's equation.
     pub(super) fn outputs(&self) -> &[usize] {
         &self.outputs
     }
@@ -167,7 +168,8 @@ impl ContactOperators {
         }
     }
 
-    /// Derivatives of the bodies, from the derivatives `gain_derivatives` of the weights of the sources.
+    /// Derivatives of the bodies' friction gains, laws and initial states. `gain_derivatives` holds the derivatives of
+    /// the source weights `gains`.
     pub(super) fn derivatives(
         &self,
         gains: &[f64],
@@ -243,7 +245,7 @@ impl ContactOperators {
         Ok(())
     }
 
-    /// Set the derivatives of the outputs of bodies at rest to those of the last pulse.
+    /// For each body at rest, replace the derivative of its output by the derivative in the last pulse.
     pub(super) fn fix_resting_outputs(&self, at: &[BodyState], motion: &[(f64, f64)], free: &mut [f64]) {
         for (a, _) in at.iter().enumerate().filter(|(_, at)| at.is_resting) {
             free[self.outputs[a]] = motion[a].0;

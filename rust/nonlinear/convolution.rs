@@ -166,7 +166,7 @@ pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
 /// neighboring pulses.
 pub(crate) const MAX_FEEDTHROUGH_ORDER: f64 = 1e-6;
 
-/// Product of a series with a cached spectrum.
+/// Convolution of `series` with a kernel whose spectrum is cached, truncated to the length of `series`.
 pub(crate) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; series.len()];
     cached.apply(series, &mut out, &mut Buffers::default());

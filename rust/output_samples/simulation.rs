@@ -183,14 +183,15 @@ impl OutputSimulation {
         self.frictions.is_empty() && self.derived.is_empty()
     }
 
-    /// Initial terms of a model with friction or non-linear terms, fitted on a grid of `every` pulses per sampling
-    /// interval.
+    /// Fit the initial terms of a model with friction or non-linear terms to the measured outputs. The result holds
+    /// (exponent e, coefficient c) of each initial term c t^e, by equation. The simulation uses `every` block pulses
+    /// per sampling interval.
     ///
     /// Outputs are not linear in the initial terms, so these are found by optimization. It starts from level and
     /// velocity at the start of the run.
     ///
     /// # Errors
-    /// As [`Recording::experiment`] and [`nonlinear::fit`].
+    /// Errors of [`Recording::experiment`] (invalid grid or too few samples) and of [`nonlinear::fit`].
     ///
     /// ```
     /// use ftlm::equation::{Equation, Initial, Structure, Term};

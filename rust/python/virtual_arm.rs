@@ -228,7 +228,9 @@ impl VirtualArm {
         run_attached(|| self.plant.inject(injection))
     }
 
-    /// Run samples at rest. The guard processes the readings, and the output is 0 V.
+    /// Simulate the arm with 0 V at both motors, one sample for each row of `noise` (N × 4, in the units of the
+    /// sensors). The guard checks each reading. Each sample is written to `output`. The simulation ends early if a
+    /// fault is latched.
     #[allow(clippy::needless_pass_by_value)]
     fn rest(
         &mut self,

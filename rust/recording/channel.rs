@@ -111,7 +111,7 @@ impl Channel {
         self.delay.unwrap_or(0.0)
     }
 
-    /// Samples after the known saturations and dead zones.
+    /// Apply the known saturations and dead zones of the channel to samples.
     pub(super) fn behind_limits<'a>(&self, samples: &'a [f64]) -> Cow<'a, [f64]> {
         let mut limited = Cow::Borrowed(samples);
         for (law, limit) in self.nonlinearities.iter().filter_map(|(law, value)| value.map(|value| (law, value))) {

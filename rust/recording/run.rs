@@ -650,7 +650,8 @@ impl Recording {
         }
     }
 
-    /// Samples of each output, as recorded, at the times of comparison; NaN for missing samples.
+    /// Recorded samples of each output at the times at which simulations are compared with the measurement. Missing
+    /// samples are NaN.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -679,8 +680,8 @@ impl Recording {
         signals.saturating_add(2 * rows * self.outputs.len()).saturating_mul(size_of::<f64>())
     }
 
-    /// Samples of each output for comparison, on a grid of `every` pulses per sampling interval; NaN for missing
-    /// samples.
+    /// Samples of each output for the comparison with a simulation on a grid of `every` block pulses per sampling
+    /// interval. Missing samples are NaN.
     ///
     /// # Errors
     /// As [`Recording::pulses`].

@@ -18,27 +18,28 @@ pub struct GuardSettings {
     pub command_scale: f64,
     /// Joint angle per encoder count \[rad\].
     pub encoder_scale: [f64; 2],
-    /// Largest command \[A\].
+    /// Maximum permitted command \[A\].
     pub current_limit: [f64; 2],
-    /// Largest change of a command \[A/s\].
+    /// Maximum permitted rate of change of a command \[A/s\].
     pub slew: [f64; 2],
-    /// Continuous current of a motor \[A\]. The mean square over `thermal_time` stays below its square.
+    /// Maximum permitted continuous current of a motor \[A\]. The mean of the squared current over `thermal_time` stays
+    /// below its square.
     pub continuous: [f64; 2],
     /// Averaging time of the squared current \[s\].
     pub thermal_time: f64,
-    /// Largest deflection \[rad\].
+    /// Maximum permitted deflection \[rad\].
     pub deflection_limit: [f64; 2],
-    /// Gauge voltage of saturation \[V\].
+    /// Voltage at which a strain gauge saturates \[V\].
     pub saturation: f64,
     /// Current above which a joint must move; otherwise its encoder is dead \[A\].
     pub moving_current: f64,
-    /// Longest standstill above `moving_current` \[s\].
+    /// Maximum permitted time at rest while the motor current exceeds `moving_current` \[s\].
     pub standstill: f64,
-    /// Highest joint speed \[rad/s\]. A larger jump of the encoder is a fault.
+    /// Maximum plausible joint speed \[rad/s\]. A faster change of the encoder is a fault.
     pub fastest: f64,
-    /// Longest delay of a command \[s\].
+    /// Maximum permitted delay of a command \[s\].
     pub late_limit: f64,
-    /// Most consecutive missed deadlines.
+    /// Maximum permitted number of consecutive missed deadlines.
     pub missed_limit: u32,
     /// Sensor filter of both deflections: natural frequency \[rad/s\] and damping ratio.
     pub filter: Option<(f64, f64)>,

@@ -119,7 +119,7 @@ def test_a_missing_mode_is_with_care(other):
     poor = ftlm.identify(record(SQUARE, words), ftlm.equation("D^2 y = a1 D y + a0 y + b0 u"))
     judged = poor.validate(record(CHIRP, words, seed=3)).verdict
     assert judged.level == "with care"
-    assert judged.reason == "y responds to u with one order more than the model has"
+    assert judged.reason == "y responds to u with more phase lag than its equation describes"
     assert judged.remedy.startswith("raise the order of the equation by 1")
 
 

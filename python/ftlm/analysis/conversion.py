@@ -422,7 +422,7 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
     twice = sorted(set(signals) & set(results))
     if twice:
         raise ModelError(
-            f"{', '.join(twice)}: name of an input and of an output; pass {parameter('inputs')} and "
+            f"{', '.join(twice)}: each is the name of an input and of an output; pass {parameter('inputs')} and "
             f"{parameter('outputs')} with other names"
         )
     rows = zip(results, parts, strict=True)

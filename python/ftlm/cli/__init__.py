@@ -29,11 +29,11 @@ sheet
 Structure
 ---------
 structure
-    flexible-link:1|2|both, arm:1|2|both or an equation in words.
+    flexible-link:STAGE, arm:STAGE (1, 2, both) or an equation.
 fixed : NAME=VALUE
     Fix a coefficient.
 delay : INPUT=SECONDS
-    Delay of an input; LOW:HIGH is estimated.
+    Delay of an input [s]; LOW:HIGH estimates it in this range.
 driven_by : OUTPUT=SIGNAL,…
     With auto: signals that drive an output; default all inputs.
 
@@ -68,7 +68,7 @@ verbose
 Options
 -------
 noise : OUTPUT=A
-    Noise standard deviation of an output; default the fit's residual.
+    Noise standard deviation of an output; default from the fit.
 increment
     Increment of the order grid.
 """

@@ -126,7 +126,10 @@ def point_to_point(
     times = positive("duration", duration), positive("rate", rate)
     rests = [real_number(n, v) for n, v in (("dwell_before", dwell_before), ("dwell_after", dwell_after))]
     if not all(0 <= r < math.inf for r in rests):
-        raise ModelError(f"dwell_before = {dwell_before!r} and dwell_after = {dwell_after!r} are not seconds from 0")
+        raise ModelError(
+            f"{setting('dwell_before')} {short_repr(dwell_before)} and {setting('dwell_after')} "
+            f"{short_repr(dwell_after)} must be finite times [s] of at least 0; pass 0 for no dwell"
+        )
     if times[0] * times[1] < 10:
         raise ModelError(
             f"{setting('duration')} {short_repr(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it "

@@ -220,7 +220,7 @@ class RunArguments:
             if self.time_unit != "s":
                 raise DataError(
                     f"{parameter('time_unit', self.time_unit)} is the unit of {parameter('time')}, which is not "
-                    f"given; {parameter('step')} is in s"
+                    f"given; leave it out, because {parameter('step')} is in s"
                 )
             step = check_step(self.step, "step")
             clock = _TimeAxis(uniform_times(min(lengths.values()), step), step, 0.0)

@@ -211,8 +211,8 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
         size = len(line.encode())
         if size > MAX_HEADER_BYTES:
             raise DataError(
-                f"run {self.name!r}: names, warnings and what it is about take {size} bytes, more than the "
-                f"{MAX_HEADER_BYTES} of the first line of a csv file; write it as .parquet"
+                f"run {self.name!r}: signal names, notes and metadata take {size} bytes, more than the "
+                f"{MAX_HEADER_BYTES} bytes that the first line of a csv file may have; write the run as .parquet"
             )
         return line
 
@@ -286,7 +286,10 @@ def _columns(run: Run) -> dict[str, Floats]:
 
 
 def _source_time(run: Run) -> Floats:
-    """Return the source time of every sample [s], rounded to short decimals."""
+    """Return the time of every sample on the time axis of the measured file [s].
+
+    Times are rounded to nine digits below the sampling interval, unless a float cannot hold these digits.
+    """
     exact = run.start + uniform_times(run.length, run.step)
     # Nine digits below the step suffice; the header holds the exact step.
     digits = 9 - math.floor(math.log10(run.step))

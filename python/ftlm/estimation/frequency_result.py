@@ -101,9 +101,9 @@ def frequency_chart(
 
 
 def record_charts(model: Model | Circuit, record: FrequencyData) -> tuple[LineChart, LineChart]:
-    """Return the gain chart and the phase chart of a record and the model with its 95 % band.
+    """Return the gain chart and the phase chart: measured response, model, and 95 % confidence band of the model.
 
-    An impedance is drawn as magnitude over frequency in Hz.
+    For an impedance, the first chart shows the magnitude over the frequency in Hz.
     """
     omega = curve_frequencies(record)
     response, wide, turned = model_curve(model, record, omega)

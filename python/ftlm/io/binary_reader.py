@@ -193,7 +193,7 @@ def read_feather(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
     ipc: Any = importlib.import_module("pyarrow.ipc")
     with open(path, "rb") as stream:
         if stream.read(4) == b"FEA1":
-            raise UnreadableError("it is a feather file of version 1", "save it again in version 2")
+            raise UnreadableError("it is a feather file of version 1", "save it again as feather version 2 (Arrow IPC)")
     file = ipc.open_file(arrow.OSFile(path))
     batches, rows, columns = [], 0, len(file.schema.names)
     check_size(0, columns)

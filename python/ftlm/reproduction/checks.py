@@ -439,7 +439,7 @@ def published_form(reproduction: Reproduction) -> Evidence:
 
 
 def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
-    """Coefficients of (22)-(25) from Table 3, from the effective parameters, and as printed in the integer rows."""
+    """Return (from Table 3, from effective parameters, printed) of each coefficient of the paper's (22)-(25)."""
     sets = [{1: PARAMETER_SETS[n][1], 2: PARAMETER_SETS[n][2]} for n in ("table-3", "effective")]
     coefficients = {}
     for output, row in printed.INTEGER_ROWS.items():
@@ -452,7 +452,7 @@ def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
 
 
 def dropped_derivative(reproduction: Reproduction) -> Evidence:
-    """Return whether (19) and (21) may drop the derivative of the current."""
+    """Return whether the paper's (19) and (21) may drop the derivative of the current."""
     orders = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
     parts = [stage.derived for stage in reproduction.stages.values()]

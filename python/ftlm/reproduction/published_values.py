@@ -57,7 +57,7 @@ SEARCH_OPTIONS = {"criterion": "output-error", "norm": "l1", "row_basis": "haar"
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """Row of a printed table: parameters by letter, and criteria (45), (46), (47), NaN if absent."""
+    """Row of a table of the paper: parameters by letter and its criteria (45), (46), (47), NaN if absent."""
 
     orders: Mapping[str, float]
     coefficients: Mapping[str, float]
@@ -67,7 +67,7 @@ class PublishedRow:
 
     @property
     def criteria(self) -> tuple[float, float, float]:
-        """Criteria (45), (46) and (47)."""
+        """Criteria (45), (46) and (47) of the paper."""
         return self.error, self.rmse, self.nr
 
 
@@ -230,7 +230,7 @@ class Row:
 
 @dataclass(frozen=True)
 class AsPrinted:
-    """Columns of one angle in Tables 4 and 5, recomputed by the interpretation closest to the printed values.
+    """Columns of one angle in the paper's Tables 4 and 5, recomputed by the closest interpretation.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ class AsPrinted:
 
 
 class _Angle:
-    """Regressors of one angle at any orders in Haar coordinates, and the closed form of the recursion (44)."""
+    """Regressors of one angle at any orders in Haar coordinates, and the closed form of the paper's recursion (44)."""
 
     def __init__(self, angles: Mapping[str, Floats], current: Floats, output: str, step: float) -> None:
         other = output[:-1] + ("2" if output.endswith("1") else "1")
@@ -324,7 +324,7 @@ class _Angle:
         return (hub if self.output.endswith("1") else deflection).split()
 
     def regressors(self, terms: str, orders: Mapping[str, float]) -> tuple[Floats, Floats]:
-        """Return the regressor columns a, b, d, g of equation (42), in time and in Haar coordinates."""
+        """Return the regressor columns a, b, d, g of the paper's (42), in time and in Haar coordinates."""
         names = ("gamma", "beta", "mu") if terms == "a and b exchanged" else ("beta", "gamma", "mu")
         etas = [*(orders["alpha"] - orders[n] for n in names), orders["alpha"]]
         parts = [self.integral(s, eta) for s, eta in zip(self.places(terms), etas, strict=True)]
@@ -332,7 +332,7 @@ class _Angle:
         return np.stack(time, axis=1), np.stack(haar, axis=1)
 
     def solve_coefficients(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
-        """Return the closed form of (44): least squares with weight min(p, M - i + 1) of row i, and a prior."""
+        """Return the paper's (44): least squares with a prior, and weight min(p, M - i + 1) for row i."""
         weights = np.minimum(p, self.m - np.arange(self.m)).astype(np.float64)
         weighted = haar * weights[:, None]
         gram, right = weighted.T @ haar, weighted.T @ self.haar_y
@@ -412,7 +412,10 @@ def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrin
 
 
 def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) -> float:
-    """Mean absolute logarithm of the ratios to the printed a and NR; a reversed sign of a counts as a decade."""
+    """Return the mean absolute logarithm of the ratios of a and NR to the printed values.
+
+    A reversed sign of a adds ln 10.
+    """
     logs = []
     for p, row in rows.items():
         ratio = row.coefficients["a"] / table[p].coefficients["a"]
@@ -424,7 +427,11 @@ def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) ->
 def _rank_orders(
     angle: _Angle, reading: Interpretation, orders: Mapping[str, float]
 ) -> tuple[int, int, dict[str, float]]:
-    """Rank of the printed orders among the neighboring orders at the largest p, number of these, and best orders."""
+    """Rank the printed orders on the grid of orders by the sum of absolute residuals.
+
+    Return the rank of the printed orders, the number of grid points, and the orders with the lowest sum. The innovation
+    length p is the largest of the paper.
+    """
     count = round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1
     values = [round(MIN_GRID_ORDER + k * GRID_INCREMENT, 9) for k in range(count)]
     varied = ("beta", "gamma", "mu")
@@ -492,7 +499,7 @@ class PrintedModelRun:
 
 
 def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Return orders and coefficients of the two printed equations of a joint, by the names in (22)-(25)."""
+    """Return orders and coefficients of the two printed equations of a joint, by the names in the paper's (22)-(25)."""
     rows = {o: FRACTIONAL_ROWS[o][p] for o in ANGLE_NAMES if stage_of(o) == stage}
     orders = {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.orders.items()}
     return orders, {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.coefficients.items()}
@@ -507,7 +514,7 @@ def printed_model(stage: StageNumber, p: int) -> Model:
 
 
 def one_angle(output: str, p: int) -> Model:
-    """Return the model of a printed row by (26), in which all terms except the current's contain the angle itself."""
+    """Return the model of a printed row by the paper's (26): all terms but the current contain the angle itself."""
     row = FRACTIONAL_ROWS[output][p]
     terms = [Term(output, Order(float(row.orders[o])), float(row.coefficients[c])) for c, o in ORDER_OF.items()]
     terms.append(Term(f"I{stage_of(output)}", Order(), float(row.coefficients["g"])))

@@ -157,7 +157,7 @@ def share_picture(ruling: ClaimVerdict) -> Markup:
 
 
 def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> LineChart:
-    """Chart of the error (45) over the steps of the recursion, one line per p."""
+    """Return the chart of the paper's error (45) over the steps of the recursion, one line per innovation length p."""
     end = max(float(t.error[-1]) for t in traces.values())
     labeled_traces, gaps = [], False
     for p, trace in traces.items():
@@ -172,7 +172,7 @@ def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *,
 
 
 def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> LineChart:
-    """Chart of the measured deflection, of (14)-(15), and of the published form with the same parameters."""
+    """Return the chart of the deflection: measured, by the paper's (14)-(15), and by its published form (22)-(25)."""
     own = reference_label(simulated=simulated)
     lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
     nr = metrics(derived.derived, derived.published).nr
@@ -424,7 +424,7 @@ def saturation_table(reproduction: Reproduction) -> Table:
 
 
 def optimizer_tables(reproduction: Reproduction) -> list[Table]:
-    """Return Tables 6 and 7 at equal budgets of evaluations, and the error (45) of each optimizer and seed."""
+    """Return the paper's Tables 6 and 7 at equal budgets, and its error (45) for each optimizer and seed."""
     rivals = reproduction.rivals
     seeds = list(dict.fromkeys(seed for rival in rivals.values() for seed in rival.optimizers["genetic"].errors))
     best: list[list[Cell]] = []

@@ -1,4 +1,4 @@
-"""Arm simulated for the reproduction, and its runs."""
+"""Flexible-link arms and runs that are simulated to reproduce the results of the paper."""
 
 from __future__ import annotations
 

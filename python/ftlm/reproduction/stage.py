@@ -165,7 +165,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class DroppedDerivative:
-    """Effect of the derivative of the current that (19) drops on the simulated deflection, at equal parameters."""
+    """Deflection simulated with and without the derivative of the current that the paper's (19) drops."""
 
     output: str
     order: float  # of the current's derivative; 0 as published
@@ -177,7 +177,10 @@ class DroppedDerivative:
 
     @property
     def correlations(self) -> dict[str, float]:
-        """Correlation of the deflection with the current: measured, (14)-(15), published; NaN at rest."""
+        """Return the correlation of the current with each deflection by name; NaN at rest.
+
+        The deflections are measured, derived by the paper's (14)-(15), and published by its (22)-(25).
+        """
         names = ("measured", "derived", "published")
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             matrix = np.corrcoef([getattr(self, n) for n in names] + [self.current])
@@ -290,7 +293,7 @@ def compare_optimizers(
 
 @dataclass(frozen=True)
 class Trial:
-    """Multi-innovation estimates with all p for one angle of one record and one K0.
+    """Multi-innovation estimates of one angle of one record at one prior covariance K0, for each innovation length p.
 
     Parameters
     ----------
@@ -317,7 +320,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Contest:
-    """Multi-innovation, genetic algorithm and differential evolution on one angle of one record, with equal budgets.
+    """Fits of one angle by multi-innovation, genetic algorithm and differential evolution, at equal budgets.
 
     Parameters
     ----------
@@ -349,7 +352,7 @@ class Contest:
 
 @dataclass(frozen=True)
 class OrderComparison:
-    """Integer and free orders of (14)-(15) on one record, both by joint output error from the currents alone.
+    """Fits of the paper's (14)-(15) to one record with integer and with free orders, by joint output error.
 
     Parameters
     ----------
@@ -575,7 +578,7 @@ def simulated_panel(
 
 @dataclass
 class StageWork:
-    """Computation of one stage: runs, settings, progress receivers, and notes about omitted parts."""
+    """Computation for one stage of the arm: runs, settings, progress callbacks, and notes on omitted results."""
 
     number: StageNumber
     square: Run
@@ -820,7 +823,7 @@ class StageWork:
         return rivals
 
     def in_published_form(self, model: Model) -> Model:
-        """Insert the parameters of (14)-(15) into (22)-(25), which drop a derivative of the current."""
+        """Insert the parameters of the paper's (14)-(15) into its (22)-(25), which drop a derivative of the current."""
         h, d = self.number * 2 - 1, self.number * 2
         values = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
         values |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
@@ -837,7 +840,7 @@ class StageWork:
         return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
 
     def published_values(self, model: Model) -> dict[str, float]:
-        """Values of the free parameters of (22)-(25) under their laws for a model of (14)-(15)."""
+        """Return the free parameters of the paper's (22)-(25) that correspond to a model of its (14)-(15), by name."""
         other = self.in_published_form(model)
         values = {**other.orders, **other.coefficients}
         h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
@@ -845,7 +848,7 @@ class StageWork:
         return {n: v for n, v in values.items() if n in free} | {f"r{self.number}": -values[d] / values[h]}
 
     def dropped_derivative(self, model: Model) -> DroppedDerivative:
-        """Compare the deflection by (14)-(15) with that by (22)-(25) at equal parameters."""
+        """Simulate the deflection by equations (14)-(15) and by (22)-(25) of the paper, with equal parameters."""
         output, other = self.measured.outputs[1], self.in_published_form(model)
         whole, published = (compare_means(m, self.on) for m in (model, other))
         drive = f"I{self.number}"

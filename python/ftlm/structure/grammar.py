@@ -464,7 +464,7 @@ class EquationParser:
         self._expect("(")
         self._depth += 1
         if self._depth > MAX_DEPTH:
-            raise self._error(f"parentheses are nested more than {MAX_DEPTH} times; write the term without some")
+            raise self._error(f"parentheses are nested more than {MAX_DEPTH} times; write the term with fewer")
         terms = self._expression()
         if self._peek()[0] == "name":
             at = self._peek()[2]

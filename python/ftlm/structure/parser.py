@@ -227,7 +227,10 @@ def _division_reason(words: EquationParser, first: ParsedTerm) -> str | None:
 
 
 def _divided_equation(words: EquationParser, first: ParsedTerm) -> str:
-    """Return an equation divided by its highest derivative, with one coefficient per term, and their meanings."""
+    """Return the text of an equation divided by the coefficient of its highest derivative.
+
+    Every term has one new coefficient. The text ends with the definition of each new coefficient by the old ones.
+    """
     sums: dict[tuple[str, str], list[tuple[float, str | None]]] = {}
     for side, items in ((-1.0, words.left), (1.0, words.right)):
         for item in items:

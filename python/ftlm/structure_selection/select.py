@@ -436,7 +436,8 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: I
     gained = improves_prediction(gains, intervals, whole) if intervals else None
     if gained is None:
         is_worse = min(gains) <= -MIN_FIT_GAIN
-        reason = f"over {rival.name} some parts gain, and others {'lose' if is_worse else 'do not'}"
+        others = "lower" if is_worse else "not higher"
+        reason = f"compared with {rival.name}, the fit is higher on some parts and {others} on other parts"
         return [make_finding("fractional_orders_not_told", reason=reason, **about)]
     return [make_finding("fractional_orders_gain" if gained else "fractional_orders_gain_nothing", **about)]
 

@@ -53,7 +53,7 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
     title, x_label
         Text, with units.
     caption
-        Sentence below.
+        Sentence below the chart.
 
     Raises
     ------
@@ -115,9 +115,9 @@ class BarChart(Figure):
     low, high
         Axis limits, by default from 0 to the largest value. A bar beyond them is truncated and labeled with its value.
     caption
-        Sentence below.
+        Sentence below the chart.
     width
-        Width of the wide drawing [px]; it scales.
+        Width [px] of the drawing for wide screens, which scales with the page.
 
     Raises
     ------
@@ -226,7 +226,7 @@ class PlaneChart(Figure):
         Complex curve of a model. The points are then measured values, drawn as dots. They determine the axis limits,
         and no sector is drawn.
     caption
-        Sentence below.
+        Sentence below the chart.
 
     Raises
     ------
@@ -510,7 +510,7 @@ class CorrelationMap(Figure):
     title
         Title.
     caption
-        Sentence below.
+        Sentence below the chart.
 
     Raises
     ------

@@ -170,7 +170,7 @@ class LineChart(Figure):
     bars
         Edges of bars that start at 0, shape (M + 1,), and their heights, shape (M,).
     width, height
-        Size of the wide drawing [px]; it scales.
+        Size [px] of the drawing for wide screens, which scales with the page.
     points
         Maximum number of points of a line.
     slider

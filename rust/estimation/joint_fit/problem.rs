@@ -247,9 +247,11 @@ struct Constraint {
 }
 
 impl Problem {
-    /// Last point between a feasible point and another that satisfies the bounds and the constraints of the orders.
+    /// Move from the feasible point `at` towards `towards` until a bound or a constraint of the orders is met, and
+    /// return the last feasible point.
     ///
-    /// The step is projected on the active constraints. All constraints are affine, so the result is exact.
+    /// The direction `towards − at` is first projected on the constraints that are active at `at`, so the path may
+    /// leave the straight line to `towards`. All constraints are affine, so the result is exact.
     ///
     /// # Errors
     /// [`Error::Length`].

@@ -58,9 +58,10 @@ pub(crate) struct SourceInput<'a> {
 enum SourceKind {
     /// Index of the input in the equation.
     Input(usize),
-    /// Impulse, whose responses are the powers of t below the order of the equation.
+    /// Impulse. Its response and the derivatives of the response represent initial terms t^e with an exponent e below
+    /// the order of the equation.
     Impulse,
-    /// Exponent of a power of t that equals the order of the equation or the order plus one.
+    /// Initial term t^e. The exponent e is the order of the equation or the order plus one.
     Power(usize),
 }
 
@@ -174,7 +175,8 @@ impl Companion {
         discretization.advance(start, input, grid)
     }
 
-    /// Discretization of 1/A, or of two 1/A in series if `behind` has an output row of the first.
+    /// Discretization of 1/A, where A is the polynomial of the equation. If `behind` holds an output row, a system with
+    /// this output row precedes 1/A in series.
     fn discretization(
         &self,
         between: Option<Intersample>,
@@ -549,7 +551,7 @@ pub(crate) fn source_input<'a>(
 }
 
 impl Source<'_> {
-    /// Add the output of a row `read` of the states and of a direct gain to samples.
+    /// Add `read`·x + `direct`·u to samples, where x are the states and u is the input.
     fn add_output(&self, read: &[f64], direct: f64, samples: &mut [f64]) {
         let rows = self.states.chunks_exact(read.len().max(1));
         for ((y, row), u) in samples.iter_mut().zip(rows).zip(&self.values) {

@@ -164,7 +164,8 @@ impl<'a> BatchEvaluator<'a> {
         Ok(Self { catalogue, boxes, limit })
     }
 
-    /// Evaluate batches `first … last − 1` of one generation.
+    /// Evaluate batches `first … last − 1`, which must belong to one generation (see [`generation_ends`]), and return
+    /// counts and best rows.
     ///
     /// `seed` holds index and raw score of the rows found before the generation. `from` resumes a checkpoint of the
     /// same range and seed that holds all rows found since its start. The range is restarted if the checkpoint belongs

@@ -47,12 +47,12 @@ pub(super) struct RemainingColumns<'a> {
     /// Positions of the remaining columns.
     pub(super) columns: &'a [usize],
     pub(super) inverse: &'a [f64],
-    /// Trace of that inverse.
+    /// Trace of `inverse`.
     pub(super) trace: f64,
     /// Rounding-error bound of a product of unit columns.
     pub(super) rounding: f64,
-    /// Remaining column of the output itself, if any. Its coefficient may cancel that of a varying column of the
-    /// output.
+    /// Index in `columns` of a column of the output itself, if there is one. Its coefficient and the coefficient of a
+    /// varying output column may cancel.
     pub(super) partner: Option<usize>,
 }
 
@@ -65,8 +65,9 @@ impl RemainingColumns<'_> {
         }
     }
 
-    /// Upper bound of the distance of Fᵀt − g t of a column of the output from that of the partner. It is zero for
-    /// other columns, and without a partner.
+    /// Upper bound of ‖(Fᵀt − g t) − (Fₚᵀt − gₚ t)‖ for each test vector t of a group. F is the convolution matrix of
+    /// an output column, g the projection of Fᵀt on t, and Fₚ, gₚ belong to the remaining output column `partner`. The
+    /// bound is zero if `column` is not an output column or there is no partner.
     #[inline(always)]
     fn distance_to_partner(&self, record: usize, group: usize, column: usize) -> Wide {
         let probes = &self.test_vectors[record];
@@ -114,7 +115,8 @@ pub(super) struct AxisTable {
     /// Products of each column with the remaining columns, k per value.
     pub(super) shared: Vec<f64>,
     pub(super) mixed: Vec<f64>,
-    /// Sum of the coefficients of û on the partner and on its own column. Empty without a partner.
+    /// Sum of the coefficient of û on the remaining output column `partner` and its coefficient on x. Empty without a
+    /// partner.
     pub(super) paired: Vec<f64>,
     /// Products with test vectors, by value, then by group of test vectors.
     pub(super) vector_products: Vec<VectorProducts>,

@@ -82,7 +82,8 @@ impl<const L: usize> Solve<L> {
     }
 }
 
-/// Normal equations of all candidates, summed over all records for the terms, and of each record for its initial terms.
+/// Normal equations that all candidates share. The equations for the coefficients of the terms are summed over all
+/// records. Each record has its own equations for its initial terms.
 pub(crate) struct NormalEquations {
     terms: Normal,
     /// Equations of each record for its initial terms. Empty for zero initial conditions.
@@ -93,7 +94,8 @@ pub(crate) struct NormalEquations {
 }
 
 impl NormalEquations {
-    /// Combine the equations of all records and, with initial terms, those of each record.
+    /// Combine the equations summed over all records with the equations of each record, which are needed for initial
+    /// terms.
     pub(super) fn new(terms: Normal, record_equations: Vec<Normal>, fixed: &[Option<f64>]) -> Self {
         let free = (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect();
         Self { terms, record_equations, fixed: fixed.to_vec(), free }

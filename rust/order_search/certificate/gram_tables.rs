@@ -125,7 +125,7 @@ fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
     NodeLayout { nodes, terms }
 }
 
-/// Memory of columns and products of this many nodes \[bytes\].
+/// Memory of the regressors, of their derivatives and of all inner products for this number of nodes \[bytes\].
 fn bytes(nodes: usize, samples: usize) -> u64 {
     8 * nodes as u64 * (DERIVATIVE_PAIRS.len() * nodes + 2 * EXPANSION_COLUMNS * samples) as u64
 }
@@ -141,7 +141,11 @@ impl GramTables {
         let fits = |deepest: u8| bytes(lay_out_nodes(region, deepest).nodes.len(), samples) <= memory;
         let Some(tabled) = (2..=MAX_TABLE_LEVEL).rev().find(|d| fits(*d)) else {
             let (bytes, limit) = (bytes(lay_out_nodes(region, 2).nodes.len(), samples).into(), memory.into());
-            return Err(Error::Memory { what: "the columns of a certificate and their products".into(), bytes, limit });
+            return Err(Error::Memory {
+                what: "the regressors of a certificate and their inner products".into(),
+                bytes,
+                limit,
+            });
         };
         let NodeLayout { nodes, terms } = lay_out_nodes(region, tabled);
         let curves: Vec<Result<RegressorExpansion>> = parallel::map(

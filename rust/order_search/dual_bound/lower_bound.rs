@@ -146,7 +146,8 @@ pub fn excluded_in_turn(
         .collect())
 }
 
-/// Return the bound with all fixed test vectors on one record, and the columns of the terms of a structure.
+/// Return the dual lower bound with all [`MAX_TEST_VECTORS`] fixed test vectors on one record, and the column index of
+/// each term of the structure in the bank of regressors.
 fn build_pool_bound(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
     structure.check(record.len(), |_| true)?;
     let mut index = Index::default();
@@ -158,7 +159,8 @@ fn build_pool_bound(record: &Record, structure: &Structure, norm: Norm) -> Resul
     Ok((Bound::new((&[bank], &[target]), norm, true, MAX_TEST_VECTORS, &Stop::default()), positions))
 }
 
-/// Dual bound from the fixed test vectors of a search, on every record.
+/// Dual lower bound of the error of any candidate, with test vectors that are the same for all candidates. It holds one
+/// set of test vectors per record.
 pub(crate) struct Bound {
     norm: Norm,
     test_vectors: Vec<TestVectors>,

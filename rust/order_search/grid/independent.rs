@@ -231,7 +231,7 @@ pub(crate) struct GroupTuples {
     /// Number of prefixes. A prefix is a tuple without its last order.
     pub(super) prefixes: usize,
     pub(super) count: u64,
-    /// Number of tuples before every [`PREFIX_STRIDE`]th prefix.
+    /// Number of tuples before prefix 0, [`PREFIX_STRIDE`], 2·[`PREFIX_STRIDE`], …
     pub(super) before: Vec<u64>,
 }
 
@@ -325,7 +325,8 @@ impl Group {
         self.terms.len() - 1
     }
 
-    /// Write the axis positions of the prefix with this number to `digits`.
+    /// Write the axis positions of all orders but the last to `digits`. `prefix` is the number of their combination,
+    /// and `first` the first permitted axis position of each order.
     pub(super) fn decode(&self, first: &[usize], prefix: usize, digits: &mut [usize]) {
         let mut rest = prefix;
         for a in (0..self.last()).rev() {
@@ -335,8 +336,10 @@ impl Group {
         }
     }
 
-    /// Call `take` with the index and the bits of each word of the set of last values that complete a prefix. An
-    /// inconsistent prefix has no completions.
+    /// Enumerate the values of the last order that are allowed with the axis positions `digits` of the other orders.
+    /// The set of these values is a bit set over the axis: `take` receives the index and the bits of each 64-bit word.
+    /// `first` holds the first permitted axis position of each order. `take` is not called if the other orders exclude
+    /// each other.
     #[inline]
     pub(super) fn completions(&self, first: &[usize], digits: &[usize], mut take: impl FnMut(usize, u64)) {
         let last = self.last();
@@ -363,7 +366,8 @@ impl Group {
         count
     }
 
-    /// Tuples of this group below an α. Completions are counted, not stored.
+    /// Tuples of this group whose orders are allowed for an α. `first` holds the first permitted axis position of each
+    /// order. Values of the last order are counted, not stored.
     pub(super) fn tuples_below(&self, first: Vec<usize>) -> GroupTuples {
         let prefixes: usize = (0..self.last()).map(|a| self.axes[a].len() - first[a]).product();
         let mut digits = vec![0; self.terms.len()];

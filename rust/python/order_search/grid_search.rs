@@ -201,7 +201,9 @@ impl OrderSearch {
         Ok(Self { ready })
     }
 
-    /// Evaluate batches `first … last − 1` of one generation.
+    /// Evaluate batches `first … last − 1` of candidates and return counts and best rows. All batches must belong to
+    /// one generation, a group of batches that start from the same results. `seed` holds index and raw score of the
+    /// rows found before the generation. `start` is a checkpoint to resume.
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn rounds(
         &self,
