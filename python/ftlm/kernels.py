@@ -54,7 +54,7 @@ __all__ = [
 
 @check_arguments
 def pulse_means(samples: ArrayLike, m: int | None = None, *, hold: bool = False) -> NDArray[np.float64]:
-    """Return the means of sampled signals over m block pulses of equal width, equation (39).
+    """Return the means of sampled signals over m block pulses of equal width, equation (39) of the paper.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def pulse_means(samples: ArrayLike, m: int | None = None, *, hold: bool = False)
 
 @check_arguments
 def block_pulse_kernel(order: ArrayLike, m: int, *, step: float, derivative: bool = False) -> NDArray[np.float64]:
-    """Return the first row of the fractional integration matrix of block pulses, equations (31) and (32).
+    """Return the first row of the fractional integration matrix of block pulses, equations (31)-(32) of the paper.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def block_pulse_kernel(order: ArrayLike, m: int, *, step: float, derivative: boo
 
 @check_arguments
 def integrate(x: ArrayLike, order: ArrayLike, *, step: float) -> NDArray[np.float64]:
-    """Return the block-pulse means of fractional integrals of signals, from the means of the signals, equation (32).
+    """Return the block-pulse means of the fractional integrals of signals by equation (32) of the paper.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def multi_innovation(
     prior_covariance: ArrayLike,
     trace: bool = False,
 ) -> NDArray[np.float64]:
-    """Return the multi-innovation least-squares estimate of X in m = Q X, equations (42)-(44), starting from X = 0.
+    """Return the multi-innovation estimate of X in m = Q X by equations (42)-(44) of the paper, starting from X = 0.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ def multi_innovation(
 
 @check_arguments
 def errors(measured: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
-    """Return the error (45), RMSE (46), NR (47) and fit of predictions; see :func:`ftlm.metrics`.
+    """Return the error (45), RMSE (46), NR (47) of the paper, and the fit; see :func:`ftlm.metrics`.
 
     Parameters
     ----------
@@ -322,9 +322,9 @@ MIN_CORRELATION_EIGENVALUE = 1e-12
 
 
 class Candidates:
-    """Evaluator of many tuples of orders of one equation D^alpha y = sum of c_j D^order_j x_j, from rest.
+    """Evaluator of one equation D^alpha y = sum_j c_j D^order_j x_j for many tuples of its orders, from rest.
 
-    It follows equations (22)-(45).
+    It follows equations (22)-(45) of the paper.
 
     Fractional integrals and their inner products are cached between calls, so that tuples of one order grid share them.
 
@@ -378,7 +378,7 @@ class Candidates:
         prior_covariance: ArrayLike = math.inf,
         rows: Literal["haar", "time"] = "haar",
     ) -> NDArray[np.float64]:
-        """Return the coefficients of each tuple of orders, by least squares or multi-innovation of the equation error.
+        """Return the coefficients for each tuple of orders: least squares or multi-innovation on the equation error.
 
         Parameters
         ----------
@@ -389,7 +389,7 @@ class Candidates:
         prior_covariance
             Initial covariance of the coefficients, a number or shape (k,); infinite for no prior.
         rows
-            Basis of the rows in equation (42): ``"haar"``, for which M is a power of two, or ``"time"``.
+            Basis of the rows in equation (42) of the paper: ``"haar"``, for which M is a power of two, or ``"time"``.
 
         Returns
         -------
@@ -560,7 +560,7 @@ class Candidates:
         return table
 
     def _places(self, orders: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return the column of each term of each tuple in the matrix of integrals, where column 0 is the output."""
+        """Return the column of each term in the matrix of integrals, by tuple of orders. Column 0 is the output."""
         gaps = np.round(orders[:, :1] - orders[:, 1:], 9)
         # Pairs as complex numbers: NumPy sorts these faster than columns of a table.
         distinct, inverse = np.unique((self._terms + 1j * gaps).ravel(), return_inverse=True)
@@ -592,7 +592,7 @@ class Candidates:
 
 
 class Recursion:
-    """Multi-innovation recursion (44) of one equation D^alpha y = sum of c_j D^order_j x_j, one sample at a time.
+    """Multi-innovation recursion for D^alpha y = sum_j c_j D^order_j x_j, one sample at a time: (44) of the paper.
 
     Parameters
     ----------
@@ -719,12 +719,12 @@ class Recursion:
 
     @property
     def pulses(self) -> int:
-        """Number of rows of (44) so far: samples minus one."""
+        """Number of rows processed by the paper's recursion (44): the number of samples minus one."""
         return self._core.pulses
 
 
 def _signal_rows(terms: Sequence[int], output: int, count: int) -> list[int]:
-    """Return the rows of the signals of terms; raise ModelError if one of them or that of the output does not exist."""
+    """Return the row of each term's signal; raise ModelError if this row or the output's row does not exist."""
     if not len(terms):
         raise ModelError(f"{parameter('terms')} is empty; give the row of the signal of each term")
     for name, row in [("output", output), *(("terms", term) for term in terms)]:
@@ -773,7 +773,7 @@ def _with_kernels(
     name: str,
     vectors: ArrayLike,
 ) -> NDArray[np.float64]:
-    """Return the result of ``work(kernels, rows, index of the kernel of each row)`` for broadcast arguments."""
+    """Broadcast the arguments, and return ``work(kernels, rows, kernel index of each row)``."""
     columns, of = _rows("kernel", kernel)
     values = finite_floats(name, vectors)
     m = _length(name, values)

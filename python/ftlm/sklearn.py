@@ -128,7 +128,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
 
     @check_arguments
     def predict(self, X: Any) -> Floats:
-        """Simulate rows of inputs, and return outputs of shape (n,) or (n, outputs), as those of y."""
+        """Simulate n rows of inputs; return outputs of shape (n,) or (n, outputs), the same shape as y in ``fit``."""
         _validation.check_is_fitted(self)
         as_array("X", X)
         index = _check_index(_index(X))

@@ -198,7 +198,7 @@ def inverse(model: Model) -> Model:
 
 
 def _distinct_name(output: str, signal: str) -> str:
-    """Return the name of an output, changed if it equals that of the input."""
+    """Return the name of an output, changed if it equals the input's name."""
     return output if output != signal else f"{output}_out"
 
 

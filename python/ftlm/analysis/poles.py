@@ -92,7 +92,7 @@ class Stability:
 
 
 def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
-    """Return the characteristic function of each group of coupled equations, as a sum of c s^p."""
+    """Return the characteristic function of each group of coupled equations, as c by p of a sum of c s^p."""
     return [
         determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names])
         for names in coupled_outputs(model, coupled=coupled)
@@ -312,7 +312,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     values = np.array(list(polynomial.values()))
 
     def shares(at: float, omega: float) -> float:
-        """Return the magnitude of all other terms relative to that of the term with power `at`."""
+        """Return the sum of the magnitudes of all other terms divided by the magnitude of the term with power `at`."""
         sizes = np.abs(values) * omega ** (powers - at)
         return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
 

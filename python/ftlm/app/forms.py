@@ -70,7 +70,7 @@ class RunSource:
     path: str = ""
 
     def run(self) -> Run:
-        """Load the run, whose name is that of the file on the page."""
+        """Load the run and name it after the uploaded file."""
         run = load(self.path or self.file, **self.options)
         if not self.path or run.name != base_name(Path(self.path)):
             return run
@@ -362,7 +362,7 @@ def parse_fields(texts: Mapping[str, Any]) -> dict[str, Any]:
     """
 
     def read_fields(parse: Callable[[str, str], Any], *names: str) -> dict[str, Any]:
-        """Return the values of those of some fields that are not empty."""
+        """Return the values of the nonempty fields by name."""
         return {name: parse(name, text) for name in names if (text := _text(texts, name))}
 
     options = read_fields(parse_number, "step", "resample") | read_fields(_plain_text, "time_unit", "missing")

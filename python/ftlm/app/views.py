@@ -73,13 +73,13 @@ def _render_template(template: str, **context: Any) -> str:
 
 @cache
 def script() -> str:
-    """Return the JavaScript of the page, including that of charts."""
+    """Return the JavaScript of the page and its charts."""
     return f"{read_resource('charts.js')}\n{read_resource('app.js', 'ftlm.app')}"
 
 
 @cache
 def style() -> str:
-    """Return the style sheet of the page, including that of reports."""
+    """Return the style sheet of the page and of reports."""
     return f"{style_sheet()}\n{chart_css()}\n{read_resource('app.css', 'ftlm.app')}"
 
 

@@ -52,7 +52,7 @@ class Power:
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies and generalized forces of one joint of the arm at the N samples of a run, each of shape (N,).
+    """Energies and generalized forces of one arm joint at the N samples of a run, by the paper's (7)-(11).
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ class Energies:
 
     @property
     def kinetic(self) -> Floats:
-        """Total kinetic energy, equation (9)."""
+        """Total kinetic energy, equation (9) of the paper."""
         return self.hub_kinetic + self.link_kinetic
 
     @property
     def lagrangian(self) -> Floats:
-        """Lagrangian, equations (12) and (13): kinetic energy minus potential energy."""
+        """Lagrangian, equations (12)-(13) of the paper: kinetic energy minus potential energy."""
         return self.kinetic - self.potential
 
 

@@ -45,7 +45,7 @@ class LinkParameters:
 
     @property
     def inertia_ratio(self) -> float:
-        """Inertia ratio r = (J_1 + J_2) / J_2, by which coefficients of the deflection exceed those of the hub."""
+        """Inertia ratio r = (J_1 + J_2) / J_2: deflection coefficients are r times the hub coefficients."""
         return (self.hub_inertia + self.link_inertia) / self.link_inertia
 
     def coefficients(self, stage: int) -> dict[str, float]:
@@ -418,7 +418,7 @@ def flexible_link(
 def _joint_equations(
     stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], friction: bool
 ) -> tuple[Equation, Equation]:
-    """Return the equations of the hub and of the deflection of one joint."""
+    """Return the hub equation and the deflection equation of one joint."""
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
     tied = "orders" in laws
@@ -454,7 +454,7 @@ def _append_terms(item: Equation, terms: Sequence[Term]) -> Equation:
 
 
 def _add_cross_torques(pair: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
-    """Return the equations of a joint with terms of order 0 in the angles and the current of the other joint."""
+    """Return the equations of a joint with order-0 terms in the other joint's angles and current."""
     other, first = 3 - stage, 2 * stage - 1
     signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
     hub, deflection = (
@@ -498,7 +498,7 @@ def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equati
 
 
 def link_structure(stage: Literal[1, 2, "both"], *, both: bool, filtered: bool = True, rate: bool = True) -> Structure:
-    """Return the structure of a deflection by equation (15), with the measured hub angle as input.
+    """Return the structure of a deflection by equation (15) of the paper, with the measured hub angle as input.
 
     Elasticity and damping have any order, and the strain gauge and its cable are included. With the angles of the
     other joint it includes their accelerations, by the energies of the planar arm, and the rate of the other

@@ -1,4 +1,4 @@
-"""Options for reading files, and those of every command."""
+"""Command-line options for reading files, and options that every command has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of discrete-time controllers, and a pair of controllers for both joints of the rig."""
+"""Files that store discrete-time controllers, and the pair of controllers for the two joints of the rig."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
 
 
 class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a controller file, which has one of the two kinds of controller."""
+    """Content of a controller file: one controller of one of two kinds."""
 
     format: Literal["ftlm-controller"]
     schema: int

@@ -553,7 +553,7 @@ def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
 
 
 def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
-    """Return (coefficients of the outputs, maximum acceptable deviation) of each weighted sum of outputs."""
+    """Return (output coefficients, maximum acceptable deviation) for each weighted sum of outputs."""
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
             f"{setting('max_deviation')} {short_repr(max_deviation)} is not a mapping from outputs, or sums of them, "

@@ -152,7 +152,7 @@ def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal
 
 
 def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[str, float] | None:
-    """Return the powers of SI units and of seconds of an expression; None if the unit of a signal is unknown.
+    """Return the exponents of SI units and of seconds in an expression's unit; None if a signal's unit is unknown.
 
     A sum has the unit of its first term with a signal. Functions other than abs and sqrt are dimensionless.
     """

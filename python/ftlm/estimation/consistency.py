@@ -462,7 +462,7 @@ def is_identifiable(result: Identification, name: str) -> bool:
 
 
 def is_quadratic(result: Identification, name: str) -> bool:
-    """Whether both bounds of a parameter's interval are close to those of the Wald interval."""
+    """Whether both bounds of a parameter's interval are close to the bounds of its Wald interval."""
     value, usual = values_of(result)[name], NORMAL_95 * result.standard_errors[name]
     low, high = result.intervals[name]
     return is_identifiable(result, name) and all(

@@ -52,7 +52,7 @@ def correlated_orders(result: Identification) -> tuple[str, str, float] | None:
 def output_error_landscape(
     result: Identification, orders: tuple[str, str] | None = None, *, refit: bool = True
 ) -> Landscape | None:
-    """Compute the cost of an output-error fit on a grid of two orders, within four standard errors of the optimum.
+    """Compute the output-error cost on a grid of two orders that spans four standard errors around the optimum.
 
     Parameters
     ----------

@@ -335,7 +335,7 @@ def _unused_names(base: str, count: int, structure: Structure, run: Run) -> list
 
 
 def _fit_extensions(extensions: Sequence[Extension], *, runs: Runs, own_criterion: float) -> list[FittedExtension]:
-    """Return the fits of extensions, without those of which every fit fails."""
+    """Return the fits of extensions; an extension whose fits all fail is omitted."""
     return [f for e in extensions if (f := _fit_extension(e, runs, own_criterion)) is not None]
 
 
@@ -394,7 +394,7 @@ def _delay_findings(
 
 
 def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
-    """Return the extensions of the input dynamics of a structure of one equation, preferred ones first."""
+    """Return the extensions of the input dynamics of a one-equation structure, preferred ones first."""
     (equation,) = structure.equations
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
     delays = {n: structure.delay.get(n, 0.0) for n in names}
@@ -597,7 +597,7 @@ def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
 
 
 def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, added_parameters: int) -> float:
-    """Return the Schwarz criterion of one-step predictions of the residuals by an autoregression of at most 25 lags.
+    """Return the Schwarz criterion of an autoregression of the residuals with at most 25 lags.
 
     The fit minimizes squared residuals and ignores their color. One generalized least-squares step therefore first
     removes the part of the residuals that parameter errors explain. The penalty counts the coefficients of the

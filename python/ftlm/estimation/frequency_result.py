@@ -43,7 +43,7 @@ CURVE_POINTS = 160
 
 
 def curve_frequencies(record: FrequencyData) -> Floats:
-    """Return frequencies [rad/s] for a smooth curve, which include those of a record.
+    """Return frequencies [rad/s] for a smooth curve, including all frequencies of the record.
 
     At least one frequency lies between neighboring measured ones, so that each measured point is drawn as a dot.
     """
@@ -161,7 +161,7 @@ def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figu
 
 
 def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> LineChart:
-    """Return the chart of residuals over frequency, in percent of the magnitude of the measured response."""
+    """Return the chart of residuals over frequency, in percent of the measured magnitude."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
     response = model_response(model, record, omega)

@@ -230,7 +230,7 @@ def multi_innovation_trace(
     m: int | None = None,
     every: int = 1,
 ) -> MultiInnovationTrace:
-    """Run the multi-innovation recursion (44), and return coefficients and simulation error (45) after each step.
+    """Run the paper's recursion (44); return the coefficients and the simulation error (45) after each step.
 
     Equation numbers are those of the paper.
 
@@ -300,7 +300,7 @@ def multi_innovation_trace(
 
 @check_arguments
 def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> LineChart:
-    """Return a chart of the simulation error (45) after every step of the recursion (44), as in Figure 4(b).
+    """Return a chart of the simulation error (45) after each step of recursion (44), as in the paper's Figure 4(b).
 
     Equations and figure are those of the paper.
 
@@ -447,7 +447,7 @@ class Streaming:
 
     @property
     def pulses(self) -> int:
-        """Number of rows of equation (44) so far, which is the number of samples minus one."""
+        """Number of rows processed by the paper's recursion (44): the number of samples minus one."""
         return self._recursions[0].pulses
 
     def __str__(self) -> str:

@@ -49,7 +49,7 @@ def search_orders(
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Search the orders of an equation, or of coupled equations under an order law, over all points of a grid.
+    """Rank all points of an order grid for one equation, or for coupled equations under an order law.
 
     For each candidate, the coefficients are estimated from the equation error, and the candidate gets a score (Table 2
     of the paper, steps 5-7). The table of best candidates equals that of a full evaluation of every candidate. It is
@@ -68,7 +68,7 @@ def search_orders(
         measured other outputs. ``"equation-error"``: that of the equation with measured signals on the right-hand side.
         It prefers equations that are nearly identities, in which a signal predicts itself.
     coefficients
-        Estimator of the coefficients: ``"multi-innovation"`` (closed form of equation (44)), ``"least-squares"``, or
+        Estimator of the coefficients: ``"multi-innovation"`` (paper (44) in closed form), ``"least-squares"``, or
         ``"instrumental-variables"`` for refined instrumental variables, which noise on the outputs does not bias. With
         instrumental variables, measured outputs that enter another equation are replaced by their projections on
         filtered inputs.
@@ -168,7 +168,7 @@ def with_verdict(
 
 
 def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]:
-    """Return a finding on table rows whose score is not significantly larger than that of rank 1.
+    """Return a finding on table rows whose score is not significantly larger than the score of rank 1.
 
     For N independent residuals, the sum of squares at the true k free orders exceeds that at the best ones by a
     relative amount of chi-squared with k degrees of freedom, divided by N. Colored residuals count as fewer samples.

@@ -30,7 +30,7 @@ def exponent_bound(name: str) -> str:
 
 
 def is_impedance(record: FrequencyData) -> bool:
-    """Whether the unit of a record is that of an impedance."""
+    """Whether the unit of a record ends in Ω, so that the record is an impedance."""
     return record.unit.endswith("Ω")
 
 
@@ -151,7 +151,7 @@ class ResponseProblem:
         return out
 
     def coefficient(self, term: Term, item: Equation, values: Floats) -> float:
-        """Return the coefficient of a term of an equation, in the time unit of this problem."""
+        """Return the coefficient of an equation's term, in the time unit of this problem."""
         if isinstance(term.coefficient, str):
             return term.factor * float(values[self._coefficient[term.coefficient]])
         power = self.order_at(item.order, values) - self.order_at(term.order, values)
@@ -516,7 +516,7 @@ def _slowest(problem: ResponseProblem, item: Equation, points: Floats) -> tuple[
 
 
 def _least_squares(matrix: Complex, right: Complex) -> Floats:
-    """Return real least-squares solutions of a batch of complex linear systems, of minimum norm."""
+    """Return the real minimum-norm least-squares solution of each complex linear system of a batch."""
     lengths = np.sqrt(np.sum(np.abs(matrix) ** 2, axis=1))
     unit = np.where((lengths > 0) & np.isfinite(lengths), lengths, 1.0)
     scaled = np.nan_to_num(matrix / unit[:, None, :])

@@ -170,7 +170,7 @@ class Task:
     order_grid: OrderGrid | None = None
 
     def part_order_grid(self, part: Structure) -> OrderGrid:
-        """Return the order grid of one independent group of equations of the structure."""
+        """Return the order grid restricted to the free orders of `part`, some equations of the structure."""
         return restrict_order_grid(self.order_grid, part) or OrderGrid()
 
 

@@ -62,7 +62,7 @@ class PieceTest:
 
 
 def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
-    """Return the result of simulating an unstable model on short pieces of the runs; None if not possible.
+    """Simulate an unstable model on short segments of the runs and return the result; None if not possible.
 
     Runs of an unstable plant are bounded only because a controller feeds back the output. A correct unstable model
     follows the output within a piece. A wrongly unstable model of a stable plant does not, over five time constants,

@@ -119,7 +119,7 @@ LIMIT_RANGE = (1e-50, 1e50)
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits of inputs, rates and outputs of a run, in the units of its signals.
+    """Limits of inputs, input rates and outputs during a run, in the units of the signals.
 
     Parameters
     ----------

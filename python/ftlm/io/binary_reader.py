@@ -67,7 +67,7 @@ def limit_resources(memory: int, seconds: int | None = None) -> None:
 
 
 def check_version(path: str) -> None:
-    """Raise UnreadableError unless the first bytes are those of a MATLAB file of version 4 or 5."""
+    """Raise UnreadableError unless the first bytes identify a MATLAB file of version 4 or 5."""
     with open(path, "rb") as stream:
         head = stream.read(520)
     # Version 4 begins with the type of its first matrix, a number below 5000: zeros among four bytes, as in no text.

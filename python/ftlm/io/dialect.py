@@ -131,7 +131,7 @@ class Layout:
         return cls(**layout)
 
     def under(self, other: Layout) -> Layout:
-        """Return the merged options of two layouts; those of the other layout take precedence."""
+        """Return the merged options of two layouts; options of the other layout take precedence."""
         return replace(self, **other.to_dict())
 
     def to_dict(self) -> dict[str, Any]:

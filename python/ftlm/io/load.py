@@ -326,7 +326,7 @@ def time_header(clock: Column) -> str:
 
 
 def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
-    """Return (file, group) for each path; the group is that of an HDF5 file, "" for the whole file."""
+    """Return (file, HDF5 group) for each path; the group is "" for the whole file."""
     entries = [argument] if isinstance(argument, (str, os.PathLike)) else argument
     if not isinstance(entries, Sequence) or not all(isinstance(entry, (str, os.PathLike)) for entry in entries):
         raise DataError(f"path is a {type(argument).__name__}; pass the path of a file, or a list of paths")

@@ -197,7 +197,7 @@ def _describe_sweeps(omega: Floats, response: Complex) -> list[str]:
 
 
 def is_response(pool: Pool) -> bool:
-    """Whether the column names are those of a frequency response."""
+    """Whether the column names denote a frequency response."""
     try:
         _find_parts(pool)
     except DataError:

@@ -91,7 +91,7 @@ class SearchProblem(ABC, Generic[Table]):
 
 @dataclass(frozen=True)
 class EquationProblem(SearchProblem["_core._Found"]):
-    """Order search of one equation: its output, grid values of its order, and of the order of each term."""
+    """Order search of one equation: output, grid values of the highest order, and grid values of each term's order."""
 
     orders: tuple[int, list[float], list[tuple[int, list[float], bool]]]
     fixed: list[float | None]
@@ -582,7 +582,7 @@ def search_equation(work: EquationProblem, execution: Execution) -> _core._Found
 
 
 def search_coupled(work: CoupledProblem, execution: Execution) -> _core._FoundStage:
-    """Return the table of the order search of coupled equations; that of a finished search is read from its file."""
+    """Search the orders of coupled equations and return the table; a finished search is read from its file."""
     store, section = execution.store, execution.section
     if store is None and execution.executor is None:
         return work.search(execution.progress)

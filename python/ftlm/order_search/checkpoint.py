@@ -143,7 +143,7 @@ class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="round
 
 
 class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="verdicts"):
-    """Record of a completely evaluated block of candidates of a coupled search.
+    """Checkpoint record of a coupled search for one block of candidates that is completely evaluated.
 
     ``values`` are unscaled scores as little-endian doubles. ``kinds`` has one byte per value: 0 for a complete score, 1
     for a lower bound, 2 for a partial sum, 3 for a singular candidate, 4 for a diverged one.
@@ -250,7 +250,7 @@ class Section:
 
     @property
     def best(self) -> float | None:
-        """Smallest unscaled score so far in the search of one equation; None for a coupled search."""
+        """Lowest unscaled score found so far in the search of one equation; None for a coupled search."""
         rows = [row for frame in self.frames.values() if isinstance(frame, Rounds) for row in frame.part[0]]
         return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
 

@@ -132,7 +132,7 @@ def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None
 
 
 def restrict_order_grid(grid: OrderGrid | None, part: Structure) -> OrderGrid | None:
-    """Return an order grid restricted to the free orders of a part of the structure."""
+    """Return an order grid restricted to the free orders of the structure `part`."""
     if grid is None:
         return None
     names = (*part.order_names, "alpha")

@@ -78,7 +78,7 @@ class OrderCertificate:
 
     @property
     def beatable(self) -> tuple[bool, ...]:
-        """Whether other orders may have an error below that of each `start` point by more than the tolerance."""
+        """Whether, for each `start` point, other orders may have an error lower by more than the tolerance."""
         return tuple(self.lower_bound < (1 - self.requested_tolerance) * error for error in self.start_errors)
 
     @property
@@ -92,7 +92,7 @@ class OrderCertificate:
 
     @property
     def proved_tolerance(self) -> float:
-        """Largest fraction by which the error of other orders can be smaller, as proved; 1 without a proof."""
+        """Upper bound of the fraction by which other orders can reduce the error; 1 without a proof."""
         return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:

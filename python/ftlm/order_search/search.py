@@ -58,7 +58,7 @@ FREE_RUN_CANDIDATES = 300
 
 
 def record_run(rec: Record, structure: Structure) -> Run:
-    """Return a block-pulse record as a run whose pulse means equal those of the record.
+    """Return a run with the same pulse means as a block-pulse record.
 
     Output samples are means of neighboring pulses.
     """
@@ -549,7 +549,7 @@ def landscape(
     orders: tuple[str, str] | None = None,
     threads: int | None = None,
 ) -> Landscape:
-    """Compute the score of the search for every pair of values of two orders.
+    """Compute the score of the search on a grid of two orders.
 
     Parameters
     ----------

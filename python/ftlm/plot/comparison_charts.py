@@ -28,7 +28,7 @@ DERIVATIVE_STEP_IN_ERRORS = 0.1
 
 
 def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
-    """Return the time of each value of a run of a comparison [s]: sample times, or block-pulse centers."""
+    """Return the time of each compared value [s]: sample times, or centers of the block pulses."""
     if comparison.times:
         return comparison.times[run]
     return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
@@ -209,7 +209,7 @@ def error_chart(
     units: Mapping[str, str] | None = None,
     points: int = MAX_LINE_POINTS,
 ) -> LineChart:
-    """Return a chart of the absolute simulation errors of several models on the first run of their comparisons.
+    """Return a chart of the absolute simulation error of several models on the first compared run.
 
     Figure 4(a) of the paper is such a chart.
 
@@ -256,7 +256,7 @@ def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
 
 @check_arguments
 def residual_charts(tests: Residuals, *, label: str = "") -> list[LineChart]:
-    """Return charts of autocorrelations and cross-correlations of the residuals of every output, with 99 % bands.
+    """Return charts of each output's residual autocorrelation and cross-correlations, with 99 % bands.
 
     Parameters
     ----------

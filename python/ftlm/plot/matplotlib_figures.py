@@ -593,7 +593,7 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
 
 @check_arguments
 def design(result: DesignedInput, *, ax: Any = None) -> Any:
-    """Plot a designed input, its predicted response and that of a square wave, with limits and spectrum.
+    """Plot a designed input and its spectrum, the predicted responses to it and to a square wave, and the limits.
 
     Parameters
     ----------

@@ -133,7 +133,7 @@ def plane_order(model: Model) -> float:
 
 @dataclass(frozen=True)
 class BodeCurve:
-    """Gain [dB] and phase [degrees] of the response of one output to one input, with half-widths of 95 % bands."""
+    """Gain [dB] and phase [degrees] from one input to one output, with half-widths of 95 % confidence bands."""
 
     output: str
     input: str

@@ -83,7 +83,7 @@ def verdict_box(judgement: Verdict, of: str = "") -> Markup:
 
 
 def first_findings(findings: Iterable[Finding]) -> tuple[list[str], list[str]]:
-    """Return (sentences of the most serious groups of findings with remedies, sentences of the other findings)."""
+    """Return sentences on findings: first the most serious groups with remedies, second all others."""
     first: list[str] = []
     rest: list[str] = []
     for k, group in enumerate(group_findings(findings)):

@@ -527,7 +527,7 @@ def papers_current(stage: StageNumber) -> Run:
 
 
 def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[PrintedModelRun]:
-    """Simulate every printed fractional model of a stage, and identify each from its own response."""
+    """Simulate every printed fractional model of a stage, and identify each model from its simulated response."""
     drive, runs = papers_current(stage), []
     scaled, _ = papers_record()
     structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())

@@ -92,7 +92,7 @@ MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
 def angle_chart(
     time: Floats, lines: Sequence[tuple[str, Floats]], output: str, title: str, caption: str, **options: Any
 ) -> LineChart:
-    """Chart of an angle over time by several models; the options are those of a line chart."""
+    """Return the chart of an angle over time by several models, with the options of a line chart."""
     options = {"points": LINE_POINTS, "caption": caption.replace(" -", " −"), **options}
     return LineChart(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
 
@@ -144,7 +144,7 @@ def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
 
 
 def share_picture(ruling: ClaimVerdict) -> Markup:
-    """Bar of the share of cases in which a claim holds, for every level of the deciding factor."""
+    """Return a bar chart: share of cases in which a claim holds, by level of the deciding factor."""
     levels = ruling.levels or (("", ruling.cases, ruling.holding_cases),)
     height = 10 * len(levels) - 2
     words = "; ".join(f"{level + ': ' if level else ''}{holding} of {count}" for level, count, holding in levels)
@@ -343,7 +343,7 @@ def printed_cells(words: str, row: printed.PublishedRow, *, criteria: bool = Tru
 
 
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
-    """Return cells of the orders of one equation, and of its significant coefficients.
+    """Return table cells with the orders of one equation and its significant coefficients.
 
     A coefficient is significant if it is at least as large as its standard error.
     """
@@ -368,7 +368,7 @@ def model_table(stage: Stage) -> Table:
 
 
 def fits_table(stage: Stage) -> Table:
-    """Return a table of both errors of every model, and of its fits on both runs."""
+    """Return a table with both errors of every model, and its fits on both runs."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
         for label, c in stage.candidates.items():

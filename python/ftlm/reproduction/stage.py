@@ -465,7 +465,7 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
 def traces_of(
     run: Run, single: Structure, models: Mapping[int, Model], prior: float, every: int
 ) -> dict[int, MultiInnovationTrace]:
-    """Return the convergence of the recursion for one equation with every p, at the orders of the model of that p."""
+    """Return the convergence of the recursion for one equation by innovation length p."""
     traces = {}
     for p, model in models.items():
         structure = single.with_orders({n: model.orders[n] for n in single.order_names})
@@ -793,7 +793,7 @@ class StageWork:
     def traces(
         self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]
     ) -> dict[str, dict[int, MultiInnovationTrace]]:
-        """Return the convergence of the recursion for every equation and p, at the orders of the model of that p."""
+        """Return the convergence of the recursion for every equation and innovation length p."""
         parts = {o: self.measured.equation(o) for o in self.measured.outputs}
         return {o: traces_of(self.on, each, models, prior, self.preset.trace_every) for o, each in parts.items()}
 

@@ -116,7 +116,7 @@ class ArmParameters:
     travel
         Hub angle at which a limit switch opens [rad].
     form
-        ``"lagrange"``: Euler-Lagrange equations (14)-(15). ``"published"``: equations (22)-(25) as printed, whose
+        ``"lagrange"``: Euler-Lagrange equations (14)-(15) of the paper. ``"published"``: its equations (22)-(25), whose
         deflections have the wrong sign, for comparison with the paper; only without coupling of the joints.
     name
         Name of the parameter set in files.
@@ -281,7 +281,7 @@ class ArmParameters:
 
 
 def _optional(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
-    """Return the fields of a dataclass as definitions of optional keys of a file."""
+    """Return the fields of a dataclass as optional keys of a file."""
     hints = {**get_type_hints(kind), **replaced}
     return [(name, hint | UnsetType, UNSET) for name, hint in hints.items() if name != "name"]
 

@@ -161,7 +161,7 @@ def _of_both_joints(controller: Controller) -> Controller:
 
 
 def _rate_of(controller: Controller, rate: float | None) -> float:
-    """Return the sampling rate [Hz]; raise ModelError if it differs from that of the controller."""
+    """Return the sampling rate [Hz]; raise ModelError if it differs from the controller's sampling rate."""
     own = finite_number(getattr(controller, "rate", None))
     _, _, checked = check_times(
         MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, (own or DEFAULT_RATE_HZ) if rate is None else rate

@@ -316,7 +316,7 @@ def record(
 
 
 class CommandSource(Protocol):
-    """Protocol of a source of the commands of a run."""
+    """Protocol of an object that supplies the commands of a run."""
 
     rows: int
     #: Additional signals of the run by name, one value per sample.
@@ -646,7 +646,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
 
 
 def _column_of(name: str) -> int:
-    """Return the index of the column of the rig that contains a signal of the live structure."""
+    """Return the index of the rig's column that contains a signal of the structure identified live."""
     if name not in RIG_COLUMNS:
         raise ModelError(
             f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(RIG_COLUMNS)}"

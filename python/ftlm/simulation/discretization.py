@@ -44,7 +44,7 @@ InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], in
 
 @dataclass(frozen=True)
 class Record:
-    """Block-pulse record: the mean of each signal of a structure over each block pulse of a run.
+    """Block-pulse record of a run: the mean of each signal over each block pulse.
 
     Parameters
     ----------

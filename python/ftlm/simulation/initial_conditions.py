@@ -284,7 +284,7 @@ def has_memory(structure: Structure) -> bool:
 
 
 def history(run: Run, structure: Structure) -> History:
-    """Return powers of t that represent the past inputs of a run, as many as the noise of its outputs requires."""
+    """Return the powers of t that represent the effect of past inputs on a run, as many as exceed the noise."""
     visible = 1.0
     for name in structure.outputs:
         if name in run:
@@ -323,7 +323,7 @@ def conditions_in_motion(structure: Structure) -> Initial:
 
 
 def common_initial_conditions(decisions: list[Initial]) -> Initial | None:
-    """Return the initial conditions with the most terms among those of several runs; None if all are equal."""
+    """Return, of the initial conditions of several runs, those with the most terms; None if all are equal."""
     if len(set(decisions)) < 2:
         return None
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))

@@ -20,7 +20,7 @@ SMOOTHING_POINTS, SMOOTHING_DEGREE = 31, 3
 
 
 def nonlinear_columns(structure: Structure) -> dict[str, Expression]:
-    """Return the expressions of the non-linear terms, by the name of their row in a record, in order of appearance."""
+    """Return the expressions of the non-linear terms by row name in a record, in order of appearance."""
     return {t.column: t.nonlinear for e in structure.equations for t in e.terms if t.nonlinear is not None}
 
 

@@ -152,7 +152,7 @@ def _posterior_mean(shapes: Floats, target: Floats) -> Floats:
 
 
 def _past_responses(model: Model, run: Run, times: Floats, max_m: int) -> list[Floats] | None:
-    """Return the responses of all outputs to a unit input of each equation during each octave of the past.
+    """Return the responses of all outputs to unit inputs: one per equation and per octave of past time.
 
     There is one array (octaves, outputs, N) for each equation, at the given times [s]. None if a response is not
     finite.

@@ -72,7 +72,7 @@ def simulate(
     initial: Mapping[str, Mapping[float, float]] | None = None,
     max_m: int = 1 << 22,
 ) -> Run:
-    """Simulate the outputs of a model on the inputs of a run, at the sample times of the run.
+    """Simulate a model with the inputs of a run, and return the outputs at the run's sample times.
 
     Models of integer orders are simulated exactly, by the matrix exponential of one sampling interval, if the samples
     are uniform and the model has no sensor filter, friction or non-linear term. For all other models, the step is
@@ -224,7 +224,7 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
 
 @check_arguments
 def explicit_euler(model: Model, run: Run) -> dict[str, Floats]:
-    """Simulate a model of integer orders by explicit Euler with the step of the run, the baseline of the paper.
+    """Simulate an integer-order model by explicit Euler steps of one sampling interval, the paper's baseline.
 
     Parameters
     ----------

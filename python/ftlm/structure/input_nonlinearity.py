@@ -141,7 +141,7 @@ def sort_nonlinearities(limits: Sequence[InputNonlinearity]) -> list[InputNonlin
 def replace_nonlinearities(
     limits: Sequence[InputNonlinearity], law: NonlinearityKind, values: Mapping[str, Value]
 ) -> tuple[InputNonlinearity, ...]:
-    """Return non-linearities in which those of one kind are replaced by new values, by input."""
+    """Return the non-linearities by input, with new values for one kind (saturation or dead zone)."""
     others = [limit for limit in limits if limit.law != law or limit.signal not in values]
     new = [
         InputNonlinearity(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()

@@ -1,4 +1,4 @@
-"""Orders of terms, which are numbers or affine functions of free orders, and grids of order values."""
+"""Orders of terms, and grids of order values. An order is a number or an affine function of free orders."""
 
 from __future__ import annotations
 

@@ -212,7 +212,7 @@ def _equation_of(words: EquationParser) -> Equation:
 
 
 def _division_reason(words: EquationParser, first: ParsedTerm) -> str | None:
-    """Return why the coefficients of an equation are not those of its terms; None if they are."""
+    """Return why the terms of an equation do not have one free coefficient each; None if they do."""
     linear = [item for item in (*words.left, *words.right) if item.expression is None]
     leading = [i for i in linear if i in words.left and (i.signal, i.order) == (first.signal, first.order)]
     named = next((item.name for item in leading if item.name), None)

@@ -66,7 +66,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def relative_degree(self) -> int:
-        """Integer part of the order of the denominator minus the order of the numerator."""
+        """Return the relative degree: order of the denominator minus order of the numerator, rounded down."""
         bottom, top = (
             max((order for coefficient, order in part if coefficient), default=0.0)
             for part in (self.denominator, self.numerator)
@@ -82,7 +82,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @classmethod
     @check_arguments
     def low_pass(cls, signals: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
-        """Return a second-order low-pass filter; the default is that of the arm's original real-time model.
+        """Return a second-order low-pass filter; by default the filter of the arm's original real-time model.
 
         Parameters
         ----------

@@ -99,7 +99,7 @@ class Selection(ReportMixin):
         return self.best.validate(runs)
 
     def summary(self) -> str:
-        """Return the summary as text: that of the model, the candidates, and the reason for the choice."""
+        """Return as text: the summary of the model, the candidates, and the reason for the choice."""
         return str(self)
 
     @property

@@ -403,7 +403,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
 
 
 def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
-    """Return ranked trials with BIC, whose effective number of samples is that of the best trial's residuals.
+    """Return ranked trials with BIC. The best trial's residuals give the effective number of samples.
 
     The trial with the whitest residuals is not suitable for this, because a high order can fit drifts and disturbances
     and still predict worse.

@@ -75,7 +75,7 @@ class Table:
     def from_groups(
         cls, title: str, columns: Sequence[str], rows: Mapping[str, Sequence[Sequence[Cell]]], **options: Any
     ) -> Table:
-        """Return a table from rows by heading; options are those of the class."""
+        """Return a table from rows by heading, with the options of the class."""
         starts = accumulate((len(each) for each in rows.values()), initial=0)
         flat = [row for each in rows.values() for row in each]
         return cls(title, columns, flat, headings=dict(zip(starts, rows, strict=False)), **options)
@@ -262,6 +262,6 @@ class ReportMixin(ABC):
         """Return the content of the report."""
 
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the result to an HTML file; arguments and errors are those of :meth:`ftlm.Identification.report`."""
+        """Write the result to an HTML file, with the arguments and errors of :meth:`ftlm.Identification.report`."""
         page = self._page()
         return write_page(path, title=page.title, sections=page.sections, lead=page.lead, force=force)

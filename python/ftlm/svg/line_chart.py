@@ -49,7 +49,7 @@ READOUT_LEVELS = 1e5
 def slider_readout(
     x: Floats, lines: Sequence[tuple[str, int, Floats]], x_label: str, y_label: str, places: int = SLIDER_POSITIONS
 ) -> str:
-    """Return the values of the lines at each position of a chart's slider, as a JSON string of integers.
+    """Return, for each slider position of a chart, the values of all lines as a JSON string of integers.
 
     Parameters
     ----------

@@ -80,7 +80,7 @@ def robust_deviation(values: Floats) -> float:
 
 
 def huber_excess(few: Floats, many: Floats) -> float:
-    """Return the excess of Huber's loss of a smaller model over that of a larger one, in units of the noise variance.
+    """Return how much a smaller model's Huber loss exceeds a larger model's, in units of the noise variance.
 
     If the smaller model is sufficient, the excess is chi-squared distributed. Its degrees of freedom are the additional
     parameters of the larger model, even with outliers (doi:10.1214/aoms/1177703732).

@@ -711,5 +711,5 @@ def warnings_html(warnings: Sequence[str]) -> Markup:
 
 
 def comparison_html(comparison: Comparison) -> str:
-    """Return HTML with the warnings of a comparison and a table of both errors of every run."""
+    """Return HTML with the warnings of a comparison and a table of the prediction and simulation error by run."""
     return str(warnings_html(comparison.warnings) + errors_table([("compared", comparison)]).to_html())

@@ -325,7 +325,7 @@ def _jumps_near(u: Floats, at: int) -> bool:
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
-    """Return the number of spectral lines of an input, and the FFT bin of the largest one."""
+    """Return the number of spectral lines of an input, and the FFT bin of its largest line."""
     x = u - np.mean(u)
     phase = 2 * np.pi * np.arange(x.size) / x.size
     window = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
