@@ -84,7 +84,8 @@ impl Equation {
     /// Return an equation with one finite coefficient per term.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`].
+    /// [`Error::Length`] if the number of coefficients differs from the number of terms; [`Error::NotFinite`] for a
+    /// coefficient that is not finite.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
@@ -102,7 +103,8 @@ impl Equation {
     /// input.
     ///
     /// # Errors
-    /// As [`Structure::check`] and [`Equation::new`].
+    /// [`Error::Structure`] for a signal that does not exist, [`Error::OutOfRange`] for an invalid order
+    /// ([`Structure::check`]); a wrong number of coefficients or one that is not finite ([`Equation::new`]).
     pub fn check(&self, signals: usize) -> Result<()> {
         self.structure.check(signals, |_| true)?;
         self.check_coefficients()
@@ -531,7 +533,7 @@ fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading 
 /// repeat or contradict each other.
 ///
 /// # Errors
-/// [`Error::Structure`].
+/// [`Error::Structure`] if the equations cannot be solved for all outputs.
 ///
 /// ```
 /// use ftlm::equation::{Equation, Structure, Term};

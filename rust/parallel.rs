@@ -146,7 +146,7 @@ impl Stop {
     /// Return an error after cancellation was requested.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn check(&self) -> Result<()> {
         if self.is_set() {
             Err(Error::Interrupted)

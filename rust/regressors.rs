@@ -73,7 +73,8 @@ impl Record {
     /// Record of the pulse means of sampled signals, one pulse per sampling interval.
     ///
     /// # Errors
-    /// As [`Record::new`] and [`pulse_means`].
+    /// Fewer than two samples or a sample that is not finite ([`pulse_means`]); signals of unequal length or an invalid
+    /// step ([`Record::new`]).
     ///
     /// ```
     /// # use ftlm::regressors::Record;

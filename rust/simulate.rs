@@ -83,7 +83,7 @@ fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(
 /// A large enough decay [1/pulse] makes every model stable. Instruments need to be free of noise, but not exact.
 ///
 /// # Errors
-/// As [`respond`].
+/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
 pub fn respond_damped(
     equations: &[Equation],
     record: &Record,
@@ -97,7 +97,7 @@ pub fn respond_damped(
 /// equation i. O(n³ m log² m).
 ///
 /// # Errors
-/// As [`respond`].
+/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
 pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f64>>>> {
     build_system(equations, record, &[])?.inverse()
 }
@@ -134,7 +134,7 @@ pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, 
 /// Response with zero initial conditions ([`respond`]) and [`unit_responses`], with shared transforms.
 ///
 /// # Errors
-/// As [`unit_responses`].
+/// [`Error::Structure`] for an initial term of an equation that does not exist; invalid equations as in [`respond`].
 #[allow(clippy::type_complexity)]
 pub fn respond_and_units(
     equations: &[Equation],
@@ -166,7 +166,7 @@ fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f6
 /// by 1/σ of its measurement, and apply to this record only.
 ///
 /// # Errors
-/// As [`respond`].
+/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
 pub fn respond_with_initial(
     equations: &[Equation],
     record: &Record,
@@ -241,7 +241,7 @@ fn weight(y: &[f64]) -> f64 {
 /// Initial terms are fitted by least squares at the given coefficients.
 ///
 /// # Errors
-/// As [`respond`].
+/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;

@@ -144,7 +144,7 @@ pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], ini
 /// The first `needed` columns must be linearly independent. Later dependent columns are excluded (x = 0) and returned.
 ///
 /// # Errors
-/// [`Error::Singular`].
+/// [`Error::Singular`] with the index of the first linearly dependent column.
 pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec<f64>, Vec<usize>)> {
     let k = columns.len();
     columns.iter().try_for_each(|column| check_length("column", target.len(), column.len()))?;

@@ -78,7 +78,7 @@ impl Innovation {
     /// Check that p and the prior covariance are positive.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`].
+    /// [`Error::OutOfRange`] if p or the prior covariance is not positive.
     pub fn check(&self) -> Result<()> {
         if self.length == 0 {
             return Err(Error::OutOfRange {

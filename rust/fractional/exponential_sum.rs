@@ -1,4 +1,5 @@
-//! Kernel of I^q as a sum of decaying exponentials, so that the history of a signal needs bounded memory.
+//! Approximation of the kernel of I^q by a sum of decaying exponentials, with which the history of a signal needs
+//! bounded memory.
 //!
 //! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. For such integrands the trapezoidal rule in x
 //! converges like e^{−π²/Δx}. A few dozen rates e^x therefore represent the whole history at any requested accuracy,
@@ -8,7 +9,8 @@
 
 use crate::error::{check_finite, check_overflow, Error, Result};
 
-/// Lowest rate of the rule times the longest lag. Below this rate, four moments suffice (1e−3⁴/4! < 1e−13).
+/// Lowest decay rate of the quadrature rule times the longest lag. Slower exponentials are replaced by four moments of
+/// the signal (1e−3⁴/4! < 1e−13).
 const LOWEST_RATE_TIMES_LAG: f64 = 1e-3;
 /// Rates that replace the nodes below the lowest rate of the rule, relative to it.
 const TAIL_RATE_RATIOS: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];

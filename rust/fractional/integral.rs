@@ -15,7 +15,8 @@ pub enum IntegralRule {
     GrunwaldLetnikov,
 }
 
-/// Highest order of a derivative of samples. Each order multiplies their noise by 1/h.
+/// Maximum order of a derivative of samples. Each order multiplies the noise of the samples by 1/h, where h is the
+/// sampling interval.
 pub const MAX_DERIVATIVE: f64 = 3.0;
 
 /// Definition of a fractional derivative.

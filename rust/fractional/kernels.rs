@@ -10,13 +10,13 @@ use crate::error::{Error, Result};
 use crate::fractional::integer_powers::{odd_powers, whole_logarithms, whole_powers};
 use crate::series::{multiply, reciprocal};
 
-/// Highest order of an integral and of an equation, enough for five oscillatory modes.
+/// Maximum order of an integral and of an equation. It suffices for five oscillatory modes.
 ///
 /// Kernels are exact to a few ε up to this order. Rounding errors of a division grow like (ωT)^α/Γ(α+1), so long
 /// records of many modes need lower orders.
 pub const MAX_ORDER: f64 = 10.0;
 
-/// Lowest order of an input in an equation: a threefold integration.
+/// Minimum order of an input in an equation: a threefold integration.
 pub const MIN_INPUT_ORDER: f64 = -3.0;
 
 /// Distance in pulses below which the even binomial sum converges slowly and needs [`TERMS_NEAR`] terms.
@@ -298,8 +298,9 @@ pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     out
 }
 
-/// Number of pulses of a long record whose means are computed from powers of their ends. The midpoint series of the
-/// other pulses before [`LONG_SUM_TERMS`] has [`MIDPOINT_SERIES_TERMS`] terms: 33^−16 is below the rounding error.
+/// Number of first pulses of a long record whose means are computed as differences of powers of the pulse ends. Later
+/// pulses before [`LONG_SUM_TERMS`] use a series about the pulse midpoint. It has [`MIDPOINT_SERIES_TERMS`] terms,
+/// because 33^−16 is below the rounding error.
 const ENDPOINT_PULSES: usize = 16;
 const MIDPOINT_SERIES_TERMS: usize = 8;
 
@@ -442,7 +443,7 @@ fn moment(exponent: f64) -> f64 {
 /// Return an error for an order outside [0, [`MAX_ORDER`]].
 ///
 /// # Errors
-/// [`Error::OutOfRange`].
+/// [`Error::OutOfRange`] for an order outside this interval, or NaN.
 pub fn check_order(name: &str, order: f64) -> Result<()> {
     if (0.0..=MAX_ORDER).contains(&order) {
         Ok(())

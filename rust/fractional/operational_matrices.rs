@@ -98,13 +98,14 @@ impl Wavelet {
     }
 }
 
-/// Table of the entries of one level of rows and one level of columns, by their distance. Every row is a contiguous
-/// part.
+/// Table of the matrix entries in which rows of one wavelet level meet columns of one level. An entry depends only on
+/// the distance of the two wavelets in time. Every row is a contiguous range of `values`.
 struct Table {
     values: Vec<f64>,
     /// Number of columns of the level.
     count: usize,
-    /// Number of rows per column, if columns are wider than rows. Each such row has its own part of the table.
+    /// Number of rows within the width of one column, if columns are wider than rows. Each of these rows has its own
+    /// range of `values`.
     phases: usize,
     /// Number of columns per row otherwise.
     stride: usize,
@@ -123,7 +124,7 @@ impl Table {
     }
 }
 
-/// Tables of a level of rows with all levels of columns, in the order of the columns.
+/// Return the tables of one wavelet level of rows with every level of columns, in the sequence of the columns.
 fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
     // ahead[m + d] is the sum of the responses from d on over half a width.
     let mut padded = vec![0.0; 2 * m];
@@ -160,7 +161,7 @@ fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f
 /// Haar operational matrix P^η by two dense matrix products, a reference for tests of [`operational_matrix`]. O(m³).
 ///
 /// # Errors
-/// As [`operational_matrix`].
+/// An order out of range, or a size that is too large or not a power of two ([`operational_matrix`]).
 #[cfg(feature = "oracles")]
 pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     let phi = haar_matrix(m)?;
@@ -205,7 +206,7 @@ pub fn check_power_of_two(m: usize) -> Result<()> {
 /// Haar transform Φ f in place: coefficients from coarse to fine, from pulse means. O(m).
 ///
 /// # Errors
-/// [`Error::NotPowerOfTwo`].
+/// [`Error::NotPowerOfTwo`] if the number of pulses is not a power of two.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -225,7 +226,7 @@ pub fn haar_transform(f: &mut [f64]) -> Result<()> {
 /// Inverse Haar transform Φᵀ c in place: pulse means from coefficients. O(m).
 ///
 /// # Errors
-/// [`Error::NotPowerOfTwo`].
+/// [`Error::NotPowerOfTwo`] if the number of pulses is not a power of two.
 pub fn haar_inverse(c: &mut [f64]) -> Result<()> {
     check_power_of_two(c.len())?;
     let mut scratch = vec![0.0; c.len()];
@@ -260,7 +261,7 @@ pub(crate) fn haar_transform_with_scratch(f: &mut [f64], scratch: &mut [f64]) {
 /// Orthogonal Haar matrix Φ by definition, row-major m × m (paper (27), (29)).
 ///
 /// # Errors
-/// [`Error::NotPowerOfTwo`].
+/// [`Error::NotPowerOfTwo`] if the number of pulses is not a power of two.
 #[allow(clippy::cast_precision_loss)]
 pub fn haar_matrix(m: usize) -> Result<Vec<f64>> {
     check_power_of_two(m)?;

@@ -132,7 +132,7 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
 /// overflows are skipped.
 ///
 /// # Errors
-/// [`crate::error::Error::Interrupted`].
+/// [`crate::error::Error::Interrupted`] after a stop request.
 pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop) -> Result<Vec<Vec<f64>>> {
     let whole = |(): &mut (), mut column: Vec<f64>| {
         let size = if stop.is_set() { 0.0 } else { norm(&column) };

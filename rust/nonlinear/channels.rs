@@ -93,8 +93,8 @@ pub(super) struct ForcingTerms {
 
 /// Derivatives of a system with respect to one parameter.
 pub(super) struct SystemDerivatives {
-    /// Derivatives of the coefficient and of the integration order of each term, by equation; the last pair is that of
-    /// the friction.
+    /// Derivatives (of the coefficient, of the integration order) of each term, by equation. The last pair belongs to
+    /// the friction force.
     pub(super) terms: Vec<Vec<(f64, f64)>>,
     /// Derivatives of the forcing by initial terms.
     pub(super) forcing: ForcingTerms,

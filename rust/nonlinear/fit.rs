@@ -202,8 +202,9 @@ const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { eval
 /// before a body sticks. Over the first part it has one minimum.
 const BEGINNING_SHARES: [f64; 3] = [0.125, 0.25, 0.5];
 
-/// Initial state of a run at fixed parameters. It is the best result of local optimizations that start from the first
-/// samples, or from fits of first parts of the run of increasing length.
+/// Estimate the initial state of a run with fixed parameters. Local optimizations start from guesses by the first
+/// samples, or from the initial state that fits the first eighth, quarter and half of the run. The best result is
+/// returned.
 fn estimate_initial_state(
     model: &NonlinearModel,
     (orders, coefficients, inputs): (&[f64], &[f64], &[f64]),

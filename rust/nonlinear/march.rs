@@ -85,7 +85,8 @@ pub(super) struct Operators {
     inputs: Vec<InputLane>,
     /// Weight of each source in each state channel within a pulse, row-major.
     gains: Vec<f64>,
-    /// True if an expression enters its own channel without integration.
+    /// True if the value of an expression depends on itself in the same pulse, because it enters its channel without
+    /// integration.
     algebraic: bool,
     /// Dry friction; None without friction.
     contact: Option<ContactOperators>,
@@ -776,7 +777,8 @@ impl Operators {
         out
     }
 
-    /// Simulation of the linearized equations with a forcing, and with changes of the known channels and of the bodies.
+    /// Simulate the linearized equations. The inputs are a forcing, changes of the known channels, and changes of the
+    /// bodies' friction.
     fn linear_run(
         &self,
         run: &LinearizedRun,

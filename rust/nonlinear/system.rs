@@ -10,7 +10,7 @@ use crate::friction::contact::is_p_matrix;
 use crate::friction::FrictionLaw;
 use crate::linalg::small;
 
-/// Smallest integration order of a linear term.
+/// Minimum integration order of a linear term.
 pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
 /// Equations with non-linear terms at known orders and coefficients.
@@ -181,9 +181,9 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(of).collect()
     }
 
-    /// True if the end velocity of an equation is computed from the pulse means of another output, as from those of an
-    /// input. This holds for outputs of an order up to 1, such as those of actuators, because they have no velocity at
-    /// a pulse end.
+    /// True if the velocity of an equation at the end of a pulse is computed from the pulse means of another output, as
+    /// if this output were an input. It holds for outputs of an order up to 1, such as outputs of actuators, because
+    /// they have no velocity at a pulse end.
     pub(super) fn couples_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
         let order = self.equations[output].structure.order;
         output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER && integration > 1.0 + MAX_FEEDTHROUGH_ORDER

@@ -20,7 +20,7 @@ pub(crate) struct CandidateIndex<'a> {
     pub(crate) options: Options,
     /// Part of the memory limit that is not used \[bytes\].
     pub(crate) spare_bytes: u64,
-    /// Column of each value of each term, per block of the order grid.
+    /// Column index by block of the order grid, then by term, then by grid value of the term's order.
     tables: Vec<Vec<Vec<usize>>>,
 }
 

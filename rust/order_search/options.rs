@@ -163,7 +163,7 @@ impl Options {
         matches!(self.estimator, Estimator::InstrumentalVariables(_))
     }
 
-    /// Largest relative weight of a row in the normal equations of the coefficients.
+    /// Return the maximum weight of a row in the normal equations: the innovation length, or 1 without multi-innovation.
     pub(crate) fn weights(&self) -> usize {
         match self.estimator {
             Estimator::MultiInnovation(innovation) => innovation.length,
@@ -253,7 +253,7 @@ impl Budget {
     /// Raise an error if the memory exceeds the limit.
     ///
     /// # Errors
-    /// [`Error::Memory`].
+    /// [`Error::Memory`] if the memory exceeds the limit.
     pub(crate) fn check(&self, limit: u64) -> Result<()> {
         let limit = u128::from(limit);
         if self.bytes <= limit {

@@ -16,7 +16,8 @@ impl OutputSimulation {
     /// inputs, and equations that are singular or nearly singular.
     ///
     /// # Errors
-    /// As [`state_space::respond`] and [`fit_initial_terms`].
+    /// Invalid equations or samples ([`state_space::respond`]); initial terms that do not match the equations
+    /// ([`fit_initial_terms`]).
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};

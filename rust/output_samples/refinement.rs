@@ -15,16 +15,16 @@ use crate::signal::nonuniform::interpolate_gaps;
 /// Pulses per sampling interval of the coarsest grid. With at least two, a sample does not depend on a jump of a
 /// zero-order-hold input at its time.
 const FIRST_REFINEMENT: usize = 2;
-/// Ratio of the ends of successive pieces of a response, down to [`MIN_PIECE_INTERVALS`]. Halving the step on a piece
-/// costs as much as the whole response on the coarser grid.
+/// Ratio of the end times of successive pieces of a response. The shortest piece has [`MIN_PIECE_INTERVALS`]. With this
+/// ratio, halving the step on a piece costs as much as the whole response on the coarser grid.
 const PIECE_RATIO: usize = 8;
 const MIN_PIECE_INTERVALS: usize = 128;
 /// Pulses per interval of the grids that cover the whole response. The coarsest grid is not used for the first piece,
 /// where responses have jumps.
 const FULL_GRID_REFINEMENTS: [usize; 3] = [1, 2, 4];
 const FINEST_FULL_GRID: usize = 4;
-/// Ratio of the second to the first half of a response above which the model counts as unstable, so that the sum of
-/// responses loses digits.
+/// Ratio of the peaks in the second and the first half of a response. Above it the model counts as unstable, because
+/// the sum of responses would lose digits.
 const MAX_GROWTH_RATIO: f64 = 1e3;
 
 /// Samples of a simulation in the limit of zero step.
@@ -34,25 +34,27 @@ pub struct RefinedSamples {
     pub samples: OutputSamples,
     /// Pulses per sampling interval of the finest grid.
     pub refinement: usize,
-    /// Change of each output on halving the step, relative to its largest value; infinite before there are three grids.
+    /// Change of each output when the step was last halved, relative to the largest value of the output. It is infinite
+    /// with fewer than three grids.
     pub change: Vec<f64>,
 }
 
 /// Options of the step refinement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
-    /// Change of each output at which the refinement ends, relative to the largest value of the output.
+    /// Tolerance of the change of each output when the step is halved, relative to the largest value of the output. The
+    /// refinement ends at this change.
     pub tolerance: f64,
-    /// Largest number of pulses.
+    /// Maximum number of pulses.
     pub max_pulses: usize,
-    /// Smallest number of sampling intervals of a record that is simulated by superposition of responses.
+    /// Minimum number of sampling intervals. Longer records are simulated by superposition of responses.
     pub long_record_intervals: usize,
     /// Memory limit \[bytes\].
     pub memory: usize,
 }
 
 impl OutputSimulation {
-    /// Samples in the limit of zero step. The step is halved until this changes no output by more than the tolerance,
+    /// Return samples extrapolated to zero step. The step is halved until no output changes by more than the tolerance,
     /// or until the number of pulses reaches its maximum.
     ///
     /// # Errors

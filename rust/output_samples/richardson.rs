@@ -7,17 +7,17 @@ pub(super) type Rows = Vec<Vec<f64>>;
 /// from the next term of both. A slope discontinuity t^η adds powers in between, which these columns do not eliminate.
 /// No column increases such an error by more than a small factor.
 const ERROR_POWERS: [i32; 3] = [2, 3, 4];
-/// Smallest ratio of the reduction of a change on halving the step to 2^power, at which a column has the error of its
-/// power.
+/// Minimum ratio of a measured reduction to 2^power. The reduction is the factor by which a change shrinks when the
+/// step is halved. Above this ratio the error of a column is proportional to step^power.
 const MIN_POWER_RATIO: f64 = 0.5;
-/// Minimum reduction of the change on halving the step for an error of unknown power, slightly below the square root of
-/// two.
+/// Minimum factor by which the change must shrink when the step is halved, if the power of the error is unknown. It is
+/// slightly below the square root of two.
 const MIN_REDUCTION_FACTOR: f64 = 1.4;
 const MIN_EFFECTIVE_SAMPLES: f64 = 8.0;
 /// Number of grids that are needed to estimate a reduction factor and to test it.
 const RATIO_TEST_GRIDS: usize = 4;
 
-/// Change of each output from samples on a grid to those on the next, relative to its largest value.
+/// Function (finer rows, coarser rows) that returns the change of each output relative to its largest value.
 pub(super) type Measure<'a> = &'a dyn Fn(&Rows, &Rows) -> Vec<f64>;
 
 /// Largest absolute value; NaN if any value is.
@@ -25,7 +25,7 @@ pub(super) fn peak(row: &[f64]) -> f64 {
     row.iter().fold(0.0, |most: f64, v| if v.is_nan() || most.is_nan() { f64::NAN } else { most.max(v.abs()) })
 }
 
-/// Largest change of a row, relative to its largest value.
+/// Return the largest change of each row, relative to the largest absolute value of the new row.
 pub(super) fn relative_change(new: &Rows, old: &Rows) -> Vec<f64> {
     let of = |(change, new): (Vec<f64>, &Vec<f64>)| match peak(&change) {
         0.0 => 0.0,
@@ -190,7 +190,7 @@ fn remaining_change_ratios(older: &Rows, old: &Rows, new: &Rows) -> Option<Vec<f
     now.iter().zip(&before).map(of).collect()
 }
 
-/// Limit for zero step of samples, and of initial terms, on grids of 1, 1/2, 1/4, … of a step.
+/// Extrapolate samples and initial terms on grids with 1, 1/2, 1/4, … of a step to zero step.
 ///
 /// The estimate is a column of the Richardson table, or its extrapolation by Aitken's method. The choice has the
 /// smallest expected change on another halving of the step. None without grids.

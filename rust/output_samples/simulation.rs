@@ -250,7 +250,8 @@ impl OutputSimulation {
     /// Samples on a grid of `every` pulses per sampling interval; not finite if the model diverges there.
     ///
     /// # Errors
-    /// As [`Recording::pulses`], [`simulate::respond`], [`NonlinearSystem::run`].
+    /// Errors of [`Recording::pulses`] (invalid grid), [`simulate::respond`] (linear models) and
+    /// [`NonlinearSystem::run`] (other models).
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};
@@ -339,7 +340,7 @@ fn leading_gain(filter: &Filter, degree: f64) -> f64 {
     }
 }
 
-/// Integer part of the difference of the orders of a filter's denominator and numerator.
+/// Return the relative degree of a filter: order of the denominator minus order of the numerator, rounded down.
 fn relative_degree(filter: &Filter) -> f64 {
     let highest = |part: &[(f64, f64)]| part.iter().filter(|(c, _)| *c != 0.0).fold(0.0, |m: f64, t| m.max(t.1));
     (highest(&filter.denominator) - highest(&filter.numerator) + ORDER_TOLERANCE).trunc()
@@ -542,7 +543,8 @@ impl<'a> Grid<'a> {
         Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
     }
 
-    /// Part of the mean of the pulses on either side of each inner sample that occurs only after the sample, by output.
+    /// Return, for each inner sample of each output, the part of the pulse means that occurs after the sample. A sample
+    /// is the mean of the pulses before and after it, so this part must be subtracted.
     ///
     /// It is half of the response in the first pulse after a jump or a slope discontinuity of the inputs.
     ///

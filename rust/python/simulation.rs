@@ -291,8 +291,8 @@ impl OutputSimulation {
     }
 }
 
-/// Limit for zero step of samples on grids of 1, 1/2, 1/4, … of a step: samples, change of each output, and limits of
-/// the values that belong to the outputs `owners`.
+/// Extrapolate samples on grids with 1, 1/2, 1/4, … of a step to zero step. Return the samples, the change of each
+/// output, and the extrapolated additional values, where `owners` is the output of each additional value.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn richardson_limit<'py>(

@@ -145,7 +145,8 @@ impl Recordings {
     /// the free input parameters. Missing samples are interpolated.
     ///
     /// # Errors
-    /// As [`Recording::pulses`] and [`Recording::with_free_inputs`].
+    /// An invalid number of pulses or a signal that is too small ([`Recording::pulses`]); a wrong number of values in
+    /// `inputs` ([`Recording::with_free_inputs`]).
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role};

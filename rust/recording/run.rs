@@ -35,7 +35,7 @@ impl Sampling {
     /// Check that the numbers of pulses and the decimation are positive and not too large.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`].
+    /// [`Error::OutOfRange`] for a number that is zero or too large.
     ///
     /// ```
     /// # use ftlm::recording::Sampling;
@@ -118,7 +118,7 @@ impl Pulses {
     /// Record without initial state.
     ///
     /// # Errors
-    /// As [`Record::new`].
+    /// [`crate::error::Error::NotFinite`] for a pulse mean that is not finite, and an invalid step ([`Record::new`]).
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -136,7 +136,7 @@ impl Pulses {
     /// Record with the filter transients and initial levels, if there are any.
     ///
     /// # Errors
-    /// As [`Record::new`].
+    /// [`crate::error::Error::NotFinite`] for a pulse mean that is not finite, and an invalid step ([`Record::new`]).
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -212,7 +212,7 @@ impl Recording {
     /// Recording of other signals with the same sample times, sensor filter and initial state.
     ///
     /// # Errors
-    /// As [`Recording::new`].
+    /// Samples of unequal length, or a channel that is invalid ([`Recording::new`]).
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -245,7 +245,7 @@ impl Recording {
     /// Recording of uniform samples whose outputs are the channels of that role, in their sequence.
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// Samples of unequal length, or a channel that is invalid ([`Self::new`]).
     pub fn from_channels(step: f64, channels: Vec<Channel>) -> Result<Self> {
         let outputs = (0..channels.len()).filter(|&signal| channels[signal].role == Role::Output).collect();
         Self::new("run", step, None, channels, outputs)
@@ -260,7 +260,7 @@ impl Recording {
     /// Signal by its number.
     ///
     /// # Errors
-    /// [`Error::Structure`].
+    /// [`Error::Structure`] for a signal that the recording does not have.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -592,7 +592,8 @@ impl Recording {
     /// Free delays and limits are left to the fit. Weights of outputs are 1; missing samples have weight 0.
     ///
     /// # Errors
-    /// As [`Recording::pulses`], [`Recording::leading_part`] and [`Experiment::check`].
+    /// An invalid number of pulses ([`Recording::pulses`]), fewer than three samples ([`Recording::leading_part`]), or
+    /// weights that do not match the outputs ([`Experiment::check`]).
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role, Sampling};
@@ -650,7 +651,7 @@ impl Recording {
         }
     }
 
-    /// Recorded samples of each output at the times at which simulations are compared with the measurement. Missing
+    /// Samples of each output as recorded, at the times at which simulations are compared with the measurement. Missing
     /// samples are NaN.
     ///
     /// ```
@@ -684,7 +685,7 @@ impl Recording {
     /// interval. Missing samples are NaN.
     ///
     /// # Errors
-    /// As [`Recording::pulses`].
+    /// An invalid number of pulses, or a sample that is not finite ([`Recording::pulses`]).
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};

@@ -108,7 +108,7 @@ impl Plant {
     /// Arm at rest with zero current.
     ///
     /// # Errors
-    /// As [`Sensors::check`].
+    /// A scale, limit, noise or resolution of the sensors out of range ([`Sensors::check`]).
     pub fn new(arm: Arm, sensors: Sensors) -> Result<Self> {
         sensors.check()?;
         Ok(Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 })
@@ -233,7 +233,7 @@ impl Sensors {
     /// or a resolution of more bits than a float has.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`], [`Error::NotFinite`].
+    /// [`Error::OutOfRange`] for a value out of its range; [`Error::NotFinite`] for an offset that is not finite.
     pub fn check(&self) -> Result<()> {
         let pairs = [
             ("strain_scale", self.strain_scale),

@@ -508,7 +508,8 @@ impl<'a> Solver<'a> {
     /// Solver that owns its matrix.
     ///
     /// # Errors
-    /// As [`Solver::new`].
+    /// [`Error::LeadingZero`] if the matrix of leading coefficients is singular; [`Error::Length`] if the matrix is not
+    /// square or its series differ in length.
     pub fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Solver<'static>> {
         Solver::of(Cow::Owned(matrix))
     }
@@ -537,7 +538,7 @@ impl<'a> Solver<'a> {
     /// Solve for one right-hand side of n series of m terms. Shorter series are allowed if all have equal length.
     ///
     /// # Errors
-    /// [`Error::Length`].
+    /// [`Error::Length`] for a wrong number of series, or series of unequal or too large length.
     pub fn solve(&mut self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         check_length("right-hand sides", self.matrix.len(), rhs.len())?;
         let asked = rhs.first().map_or(0, Vec::len).min(self.division.terms());
@@ -553,7 +554,7 @@ impl<'a> Solver<'a> {
     /// Series of A⁻¹: `[j][i]` is the response of unknown j to a unit pulse in the error of equation i. n solutions.
     ///
     /// # Errors
-    /// As [`Solver::solve`].
+    /// [`Error::Length`] for series that do not match the matrix ([`Solver::solve`]).
     pub fn inverse(&mut self) -> Result<Vec<Vec<Vec<f64>>>> {
         let (m, n) = (self.division.terms(), self.matrix.len());
         let mut rows = vec![Vec::with_capacity(n); n];
@@ -570,7 +571,7 @@ impl<'a> Solver<'a> {
     /// Spectra of A⁻¹ for products of up to `total` terms in all factors together, see [`Solver::inverse`].
     ///
     /// # Errors
-    /// As [`Solver::solve`].
+    /// [`Error::Length`] for series that do not match the matrix ([`Solver::solve`]).
     pub fn inverse_spectra(&mut self, total: usize) -> Result<Vec<Vec<Kernel>>> {
         let spectra = |row: Vec<Vec<f64>>| row.iter().map(|series| Kernel::with_length(series, total)).collect();
         Ok(self.inverse()?.into_iter().map(spectra).collect())

@@ -91,7 +91,7 @@ pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
 /// If all signals pass this filter, their equation is unchanged.
 ///
 /// # Errors
-/// As [`Filter::series`].
+/// An order out of range, a value that is not finite, or an invalid step ([`Filter::series`]).
 pub fn low_pass(omega: f64, record: &Record) -> Result<Vec<f64>> {
     let numerator = vec![(omega * omega, 0.0)];
     let denominator = vec![(1.0, 2.0), (1.4 * omega, 1.0), (omega * omega, 0.0)];
@@ -101,7 +101,7 @@ pub fn low_pass(omega: f64, record: &Record) -> Result<Vec<f64>> {
 /// Series of the state-variable filter s^α/(s + λ)^⌈α⌉.
 ///
 /// # Errors
-/// As [`Filter::series`].
+/// An order out of range, a value that is not finite, or an invalid step ([`Filter::series`]).
 pub(super) fn state_variable_filter(pole: f64, order: f64, record: &Record) -> Result<Vec<f64>> {
     let n = order.ceil().max(1.0) as i32;
     let mut binomial = 1.0;
@@ -134,7 +134,8 @@ const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 /// Return a record with noise-free substitutes ([`project`]) for all signals except the inputs.
 ///
 /// # Errors
-/// As [`project`], [`Error::Interrupted`].
+/// [`Error::Structure`] without an input or for fewer than 8 pulses ([`project`]); [`Error::Interrupted`] after a stop
+/// request.
 pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &Stop) -> Result<Record> {
     let input_signals: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
     // One basis for all signals; none where all are inputs.

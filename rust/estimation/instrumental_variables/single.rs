@@ -268,7 +268,8 @@ fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Ve
 /// the number of iterations and whether they converged.
 ///
 /// # Errors
-/// As [`step`] and [`damped_inverse`].
+/// Instruments that do not identify the coefficients, or a stop request ([`step`]); a denominator with leading
+/// coefficient zero ([`damped_inverse`]).
 pub fn refine(
     sources: &[InstrumentSource<'_>],
     fixed: &[Option<f64>],

@@ -21,7 +21,7 @@ const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 /// clipped (Huber & Ronchetti, doi:10.1002/9780470434697, §7.6).
 ///
 /// # Errors
-/// As [`covariance_of_residuals`].
+/// A Jacobian that is not finite, or residuals of another length ([`covariance_of_residuals`]).
 pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<Vec<f64>> {
     let series: Vec<Vec<f64>> = grid.residuals(attempt).into_iter().flatten().collect();
     let shares = grid.weights.robust_weights.is_some().then(|| grid.flat_sample_weights());
@@ -32,7 +32,7 @@ pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<
 /// output.
 ///
 /// # Errors
-/// As [`covariance_of_residuals`].
+/// A Jacobian that is not finite, or residuals of another length ([`covariance_of_residuals`]).
 pub fn robust_covariance(jacobian: &[Vec<f64>], series: Vec<Vec<f64>>, shares: Option<&[f64]>) -> Result<Vec<f64>> {
     let squares = |series: &[Vec<f64>]| {
         let of = |e: &Vec<f64>| sum(&e.iter().map(|v| if v.is_nan() { 0.0 } else { v * v }).collect::<Vec<_>>());
@@ -204,7 +204,7 @@ fn widen_covariance(one: Vec<f64>, other: &[f64]) -> Vec<f64> {
 /// The weights act like autocovariances, so the sum over lags is a circular convolution. O(p² m + p m log m).
 ///
 /// # Errors
-/// [`Error::Length`].
+/// [`Error::Length`] if the residuals and the Jacobian differ in length.
 #[allow(clippy::cast_precision_loss)]
 pub fn long_run_covariance(jacobian: &[Vec<f64>], series: &[Vec<f64>]) -> Result<Vec<f64>> {
     let count = series.iter().map(Vec::len).sum();

@@ -173,7 +173,7 @@ impl<'a> Objective<'a> {
     /// Minimize the cost from an iterate by Levenberg–Marquardt.
     ///
     /// # Errors
-    /// As [`Problem::minimize`].
+    /// An initial guess whose simulation fails, or a stop request ([`Problem::minimize`]).
     pub fn minimize(&self, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
         let settings = MinimizationSettings { evaluations, tolerance: self.tolerance };
         self.problem.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
@@ -182,7 +182,7 @@ impl<'a> Objective<'a> {
     /// Minimize the cost in the coordinates of another problem (see `ParameterSet::problem_at`).
     ///
     /// # Errors
-    /// As [`Problem::minimize`].
+    /// An initial guess whose simulation fails, or a stop request ([`Problem::minimize`]).
     pub fn minimize_in(&self, turned: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
         let settings = MinimizationSettings { evaluations, tolerance: self.tolerance };
         turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
@@ -216,7 +216,7 @@ impl<'a> Objective<'a> {
     /// True if the simulated samples differ significantly from those on the given finer grid.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn is_refinement_significant(&self, place: &Iterate, finer: &Self) -> Result<bool> {
         let (Some(evaluation), Some(finer_evaluation)) = (self.evaluate(place)?, finer.evaluate(place)?) else {
             // The simulation is finite on one grid only: the difference is significant.
@@ -236,7 +236,7 @@ impl<'a> Objective<'a> {
     /// follow noise, but its simulation is not reproduced on any other grid.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn rank_results(&self, attempts: &[&OptimizationResult]) -> Result<Vec<usize>> {
         let worse = |attempt: &&OptimizationResult| {
             let evaluation = self.evaluate(&attempt.iterate)?;
@@ -257,7 +257,7 @@ impl<'a> Objective<'a> {
     /// Residuals and cost of an iterate, without derivatives; None if its simulation is not finite.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn evaluate(&self, place: &Iterate) -> Result<Option<OptimizationResult>> {
         match self.minimize(place, 0) {
             Ok(evaluation) => Ok(Some(evaluation)),

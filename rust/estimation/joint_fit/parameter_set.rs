@@ -46,7 +46,7 @@ impl ParameterSet {
     /// Parameter set of a structure.
     ///
     /// # Errors
-    /// As [`ParametricStructure::check`] and [`Problem::new`].
+    /// An invalid equation, signal or order ([`ParametricStructure::check`]), or crossed bounds ([`Problem::new`]).
     pub fn from_structure(structure: ParametricStructure) -> Result<Self> {
         structure.check()?;
         let named = structure.coefficient_names();
@@ -208,7 +208,7 @@ impl ParameterSet {
     /// Parameter set with other initial terms.
     ///
     /// # Errors
-    /// As [`ParameterSet::from_structure`].
+    /// An invalid equation, signal, order or bound ([`ParameterSet::from_structure`]).
     pub fn with_initial_terms(&self, initial: Initial, history: bool) -> Result<Self> {
         Self::from_structure(ParametricStructure { initial, history, ..self.structure.clone() })
     }

@@ -82,7 +82,7 @@ impl Problem {
     /// Convert the values of all free parameters to a point.
     ///
     /// # Errors
-    /// [`Error::Length`].
+    /// [`Error::Length`] for a number of values that differs from the number of free parameters.
     pub fn point(&self, values: &[f64]) -> Result<ParameterPoint> {
         check_length("values of what is free", self.size(), values.len())?;
         let (orders, rest) = values.split_at(self.model.order_bounds.len());
@@ -115,7 +115,8 @@ impl Problem {
     /// Minimize the cost by Levenberg–Marquardt. If `steady`, a stable model does not become unstable.
     ///
     /// # Errors
-    /// As [`fit_until`], with friction or non-linear terms [`nonlinear::fit`].
+    /// An initial guess whose simulation fails, a model that does not match the experiments, or a stop request
+    /// ([`fit_until`]; with friction or non-linear terms [`nonlinear::fit`]).
     pub fn minimize(
         &self,
         experiments: &[Experiment],
@@ -254,7 +255,7 @@ impl Problem {
     /// leave the straight line to `towards`. All constraints are affine, so the result is exact.
     ///
     /// # Errors
-    /// [`Error::Length`].
+    /// [`Error::Length`] for a number of values that differs from the number of free parameters.
     pub fn last_feasible_point(&self, at: &[f64], towards: &[f64]) -> Result<Vec<f64>> {
         check_length("values to go from", self.size(), at.len())?;
         check_length("values to go to", self.size(), towards.len())?;

@@ -43,7 +43,7 @@ impl<'a> FitProgress<'a> {
     /// count from zero repeatedly. Each count takes the fraction `sweep` of the rest of the phase.
     ///
     /// # Errors
-    /// As [`FitProgress::advance_to`].
+    /// The error that the callback returns ([`FitProgress::advance_to`]).
     #[allow(clippy::cast_precision_loss)]
     pub fn advance_within(&mut self, share: f64, sweep: f64, count: usize, of: usize) -> Result<()> {
         let fraction = count as f64 / of.max(1) as f64;

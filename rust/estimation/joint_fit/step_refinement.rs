@@ -64,7 +64,8 @@ pub struct OptimumStatistics {
 /// progress. Then the other survivors are optimized on the finer grid as well.
 ///
 /// # Errors
-/// As [`fit_reweighted`] and [`covariance`].
+/// A simulation that fails, residuals that overflow, or a stop request ([`fit_reweighted`]); a Jacobian that is not
+/// finite ([`covariance`]).
 pub fn refine_step<'a>(
     best: OptimizationResult,
     grid: Objective<'a>,
@@ -125,7 +126,8 @@ pub fn refine_step<'a>(
 /// estimate does not change (Stetter, doi:10.1007/BF01432879). The finer grids are simulated without derivatives.
 ///
 /// # Errors
-/// As [`covariance`] and the source; [`Error::Interrupted`].
+/// A Jacobian that is not finite ([`covariance`]); the errors of the experiments; [`Error::Interrupted`] after a stop
+/// request.
 pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: Loss) -> Result<Option<Optimum<'a>>> {
     let pulses: usize = grid.experiments().iter().map(|experiment| experiment.record.m()).sum();
     if pulses < MIN_CORRECTED_PULSES || !best.has_converged() {
@@ -201,7 +203,7 @@ impl<'a> Optimum<'a> {
     /// Optimum of a grid without refinement.
     ///
     /// # Errors
-    /// As [`covariance`].
+    /// A Jacobian that is not finite ([`covariance`]).
     pub fn without_refinement(attempt: OptimizationResult, grid: Objective<'a>) -> Result<Self> {
         let covariance = covariance(&attempt, &grid)?;
         Ok(Self { estimate: attempt.values(), step_converged: true, covariance, attempt, grid })
@@ -276,7 +278,7 @@ fn extrapolated_start(
 /// Unstable candidates are excluded if the objective requires stability.
 ///
 /// # Errors
-/// [`Error::Interrupted`].
+/// [`Error::Interrupted`] after a stop request.
 pub fn best_alternative<'a>(
     stuck: &OptimizationResult,
     grid: &Objective<'a>,

@@ -298,7 +298,7 @@ impl ParametricStructure {
     /// Return the structure with values for some free orders.
     ///
     /// # Errors
-    /// As [`ParametricStructure::check`].
+    /// [`Error::Structure`] for an order out of range ([`ParametricStructure::check`]).
     pub fn with_orders(&self, values: &BTreeMap<String, f64>) -> Result<Self> {
         let mut out = self.clone();
         for equation in &mut out.equations {

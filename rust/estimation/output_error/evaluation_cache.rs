@@ -113,7 +113,7 @@ impl EvaluationCache {
     /// Responses of `n` outputs to initial terms t^e, given as (equation, e) in `terms`, over at least `m` pulses.
     ///
     /// # Errors
-    /// As [`SystemInverse::initial_term_responses`].
+    /// [`crate::error::Error::Length`] for series that do not match the equations ([`SystemInverse::initial_term_responses`]).
     pub(crate) fn initial_term_responses(
         &self,
         solved: &SystemInverse,

@@ -52,7 +52,8 @@ impl Experiment {
     /// Experiment without a filter.
     ///
     /// # Errors
-    /// As [`Experiment::check`].
+    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
+    /// ([`Experiment::check`]).
     pub fn new(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Result<Self> {
         let experiment = Self::new_unchecked(record, every, samples, weights);
         experiment.check()?;
@@ -62,7 +63,8 @@ impl Experiment {
     /// Experiment with nonuniform sample times.
     ///
     /// # Errors
-    /// As [`Experiment::check`].
+    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
+    /// ([`Experiment::check`]).
     pub fn with_nonuniform_samples(
         record: Record,
         samples: Vec<Vec<f64>>,
@@ -92,7 +94,8 @@ impl Experiment {
     /// Set relative weights of the compared samples.
     ///
     /// # Errors
-    /// As [`Experiment::check`].
+    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
+    /// ([`Experiment::check`]).
     pub fn with_sample_weights(mut self, shares: Vec<Vec<f64>>) -> Result<Self> {
         self.sample_weights = shares;
         self.check()?;
@@ -121,7 +124,8 @@ impl Experiment {
     /// Set the sensor filter of the simulated outputs.
     ///
     /// # Errors
-    /// As [`Experiment::check`].
+    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
+    /// ([`Experiment::check`]).
     pub fn with_filter(mut self, series: Vec<f64>, applies: Vec<bool>) -> Result<Self> {
         self.filter = Some((series, applies));
         self.check()?;
@@ -131,7 +135,8 @@ impl Experiment {
     /// Set the values of the signals at the sample times.
     ///
     /// # Errors
-    /// As [`Experiment::check`].
+    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
+    /// ([`Experiment::check`]).
     pub fn with_point_values(mut self, instants: Vec<PointValues>) -> Result<Self> {
         self.point_values = instants;
         self.check()?;
@@ -191,7 +196,7 @@ impl Experiment {
     /// Equations and filter commute, so that filtering the inputs once replaces filtering every simulated output.
     ///
     /// # Errors
-    /// As [`Record::with_filter`].
+    /// [`Error::NotFinite`] if a filtered signal overflows ([`Record::with_filter`]).
     pub(crate) fn prefilter_signals(&self) -> Result<Option<Self>> {
         match &self.filter {
             Some((series, applies))

@@ -265,7 +265,7 @@ impl JumpCorrection {
     /// Correct the derivative of weighted samples with respect to a parameter.
     ///
     /// # Errors
-    /// As [`JumpCorrection::correct`].
+    /// [`crate::error::Error::LeadingZero`] if the scheme is singular ([`JumpCorrection::correct`]).
     pub(crate) fn correct_slope(
         &self,
         model: &FreeModel,

@@ -317,7 +317,7 @@ pub fn fit(
 /// inputs. The stability of coupled equations is not checked.
 ///
 /// # Errors
-/// As [`fit`].
+/// An initial guess whose simulation is not finite, or a model that does not match the experiments ([`fit`]).
 pub fn fit_stable(
     model: &FreeModel,
     experiments: &[Experiment],
@@ -330,7 +330,8 @@ pub fn fit_stable(
 /// Fit a model as [`fit`], or as [`fit_stable`] if `steady`, with a cancellation flag.
 ///
 /// # Errors
-/// As [`fit`]; [`Error::Interrupted`].
+/// An initial guess whose simulation is not finite, or a model that does not match the experiments ([`fit`]);
+/// [`Error::Interrupted`] after a stop request.
 pub fn fit_until(
     model: &FreeModel,
     experiments: &[Experiment],

@@ -145,7 +145,7 @@ impl SystemInverse {
     /// Inverse of a matrix A of series.
     ///
     /// # Errors
-    /// As [`Solver::new`].
+    /// A singular matrix of leading coefficients, or series of unequal length ([`Solver::new`]).
     pub(crate) fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
         let solver = Some(RefCell::new(Solver::from_matrix(matrix)?));
         Ok(Self { solver, inverse: OnceCell::new(), initial_responses: RefCell::default() })
@@ -159,7 +159,7 @@ impl SystemInverse {
     /// Solve by division, exact also if A⁻¹ is unstable; None with running sums.
     ///
     /// # Errors
-    /// As [`Solver::solve`].
+    /// Series that do not match the matrix ([`Solver::solve`]).
     pub(crate) fn solve_by_division(&self, rhs: &[Vec<f64>]) -> Result<Option<PulseMeans>> {
         self.solver.as_ref().map(|solver| solver.borrow_mut().solve(rhs)).transpose()
     }
@@ -167,7 +167,7 @@ impl SystemInverse {
     /// Inverse A⁻¹, with spectra for products of [`SPECTRUM_FACTORS`] series of the longest run.
     ///
     /// # Errors
-    /// As [`Solver::solve`].
+    /// Series that do not match the matrix ([`Solver::solve`]).
     pub(crate) fn inverse(&self) -> Result<&Inverse> {
         if let (None, Some(solver)) = (self.inverse.get(), &self.solver) {
             let mut solver = solver.borrow_mut();
@@ -181,7 +181,7 @@ impl SystemInverse {
     /// Responses to the initial terms t^e of equations, m pulses of n outputs; cached if `keep`.
     ///
     /// # Errors
-    /// As [`Solver::solve`].
+    /// Series that do not match the matrix ([`Solver::solve`]).
     pub(crate) fn initial_term_responses(
         &self,
         (n, m): (usize, usize),

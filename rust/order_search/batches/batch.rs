@@ -23,7 +23,7 @@ const GRAM_CHUNK_CANDIDATES: u64 = 1 << 13;
 /// Number of slices on which boxes are tried if candidates are hard to exclude. Boxes must exclude at least one in
 /// [`MAX_CANDIDATES_PER_EXCLUSION`] candidates. Boxes that exclude nothing make a search 50 % longer.
 const TRIAL_SLICES: u64 = 32;
-/// Largest number of candidates per excluded candidate for which boxes are worthwhile.
+/// Maximum number of candidates per candidate that boxes exclude. Above it boxes cost more time than they save.
 const MAX_CANDIDATES_PER_EXCLUSION: u64 = 8;
 /// Initial and largest number of candidates simulated between two updates of the limit.
 const SIMULATION_CHUNK_RANGE: (u64, u64) = (256, 16_384);

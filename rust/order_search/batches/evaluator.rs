@@ -88,7 +88,7 @@ impl<'a> BatchEvaluator<'a> {
     /// Build the data shared by all batches: regressors, their products, test vectors and an initial limit.
     ///
     /// # Errors
-    /// As [`search`].
+    /// An option out of range, signals that the records lack, too little memory, or a stop request ([`search`]).
     pub fn new(
         records: &[Record],
         lattice: Cow<'a, OrderGrid>,
@@ -308,7 +308,7 @@ const BATCH_SIZE_SIMULATED: u64 = 1 << 12;
 /// Minimum number of candidates for branch and bound. Batches then grow with the grid up to [`MAX_BATCH_SIZE`], because
 /// tables of boxes shared by two batches are computed twice.
 pub(super) const MIN_BOX_CANDIDATES: u64 = 1 << 25;
-/// Largest number of candidates per batch.
+/// Maximum number of candidates per batch.
 const MAX_BATCH_SIZE: u64 = 1 << 22;
 /// Minimum number of candidates for the close bounds (unstable zeros and linearized test vectors), if candidates are
 /// ranked by simulation. A smaller search ends before these bounds are built.

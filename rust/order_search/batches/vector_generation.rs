@@ -31,9 +31,10 @@ const MAX_TRIAL_VECTORS: usize = 32;
 const MAX_SELECTED_VECTORS: usize = 12;
 /// Maximum number of passes.
 const MAX_GENERATION_PASSES: u64 = 4;
-/// Smallest number of open candidates for another pass. One pass costs as much as simulating this many candidates.
+/// Minimum number of candidates not yet excluded for another pass. One pass costs as much time as simulating this many
+/// candidates.
 const MIN_OPEN_CANDIDATES: f64 = 16_384.0;
-/// Smallest number of exclusions that make a vector worthwhile.
+/// Minimum number of candidates that a test vector must exclude to be kept.
 const MIN_VECTOR_EXCLUSIONS: f64 = 512.0;
 const SELECTION_BIAS_FACTOR: usize = 4;
 /// Maximum memory of test vectors, including those on trial \[bytes\].

@@ -19,8 +19,8 @@ pub(super) type VectorProducts = [Wide; 4];
 /// Largest values and second differences over an interval of 2^l values of an order.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
-    /// Largest second differences along the axis of ⟨t, û⟩ and g‖t‖, where t is a test vector, û the normalized column
-    /// of this order, and g a bound of its rounding error.
+    /// Largest second differences of ⟨t, û⟩ and of g‖t‖ along the axis. Here t is a test vector, û the normalized
+    /// column of this order, and g the projection of Fᵀt on t.
     pub(super) second_differences: [Wide; 4],
 }
 

@@ -270,7 +270,8 @@ pub struct BoxBound {
 /// other order varies.
 ///
 /// # Errors
-/// As [`crate::order_search::batches::search`].
+/// An option out of range, signals that the records lack, or too little memory
+/// ([`crate::order_search::batches::search`]).
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -322,7 +323,8 @@ pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, in
 /// at most `limit`. Empty if [`box_bounds`] is empty.
 ///
 /// # Errors
-/// As [`crate::order_search::batches::search`].
+/// An option out of range, signals that the records lack, or too little memory
+/// ([`crate::order_search::batches::search`]).
 pub fn open_candidates(
     records: &[Record],
     lattice: &OrderGrid,

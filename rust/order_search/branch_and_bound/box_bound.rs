@@ -18,8 +18,8 @@ use crate::order_search::dual_bound::test_vectors::NO_INDEX;
 use crate::order_search::options::Norm;
 use crate::simd::LANE_COUNT;
 
-/// Rounding-error bound of coefficients per unit of the trace of an inverse correlation matrix and of the squared
-/// number of terms. It is far above the error of the elimination.
+/// Factor of the rounding-error bound of coefficients. The bound is this factor times the trace of the inverse
+/// correlation matrix times the squared number of terms. It is far above the error of the elimination.
 const ELIMINATION_ERROR: f64 = 16.0 * f64::EPSILON;
 
 /// Value of 1 − B² at or below which û and v̂ are numerically collinear.
@@ -134,10 +134,11 @@ pub(super) struct BoxQuantities {
     pub(super) most: [f64; 2],
     /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions.
     pub(super) bilinear_deviation: [f64; 2],
-    /// Sums of the moduli of the coefficients of s and st in p, and of t and st in q. They bound the curvature of a
-    /// product with a linear function of s or t.
+    /// Two sums of moduli: coefficients of s and st in the bilinear form of p, and coefficients of t and st in the form
+    /// of q. They bound the curvature of p times a linear function of s, and of q times a linear function of t.
     pub(super) mixed_slopes: [f64; 2],
-    /// Largest part of ‖y‖² explained by û and v̂, if candidates are ranked by equation error.
+    /// Upper bound over the box of the part of ‖y‖² that û and v̂ explain. Computed only if candidates are
+    /// ranked by equation error.
     pub(super) explained: f64,
     /// Sum of the moduli of output and coefficients.
     pub(super) all: f64,
@@ -164,7 +165,8 @@ impl BoxQuantities {
 pub(super) struct Moduli {
     others: [[f64; 4]; MAX_REMAINING_COLUMNS],
     rests: [f64; MAX_REMAINING_COLUMNS],
-    /// Sum at the corners of the coefficients on the partner and on the varying column of the output, which may cancel.
+    /// Sum of two coefficients at each corner: of the remaining output column `partner`, and of the varying output
+    /// column. The two may cancel.
     sums: [f64; 4],
     sums_rest: f64,
 }
@@ -185,13 +187,13 @@ pub(super) struct SliceTables<'a> {
     pub(super) common: &'a SearchConstants,
     /// The order that changes from row to row, and the order along a row.
     pub(super) sides: [AxisTable; 2],
-    /// Index of the side whose order is that of an output term, if any.
+    /// Index of the side that varies the order of an output term, if there is one.
     own: Option<usize>,
     /// Coefficients of the output on the remaining columns.
     pub(super) base_coefficients: Vec<f64>,
     /// Sum of squares of the output's residual after projection on the remaining columns.
     unexplained: f64,
-    /// Products ⟨t, y⟩ and ‖t‖ of that residual y, by group.
+    /// Products ⟨t, y⟩ of test vectors t with this residual y, and norms ‖t‖, by group.
     base: Vec<VectorProducts>,
     /// Norms ‖Fᵀt − g t‖ of the remaining columns, k per group.
     rests: Vec<Wide>,
@@ -333,7 +335,8 @@ impl<'a> SliceTables<'a> {
         })
     }
 
-    /// Lower bound of the raw scores of all candidates of a box. The sum stops once it exceeds the limit.
+    /// Return a lower bound of the raw score that holds for every candidate of a box. The sum over records stops once
+    /// it exceeds the limit.
     #[inline(always)]
     pub(super) fn bound(&self, both: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
         if self.common.ranks_equation_error {
@@ -439,7 +442,8 @@ impl<'a> SliceTables<'a> {
         Moduli { others, rests, sums, sums_rest }
     }
 
-    /// Remaining column of the output, whose coefficient may cancel that of the varying column of the output.
+    /// Return the index of the remaining output column if a varying column also belongs to the output. The coefficients
+    /// of the two columns may cancel.
     #[inline(always)]
     fn partner(&self) -> Option<usize> {
         self.others.partner.filter(|_| self.own.is_some())
@@ -470,7 +474,7 @@ impl<'a> SliceTables<'a> {
         (joint < apart).then_some(partner)
     }
 
-    /// Products of a group of test vectors of one record at the corners of a box.
+    /// Return the products with one group of test vectors on one record, at the corners of a box.
     #[inline(always)]
     pub(super) fn corner_values(
         &self,

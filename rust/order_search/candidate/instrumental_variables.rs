@@ -59,8 +59,8 @@ impl Refiner {
         Self { spectra, settings }
     }
 
-    /// Refine coefficients in place: those of the terms, then those of the initial terms by record. The result is
-    /// invalid after a stop request.
+    /// Refine coefficients in place. The coefficients of the terms come first, then the coefficients of the initial
+    /// terms of each record. The result is invalid after a stop request.
     pub(crate) fn refine(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -105,7 +105,8 @@ impl Refiner {
 /// Bank and target for the initial coefficients: noise-free signals, low-pass filtered.
 ///
 /// # Errors
-/// As [`Bank::new_interruptible`].
+/// [`Error::Structure`] for a signal that the record lacks; [`Error::Interrupted`] after a stop request
+/// ([`Bank::new_interruptible`]).
 pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
     let band = START_BAND * power_frequency(record.signal(output), record.step());
     let smooth = record.clean_record().with_filter(&low_pass(band, record)?)?;

@@ -14,8 +14,8 @@ use crate::regressors::Record;
 
 /// Width of the largest cells. A bound over wider cells rarely proves anything.
 const MAX_CELL_WIDTH: f64 = 0.1;
-/// Maximum bisection level of an interval with tables of its own. Deeper cells, up to [`MAX_CELL_LEVEL`], use
-/// expansions about the midpoints of the tables.
+/// Maximum bisection level for which tables are stored. Deeper cells, up to [`MAX_CELL_LEVEL`], use expansions about
+/// the midpoints of stored tables.
 const MAX_TABLE_LEVEL: u8 = 3;
 pub(super) const MAX_CELL_LEVEL: u8 = 10;
 /// Pairs of derivatives with tabulated products, in the order of [`pair_position`].
@@ -326,8 +326,8 @@ pub struct Region {
     pub alpha: (f64, f64),
     /// Intervals of the terms' orders, none above the order of the equation.
     pub terms: Vec<Range>,
-    /// Minimum distance of the orders of the output terms from the order of the equation, and of two orders of one
-    /// signal. At distance 0 the equation would be an identity, or two terms would coincide.
+    /// Minimum difference between the order of an output term and the order of the equation, and between two orders of
+    /// one signal. At difference 0 the equation would be an identity, or two terms would coincide.
     pub min_separation: f64,
 }
 
@@ -397,7 +397,8 @@ impl Region {
         (low <= high + ORDER_TOLERANCE).then_some((low, high))
     }
 
-    /// Orders of the equation and of its terms for these orders of integration.
+    /// Return (order of the equation, orders of its terms) for the integration orders `etas`; None if no order
+    /// of the equation in the region allows them.
     pub(super) fn orders(&self, etas: &[f64]) -> Option<(f64, Vec<f64>)> {
         let points: Vec<(f64, f64)> = etas.iter().map(|&eta| (eta, eta)).collect();
         let (low, high) = self.alpha_interval(&points)?;

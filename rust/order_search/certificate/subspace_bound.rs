@@ -28,7 +28,7 @@ pub(super) struct DerivativeSubspace {
     target: [f64; MAX_BASIS_ROWS],
     /// Bound of the omitted Taylor terms of a unit column.
     max_omitted_norm: f64,
-    /// Least norm of a unit column within the cell.
+    /// Minimum norm within the cell of a column that has norm 1 at the midpoint.
     min_column_norm: f64,
     /// Rounding-error bound of a product of two unit columns.
     rounding: f64,
@@ -78,8 +78,8 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Lower bound of the relative squared residual over the cell, 0 without a proof. It holds for coefficients whose
-    /// terms have a sum of norms of at most `largest` times the norm of the output. The ridge is tuned for `goal`.
+    /// Return a lower bound of the relative squared residual over the cell, 0 without a proof. It holds for all
+    /// coefficients c with Σ‖c x‖ ≤ `largest`·‖y‖. The ridge parameter is tuned to reach the bound `goal`.
     pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
         if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || goal.is_nan() {
             return 0.0;

@@ -20,8 +20,8 @@ use crate::simd;
 
 /// Maximum number of output terms of a candidate.
 pub(crate) const MAX_OWN_TERMS: usize = 4;
-/// Largest ratio of error to limit for which a vector is built. For a candidate with a larger error the vector covers
-/// the first samples only. Their error is a lower bound of the error of all samples.
+/// Maximum ratio of error to limit on the samples that a vector covers. For a candidate with a larger error the vector
+/// covers only the first samples. The error on these samples is a lower bound of the error on all samples.
 const MAX_ERROR_LIMIT_RATIO: f64 = 4.0;
 /// Magnitude below which products of two values do not overflow.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
@@ -93,7 +93,7 @@ pub(crate) struct LinearizedVector {
     /// Largest magnitude of each first-order correction vector v_m of the test vector.
     peak_values: Vec<f64>,
     solution_residuals: Vec<f64>,
-    /// Upper bound of Σ|g_m| of the series of G_m and of its components, times the largest norm.
+    /// Upper bounds of Σ|g_m| for the series G_m and for each of its components, times the largest norm.
     series_norms: Vec<f64>,
     /// Norms ‖G_nᵀv_m + G_mᵀv_n‖ for n < m and ‖G_mᵀv_m‖, packed by rows.
     second_order_norms: Vec<f64>,
@@ -105,7 +105,7 @@ pub(crate) struct LinearizedVector {
     products: Vec<f64>,
 }
 
-/// Set of linearized test vectors of a search, by the output columns of their candidates.
+/// All linearized test vectors of a search. They are found by the output columns of a candidate.
 pub(crate) struct LinearizedVectors {
     rounding_bounds: RoundingBounds,
     /// Index among the input columns, [`NO_INDEX`] for an output column.

@@ -236,7 +236,7 @@ impl Bound {
         (bound, guess)
     }
 
-    /// Whether no coefficients of these columns give a raw score of at most `limit`.
+    /// True if it is proved that no coefficients of the columns `terms` give a raw score of at most `limit`.
     ///
     /// The slice `fixed` holds the fixed coefficients of the terms. All others, and those of the initial terms, are
     /// free. `start` is the initial guess: coefficients of the terms, then of the initial terms by record.

@@ -355,7 +355,7 @@ pub(super) struct RoundingBounds {
     /// Rounding-error bound of |⟨t, w⟩| per unit of the coefficient of each column, if |t| ≤ 1.
     pub(super) rounding: Vec<f64>,
     pub(super) target_rounding: f64,
-    /// Sum of the moduli of the kernel of an output column, times the largest dual norm, 0 for any other column.
+    /// For each output column, the sum of its kernel's moduli times the largest dual norm. Zero for other columns.
     pub(super) kernel_norms: Vec<f64>,
     /// Largest dual norm of a vector whose values are at most 1 in modulus.
     pub(super) max_dual_norm: f64,

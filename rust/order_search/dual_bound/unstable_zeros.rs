@@ -81,7 +81,7 @@ struct PathSums {
     samples: f64,
     /// Real and imaginary part by column and node, and by segment a bound from the second derivative and rounding.
     values: Vec<[[f64; PADDED_NODE_COUNT]; 3]>,
-    /// Largest |z^M| of each segment, for M samples.
+    /// Maximum of |z^M| on each segment, where M is the number of samples.
     tails: Vec<[f64; PATH_SEGMENT_COUNT]>,
     /// Sum of the moduli of each column; for an output column, of its kernel.
     sums: Vec<f64>,
@@ -189,8 +189,8 @@ impl PathSums {
         }
     }
 
-    /// Number of zeros of D, or of N, inside a path, from the winding number of the values along it. `None` if the
-    /// values, or N reduced by its truncation bound, may be 0 on the path.
+    /// Return the number of zeros of D, or of N, inside a path. It is the winding number of the values along the path.
+    /// `None` if a value, or |N| minus its truncation bound, may be 0 on the path.
     #[inline(always)]
     fn count_zeros(
         &self,

@@ -370,7 +370,7 @@ impl SearchState {
 /// Search the free orders that minimize the sum of score / scale over the equations.
 ///
 /// # Errors
-/// As [`Stage::new`].
+/// An invalid option, scale or record, or no tuple of orders that satisfies the law ([`Stage::new`]).
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;

@@ -24,18 +24,19 @@ use crate::order_search::result::Failure;
 /// Row of one half of the join: values of the free orders of this half, and the addend of the other half.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct HalfRow {
-    /// Bucket number, from the two addends that the row shares with rows of the other half.
+    /// Number of the hash bucket. It is computed from the two addends that the row has in common with matching rows of
+    /// the other half.
     bucket: u64,
-    /// Contribution of its own free orders to the index of a tuple.
+    /// Contribution of this half's free orders to the index of a tuple.
     pub(super) index: u64,
-    /// Number of the combination of candidates of its equations.
+    /// Index of the combination of candidates of this half's equations.
     pub(super) combination: u32,
 }
 
 /// One half of the join.
 pub(super) struct Half {
     pub(super) equations: Range<usize>,
-    /// Number of the candidate of each equation, for one combination after another.
+    /// Candidate index of each equation, one combination after another.
     combinations: Vec<u32>,
     pub(super) rows: Vec<HalfRow>,
 }
@@ -448,10 +449,11 @@ impl OrderLawSums {
         Self { constants, weights, equations }
     }
 
-    /// Distinct contributions of these free orders to the laws. `None` if there are more than the limit.
+    /// Return the distinct contributions of the free orders `axes` to the order laws of these equations. `None` if
+    /// there are more than `limit`.
     ///
     /// # Errors
-    /// [`crate::error::Error::Interrupted`].
+    /// [`crate::error::Error::Interrupted`] after a stop request.
     pub(super) fn distinct_sums(
         &self,
         lattice: &OrderLawGrid,
@@ -481,8 +483,9 @@ impl OrderLawSums {
         Ok(Some(distinct))
     }
 
-    /// Call `take` for every choice of these free orders. Its arguments are the contribution to the index of a tuple,
-    /// the sums in these laws including constants, and the sums in the other laws without constants.
+    /// Call `take(index, sums, other_sums)` for every combination of values of the free orders `axes`. `index` is the
+    /// contribution to the index of a tuple. `sums` are the values of the order laws of these equations, with
+    /// constants. `other_sums` are the contributions to the order laws of `others`, without constants.
     ///
     /// # Errors
     /// The first error of `take`.
@@ -518,7 +521,7 @@ impl OrderLawSums {
         }
     }
 
-    /// Compute the orders of these equations from their own sums and an addend. Return true if they are valid.
+    /// Compute the orders of these equations as `sums` + `addend`. Return true if all orders are valid.
     pub(super) fn orders(&self, lattice: &OrderLawGrid, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
         orders.clear();
         orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));

@@ -34,7 +34,8 @@ const MAX_START_PULSES_PER_SAMPLE: usize = 4;
 /// Run the multistart of a problem with non-linear terms; return the candidates best first.
 ///
 /// # Errors
-/// As [`run_multistart`]; [`crate::error::Error::Interrupted`].
+/// The errors of the experiments, initial guesses and callback ([`run_multistart`]);
+/// [`crate::error::Error::Interrupted`] after a stop request.
 pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     let linear = ParameterSet::from_structure(ParametricStructure { derived: Vec::new(), ..structure.clone() })?;

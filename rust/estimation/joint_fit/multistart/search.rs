@@ -38,7 +38,7 @@ pub trait InitialGuessSource {
     /// Optima of a problem of integer orders on the samples of a grid; None for other problems.
     ///
     /// # Errors
-    /// As [`InitialGuessSource::initial_guesses`].
+    /// Equations that cannot be searched, or a stop request ([`InitialGuessSource::initial_guesses`]).
     fn integer_order_optima(&self, _free: &ParameterSet, _grid: &Objective<'_>) -> Result<Option<Vec<Candidate>>> {
         Ok(None)
     }

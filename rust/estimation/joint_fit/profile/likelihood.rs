@@ -92,7 +92,7 @@ impl<'a> ProfileLikelihood<'a> {
     /// Profile likelihood around the optimum that is found from the fit with at most `evaluations` evaluations.
     ///
     /// # Errors
-    /// As [`Objective::minimize`].
+    /// A simulation that fails at the first point, or a stop request ([`Objective::minimize`]).
     pub fn new(
         sources: (&'a ParameterSet, &'a Recordings, &'a Stop),
         fit: &FitState,
@@ -136,7 +136,7 @@ impl<'a> ProfileLikelihood<'a> {
     /// Profile likelihood around the optimum reached from another point.
     ///
     /// # Errors
-    /// As [`Objective::minimize`].
+    /// A simulation that fails at the first point, or a stop request ([`Objective::minimize`]).
     pub fn moved_to(&self, values: &[f64]) -> Result<Self> {
         let likelihood = Self::at(self.free, self.grid.clone(), values, MAX_REFIT_EVALUATIONS)?;
         Ok(Self { on_grid: self.on_grid.clone(), ..likelihood })
@@ -196,7 +196,7 @@ impl<'a> ProfileLikelihood<'a> {
     /// Both are evaluated there and not refitted, because a refit could exploit the discretization error of that grid.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn is_lower_on_finer_grid(&self) -> Result<bool> {
         let cost = |grid: &Objective<'a>, values: &[f64]| -> Result<f64> {
             Ok(minimize(self.free, grid, values, &[], (0, RELATIVE_COST_TOLERANCE))?.cost)
@@ -212,7 +212,7 @@ impl<'a> ProfileLikelihood<'a> {
     /// if a bound violates a constraint or its simulation is not finite.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn nonlinearity(&self, i: usize, width: f64) -> Result<f64> {
         if !self.is_identifiable(i) {
             return Ok(0.0);
@@ -239,7 +239,7 @@ impl<'a> ProfileLikelihood<'a> {
     /// Refit all other parameters at a value of one, from a nearby optimum.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn refit(&self, i: usize, value: f64, near: &OptimizationResult, evaluations: usize) -> Result<Refit> {
         let (rise, least) = (self.units[i], 2.0 * self.cost());
         let tolerance = REFIT_TOLERANCE * rise / least.max(rise);
@@ -338,7 +338,7 @@ impl<'a> CostSurface<'a> {
     /// Surface around the optimum of the finest grid. With `refit`, all other parameters follow by one linear step.
     ///
     /// # Errors
-    /// As [`Objective::minimize`].
+    /// A simulation that fails at the first point, or a stop request ([`Objective::minimize`]).
     pub fn new(
         (free, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
         fit: &FitState,
@@ -379,7 +379,7 @@ impl<'a> CostSurface<'a> {
     /// Sum of squares at each pair of values, rows of the second; infinite if the simulation is not finite.
     ///
     /// # Errors
-    /// [`Error::Interrupted`].
+    /// [`Error::Interrupted`] after a stop request.
     pub fn scores(&self, first: &[f64], second: &[f64]) -> Result<Vec<f64>> {
         let mut scores = Vec::with_capacity(first.len() * second.len());
         for y in second {
