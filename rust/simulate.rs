@@ -336,7 +336,8 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
     Ok(out)
 }
 
-/// Output error Σ|y − ŷ| (45) for each row of coefficients of one structure, with zero initial conditions.
+/// Output error Σ|y − ŷ|, (45) of the paper, for each row of coefficients of one structure. Initial conditions are
+/// zero.
 ///
 /// It shows the convergence of a recursion. Regressors are computed once; each row costs one division.
 ///

@@ -36,9 +36,9 @@ pub struct InputSignal {
     pub before: f64,
 }
 
-/// Largest number n of states. A step costs O(n²).
+/// Maximum number n of states. A step costs O(n²).
 const MAX_STATES: usize = 128;
-/// Largest condition number of the matrix of direct terms. Above it the orders of the system depend on a cancellation.
+/// Maximum condition number of the matrix of direct terms. Above it the orders of the system depend on a cancellation.
 const MAX_CONDITION: f64 = 1e10;
 /// Tolerance at which a delay d in sampling intervals counts as an integer, relative to max(1, d).
 const DELAY_TOLERANCE: f64 = 1e-9;
@@ -46,7 +46,7 @@ const DELAY_TOLERANCE: f64 = 1e-9;
 const BLOCK_ROWS: usize = 1 << 10;
 /// Magnitude below which a state is set to 0 at the next block, because arithmetic below 1e−308 is slow.
 const SMALLEST_STATE: f64 = 1e-290;
-/// Number of terms of the Taylor series of φ₂ for a norm of at most 1/2.
+/// Number of Taylor terms of φ₂(A) for ‖A‖ ≤ 1/2.
 const TAYLOR_TERMS: i32 = 15;
 
 /// Samples of the outputs of equations with integer orders, concatenated: `rows` samples for each equation.
@@ -331,8 +331,8 @@ pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
     Some(growth)
 }
 
-/// Gains on the states after one interval: of the value of an input at the start of the interval, and of its next
-/// value.
+/// Effect of an input on the states after one interval. `now` is the gain of the input's value at the start of the
+/// interval, `later` the gain of its next value.
 pub(crate) struct InputGains {
     pub(crate) now: Vec<f64>,
     pub(crate) later: Vec<f64>,
@@ -449,7 +449,7 @@ impl Channel<'_> {
     }
 }
 
-/// Add the effect of an input with these gains on each of the `n` states to a block of rows.
+/// Add gain × input value to each of the `n` states, for every row of a block.
 #[inline(always)]
 fn add_forcing(n: usize, gains: &[f64], values: &[f64], forcing: &mut [f64]) {
     let gains = &gains[..n];

@@ -29,7 +29,7 @@ pub struct Regression {
     pub columns: Vec<Vec<f64>>,
     /// y minus the terms with fixed coefficients.
     pub target: Vec<f64>,
-    /// Index of the first row of each record, then the number of rows.
+    /// Index of each record's first row, then the total number of rows.
     pub starts: Vec<usize>,
     exponents: Vec<f64>,
     fixed: Vec<Option<f64>>,

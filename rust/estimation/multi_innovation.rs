@@ -27,7 +27,7 @@ pub enum RowBasis {
 pub enum Prior {
     /// Covariance of every coefficient.
     Absolute(f64),
-    /// Covariance of a coefficient times the sum of squares of its column. It does not depend on units.
+    /// Prior covariance of a coefficient times the sum of squares of its column. It does not depend on units.
     Relative(f64),
 }
 
@@ -35,7 +35,7 @@ impl Prior {
     /// Prior that changes coefficients only where the data hardly determine them.
     pub const WEAK: Self = Self::Relative(1e10);
 
-    /// Inverse covariance of the coefficient of a column with this sum of squares.
+    /// Return the inverse prior covariance of the coefficient of a column whose sum of squares is given.
     #[must_use]
     pub fn precision(self, squares: f64) -> f64 {
         match self {
@@ -44,7 +44,7 @@ impl Prior {
         }
     }
 
-    /// Inverse covariances of the coefficients of these columns.
+    /// Return the inverse prior covariance of each column's coefficient.
     fn precisions(self, columns: &[Vec<f64>]) -> Vec<f64> {
         columns.iter().map(|column| self.precision(column.iter().map(|v| v * v).sum())).collect()
     }
@@ -182,7 +182,8 @@ fn weighted_rows(
     (columns, target)
 }
 
-/// Multi-innovation estimate (44) of m = Q X, from X₀ = 0 with a prior covariance of each coefficient, in closed form.
+/// Multi-innovation estimate of X in m = Q X in closed form, (44) of the paper. It starts from X₀ = 0 with a prior
+/// covariance of each coefficient.
 ///
 /// `columns` are those of Q. O(M k²).
 ///
@@ -209,7 +210,7 @@ pub fn estimate(
     Ok(weighted_solution((columns, target, &starts), length, &prior, columns.len())?.0)
 }
 
-/// Coefficients after every step of the recursion (44) on m = Q X, as in [`estimate`], step by step. O(M k³).
+/// Coefficients after every step of the paper's recursion (44) on m = Q X. The last ones equal [`estimate`]. O(M k³).
 ///
 /// # Errors
 /// As [`estimate`], and [`Error::Diverged`] if rounding makes the covariance indefinite.
@@ -269,7 +270,7 @@ fn check_problem(
     Ok(prior_covariance.iter().map(|covariance| 1.0 / covariance).collect())
 }
 
-/// Run the recursion (44) from X₀ = 0; return the last estimate and the coefficients after every step.
+/// Run the paper's recursion (44) from X₀ = 0. Return the last estimate and the coefficients after every step.
 ///
 /// The steps run through the records in sequence. An innovation never spans two records. O(k³) per step.
 ///

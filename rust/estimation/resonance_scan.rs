@@ -150,7 +150,8 @@ fn fit_point(
     Ok(Some(FixedPoleEstimate { error: missed / size, coefficients }))
 }
 
-/// Coefficients of the columns with initial terms of each record, and the norm of the residuals; None if singular.
+/// Fit the coefficients of the columns together with initial terms of each record. Return them and the norm of the
+/// residuals; None if the regressors are linearly dependent.
 fn solve_with_initial_terms(
     columns: Vec<Vec<f64>>,
     target: Vec<f64>,

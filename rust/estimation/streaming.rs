@@ -120,7 +120,7 @@ struct EquationRecursion {
     recursion: Recursion,
     /// Gram matrix of the p newest rows.
     window: SlidingGram,
-    /// Values at the newest pulse of the integrals of the output and of the signals of the terms.
+    /// Fractional integrals at the newest pulse: of the output, then of each term's signal.
     values: Vec<f64>,
     /// Newest row.
     row: Vec<f64>,
@@ -161,7 +161,7 @@ impl StreamingOptions {
     }
 }
 
-/// Multi-innovation recursion (44) of several equations on one stream of samples.
+/// Multi-innovation recursion of several equations on one stream of samples, (44) of the paper.
 #[derive(Debug, Clone)]
 pub struct Streaming {
     inputs: Vec<bool>,
@@ -292,8 +292,8 @@ impl Streaming {
         Ok(())
     }
 
-    /// Coefficients of the terms of every equation after the newest sample, fixed ones as given, then those of its
-    /// initial terms.
+    /// Return the coefficients of every equation after the newest sample: first of its terms, including fixed ones,
+    /// then of its initial terms.
     #[must_use]
     pub fn coefficients(&self) -> Vec<Vec<f64>> {
         self.fits.iter().map(|fit| fit.coefficients().collect()).collect()

@@ -16,8 +16,8 @@ use super::law::{FrictionLaw, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
-/// Friction problem of coupled bodies: their friction laws, and gains G_ab. A gain is the decrease of the end velocity
-/// of body a per unit of friction on body b.
+/// Friction problem of coupled bodies: their friction laws, and gains G_ab. G_ab is the decrease of the velocity of
+/// body a at the end of a pulse per unit of friction force on body b.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionProblem {
     laws: Vec<FrictionLaw>,
@@ -30,7 +30,7 @@ const MAX_CONTACT_ITERATIONS: usize = 200;
 /// Rounding error relative to the largest velocity without friction. A body does not move under a force that equals
 /// friction within this error.
 pub(crate) const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
-/// Largest error of a friction force, as a change of velocity relative to the velocities.
+/// Maximum error of a friction force, expressed as the change of velocity it causes relative to the velocities.
 pub(crate) const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
 
 impl FrictionProblem {
@@ -58,13 +58,13 @@ impl FrictionProblem {
         &self.laws[body]
     }
 
-    /// Decrease of the end velocity of a body for a unit of friction on another or on itself.
+    /// Return G_ab, where a is `body` and b is `other`, which may be the same.
     #[must_use]
     pub fn gain(&self, body: usize, other: usize) -> f64 {
         self.gains[body * self.count() + other]
     }
 
-    /// Decrease of the end velocity of a body for a unit of its own friction.
+    /// Return G_aa, where a is `body`.
     #[must_use]
     pub fn own(&self, body: usize) -> f64 {
         self.gain(body, body)

@@ -46,9 +46,9 @@ pub struct Pulse {
 pub struct PulseDerivatives {
     /// Derivative of the velocity at the start.
     pub start: f64,
-    /// Derivative of the end velocity without friction in the pulse.
+    /// Derivative of the velocity at the end of the pulse without friction in it.
     pub free: f64,
-    /// Derivative of the change of the end velocity per unit of force in the pulse.
+    /// Derivative of the friction gain: change of the velocity at the end of the pulse per unit of friction force.
     pub first: f64,
     /// Derivatives of the friction parameters fc, fs and vs.
     pub law: [f64; 3],
@@ -208,7 +208,7 @@ impl FrictionLaw {
         Pulse { force, end: -side * back, phase: Phase::Turn }
     }
 
-    /// Derivatives of the friction and of the end velocity of a pulse.
+    /// Return the derivatives of the friction force in a pulse and of the velocity at its end.
     #[must_use]
     pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, derivatives: &PulseDerivatives) -> (f64, f64) {
         let of = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();

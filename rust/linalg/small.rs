@@ -427,14 +427,15 @@ impl SlidingGram {
         Ok(())
     }
 
-    /// Sum over the window of the product at index `at` of the packed rows of q qᵀ, then q m.
+    /// Return one element of Σ q qᵀ (packed upper rows) or, after these, of Σ q m over the rows of the window. `at` is
+    /// the index of the element.
     #[inline]
     fn sum(&self, at: usize) -> f64 {
         self.suffix[at] + self.prefix[at]
     }
 }
 
-/// State of recursion (44): coefficients and inverse covariance.
+/// State of the paper's recursion (44): coefficients and inverse covariance.
 #[derive(Debug, Clone)]
 pub struct Recursion {
     coefficients: Vec<f64>,
@@ -479,7 +480,7 @@ impl Recursion {
         }
     }
 
-    /// One update of (44) with the rows of a window.
+    /// Update the state by one step of the paper's (44) with the rows of a window.
     ///
     /// A coefficient without information is unchanged.
     ///
@@ -532,7 +533,7 @@ impl Recursion {
 mod tests {
     use super::*;
 
-    /// One update of (44) by a dense solve, with one row of the window after another.
+    /// Update by one step of the paper's (44) with a dense solve. Rows of the window are added one after another.
     fn naive_step(information: &mut DMatrix<f64>, x: &mut DVector<f64>, rows: &[(Vec<f64>, f64)]) {
         let mut gain = DVector::zeros(x.len());
         for (row, output) in rows {

@@ -100,7 +100,8 @@ impl PowerSum {
     }
 }
 
-/// Powers of t in the derivative D^ρ of an output as (exponent, coefficient), from those in all outputs.
+/// Return the powers of t in the derivative D^ρ of an output as (exponent, coefficient). `order` is ρ, and `powers`
+/// holds the powers of t in every output.
 ///
 /// D^ρ I^η y equals I^η D^ρ y plus powers of t from y(0), y′(0), …. These cancel the powers of Caputo's initial terms.
 pub(super) fn derivative_powers(

@@ -263,7 +263,8 @@ pub fn has_unstable_pole(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>
     })
 }
 
-/// Recursion (44) on a stream of samples, see module `estimate::streaming` of the core.
+/// Multi-innovation recursion, (44) of the paper, on a stream of samples; see module `estimation::streaming` of the
+/// core.
 #[pyclass(module = "ftlm._core")]
 pub struct Streaming {
     inner: StreamingFit,

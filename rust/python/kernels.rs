@@ -187,7 +187,8 @@ pub fn pulse_mean_rows<'py>(
     PyArray1::from_vec(py, values).reshape([count, m])
 }
 
-/// Multi-innovation estimates (44) of m = Q X for problems of `count` rows, one after another in `q` and `m`.
+/// Multi-innovation estimates of X in m = Q X, (44) of the paper. Problems of `count` rows follow one after another in
+/// `q` and `m`.
 ///
 /// The result has one row per problem, or with `path` the coefficients after every row.
 #[pyfunction]

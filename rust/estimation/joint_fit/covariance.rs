@@ -9,9 +9,10 @@ use crate::signal::statistics::{
     WHITENESS_LAGS,
 };
 
-/// Exponent of the number of samples in the number of autocovariance lags of the robust covariance.
+/// Exponent e in the number of autocovariance lags of the robust covariance, which is proportional to (number of
+/// samples)^e.
 const LAG_POWER: f64 = 1.0 / 3.0;
-/// Smallest assumed share of the noise variance that remains in the residuals of a fit.
+/// Minimum assumed fraction of the noise variance that remains in the residuals of a fit.
 const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 
 /// Row-major covariance of the parameters: classical for white residuals, robust to autocorrelation otherwise.
@@ -46,7 +47,7 @@ pub fn robust_covariance(jacobian: &[Vec<f64>], series: Vec<Vec<f64>>, shares: O
     covariance_of_residuals(&rows, &series, squares(&series))
 }
 
-/// Pseudo-residuals of Huber's loss. Their least-squares covariance is that of the M-estimator.
+/// Pseudo-residuals of Huber's loss. Least squares on them has the covariance of the M-estimator.
 #[allow(clippy::cast_precision_loss)]
 fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<Vec<f64>> {
     let finite: Vec<f64> = series.iter().flatten().copied().filter(|e| !e.is_nan()).collect();

@@ -20,8 +20,9 @@ pub const SEARCHED_ORDER: f64 = 3.0;
 pub const ALPHA_BOUNDS: (f64, f64) = (0.05, SEARCHED_ORDER);
 /// Default bounds of the highest orders of equations with friction.
 const FRICTION_BOUNDS: (f64, f64) = (1.001, 2.0);
-/// Smallest distance of an estimated ratio of the coefficient law from its lower bound. Ratios are below [`MAX_RATIO`].
-/// If no equation determines a ratio, its initial guess is [`DEFAULT_RATIO_EXCESS`] above the lower bound.
+/// Minimum difference between an estimated ratio of the coefficient law and its lower bound. Ratios are below
+/// [`MAX_RATIO`]. If no equation determines a ratio, its initial guess is [`DEFAULT_RATIO_EXCESS`] above the lower
+/// bound.
 const MIN_RATIO_EXCESS: f64 = 0.05;
 const MAX_RATIO: f64 = 20.0;
 const DEFAULT_RATIO_EXCESS: f64 = 0.5;
@@ -250,7 +251,8 @@ fn upper_order_bound(structure: &ParametricStructure, name: &String, above: bool
     numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
 }
 
-/// Time scaling of a problem: the unit of time of its runs, and the exponent of that unit in each parameter.
+/// Time scaling of a problem: a unit of time chosen by its runs, and the exponent of this unit in the unit of each
+/// parameter.
 #[derive(Debug, Clone)]
 pub struct TimeScaling {
     unit: Unit,
@@ -289,7 +291,8 @@ impl TimeScaling {
         (0..self.size).map(of).collect()
     }
 
-    /// Relative decrease of parameter i by a step of the orders that keeps its value in the unit of time.
+    /// Return the relative decrease of parameter i in seconds, if the orders change by `step` and its value in the
+    /// scaled unit of time is constant.
     fn relative_decrease(&self, i: usize, step: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => {

@@ -16,7 +16,7 @@ use crate::signal::statistics::mean;
 
 /// Number of segments of the runs whose sums of squares are compared.
 const COMPARISON_SEGMENTS: f64 = 20.0;
-/// 99 % quantile of Student's t with one degree of freedom less than the number of segments.
+/// 99 % quantile of Student's t distribution with [`COMPARISON_SEGMENTS`] − 1 degrees of freedom.
 const STUDENT_T_QUANTILE_99: f64 = 2.54;
 /// Ratio of the residuals above which the better optimum is chosen without a test: instability can show up only at the
 /// end of a run.

@@ -164,8 +164,8 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
     Ok(None)
 }
 
-/// Differences of the residuals extrapolated to zero step from those of a grid, by run and output, in units of the
-/// outputs. None where they are large relative to the noise or a simulation is not finite.
+/// Return residuals extrapolated to zero step minus residuals on `grid`, by run, output and sample, in units of the
+/// outputs. None if these differences are large relative to the noise, or a simulation is not finite.
 fn limit_shifts(
     place: &Iterate,
     grid: &Objective<'_>,

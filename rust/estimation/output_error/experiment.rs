@@ -14,7 +14,7 @@ pub struct Experiment {
     pub record: Arc<Record>,
     /// Block pulses per sampling interval.
     pub pulses_per_sample: usize,
-    /// Samples of the output of each equation; their number is that of the sampling intervals plus one.
+    /// Samples of the output of each equation, one more than there are sampling intervals.
     pub samples: Vec<Vec<f64>>,
     /// Sensor filter of the simulated outputs, if any: a series of the length of the record, and a flag per output.
     pub filter: Option<(Vec<f64>, Vec<bool>)>,
@@ -102,7 +102,7 @@ impl Experiment {
         Ok(self)
     }
 
-    /// Set the weights of the outputs, and multiply those of the compared samples by `shares`.
+    /// Set the weights of the outputs. Multiply the weights of the compared samples by `shares`.
     ///
     /// # Errors
     /// [`Error::Length`] for another number of shares than outputs or compared samples.

@@ -1,4 +1,4 @@
-//! Direct feedthrough: the instantaneous effect of a term whose order equals that of its equation.
+//! Direct feedthrough: the instantaneous effect of a term whose order equals the order of its equation.
 //!
 //! A sample is taken just after its input changes: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without feedthrough
 //! and s the input. The mean of the two pulses next to t contains G times their mean of s. The correction is G δ, where
@@ -115,7 +115,7 @@ impl Feedthrough {
     }
 }
 
-/// Add the derivative of the feedthrough to that of the samples.
+/// Add the derivative of the feedthrough to the derivative of the samples.
 pub(crate) fn add_feedthrough_derivative(
     model: &FreeModel,
     experiment: &Experiment,
@@ -153,12 +153,12 @@ pub(crate) fn add_feedthrough_derivative(
 /// which only the direct gain is present at the sample. Without the correction a first-order equation has an error
 /// proportional to the step. An equation with an input derivative of order 0.6 has one of order step^0.4.
 pub(crate) struct JumpCorrection {
-    /// Half of the change of the next pulse mean by the jump or kink of each signal at each compared sample. The second
-    /// list is its derivative with respect to the free parameter of the input.
+    /// For each signal, half of the change of the next pulse mean that its jump or kink causes, at each compared
+    /// sample. The second list is the derivative with respect to the free parameter of the input.
     jumps: Vec<Option<(Vec<f64>, Vec<f64>)>>,
 }
 
-/// Relative step of the central differences of the gains, which have an error of 1e−10.
+/// Relative step of the central differences that approximate derivatives of the gains. Their error is 1e−10.
 const RELATIVE_DIFFERENCE_STEP: f64 = 1e-5;
 
 impl JumpCorrection {

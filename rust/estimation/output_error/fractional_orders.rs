@@ -22,7 +22,7 @@ use crate::fractional::kernels::digamma;
 use crate::fractional::starred_transform::{integration, StarredTransform};
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 
-/// Smallest number of pulses of an experiment with exact samples. Block pulses are faster for shorter experiments.
+/// Minimum number of pulses for exact samples. Block pulses are faster for shorter experiments.
 pub(crate) const MIN_EXACT_PULSES: usize = 1 << 12;
 
 /// Equations of any orders with zero-order-hold inputs, on experiments with uniform samples.
@@ -37,7 +37,7 @@ struct Run {
     jumps: HashMap<usize, Vec<Bin>>,
 }
 
-/// Effects of the linear coefficients and of the initial terms on the weighted samples of an experiment.
+/// Linear dependence of the weighted samples of an experiment on linear coefficients and initial terms.
 pub(crate) struct SampledSimulation {
     /// Orthonormal basis of the weighted responses to the initial terms.
     pub(crate) basis: Vec<Vec<f64>>,
@@ -47,7 +47,7 @@ pub(crate) struct SampledSimulation {
 
 /// Terms of an equation at a parameter point.
 struct Terms {
-    /// Distinct integration orders η, and the index of each term's η among them.
+    /// Distinct integration orders η. `places` holds the index of each term's η in this list.
     etas: Vec<f64>,
     places: Vec<usize>,
     coefficients: Vec<f64>,
@@ -55,11 +55,11 @@ struct Terms {
     inputs: Vec<Option<usize>>,
 }
 
-/// Derivatives of the coefficient and of the integration order of each term with respect to a parameter.
+/// For each term, (derivative of the coefficient, derivative of the integration order) with respect to one parameter.
 type Slopes = Vec<(f64, f64)>;
 
-/// Response of an equation to one input with zero initial conditions, with weights in place of the coefficients of the
-/// terms of that input.
+/// Response of an equation to one input from zero initial conditions. The coefficients of this input's terms are
+/// replaced by weights.
 struct Column {
     /// Weight of each term of the equation. Weights of other terms are not used.
     weights: Vec<f64>,
@@ -96,20 +96,20 @@ impl Terms {
         signal_indices
     }
 
-    /// Σ weight s^−η over the terms of an input, or over those of the output itself.
+    /// Return Σ weight·s^−η over the terms of `input`, or over the terms of the output itself if `input` is None.
     fn sum(&self, input: Option<usize>, powers: &[Bin], weight: impl Fn(usize) -> Bin) -> Bin {
         let terms = (0..self.places.len()).filter(|&k| self.inputs[k] == input);
         terms.map(|k| weight(k) * powers[self.places[k]]).sum()
     }
 
-    /// s^−η of each distinct integration order, and 1/D.
+    /// Write s^−η of each distinct integration order η to `powers`, and return 1/D.
     fn powers(&self, logarithm: Bin, powers: &mut Vec<Bin>) -> Bin {
         powers.clear();
         powers.extend(self.etas.iter().map(|&eta| integration(logarithm, eta)));
         (Bin::from(1.0) - self.sum(None, powers, |k| self.coefficients[k].into())).inv()
     }
 
-    /// Mean of both sides at t = 0 of the step response with weights of the terms of an input.
+    /// Return half of the jump of the step response at t = 0. `weights` holds the weight of each term of the input.
     fn start(&self, input: usize, weights: impl Fn(usize) -> f64) -> f64 {
         let at_once =
             |k: &usize| self.inputs[*k] == Some(input) && self.etas[self.places[*k]] < FEEDTHROUGH_ORDER_TOLERANCE;
@@ -136,7 +136,7 @@ impl InitialTerms {
         out.iter().sum()
     }
 
-    /// Derivative of the sum of the transforms, for the derivatives `slopes` of the exponents.
+    /// Return the derivative of the sum of the transforms. `slopes` holds the derivatives of the exponents.
     fn slope(&self, logarithm: Bin, transforms: &[Bin], slopes: &[f64]) -> Bin {
         let parts = self.terms.iter().zip(transforms).zip(slopes).filter(|(_, by)| **by != 0.0);
         parts.map(|((term, transform), by)| transform * (Bin::from(term.2) - logarithm) * by).sum()
@@ -326,7 +326,8 @@ fn add_weighted(experiment: &Experiment, i: usize, sign: f64, samples: &[f64], s
     own.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v += sign * w * y);
 }
 
-/// Derivatives of the coefficients and integration orders of the terms of equation i with respect to a parameter.
+/// For each term of equation i, return the derivatives of coefficient and integration order with respect to a
+/// parameter.
 fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: usize) -> Slopes {
     let equation = &model.equations[i];
     let of = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
@@ -339,8 +340,8 @@ fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: u
 }
 
 impl Run {
-    /// Samples of the output of an equation with zero initial conditions, for each list of `weight_sets` in place of
-    /// its coefficients. The second result is its response to each initial term t^e with e in `exponents`.
+    /// Return (samples from zero initial conditions for each list of coefficients in `weight_sets`, response to each
+    /// initial term t^e with e in `exponents`) of one equation.
     fn responses(
         &self,
         experiment: &Experiment,

@@ -27,7 +27,7 @@ pub enum Coordinate {
     Fixed,
 }
 
-/// Largest logarithmic decrease of a coefficient from its initial value.
+/// Maximum decrease of ln|c| of a coefficient c from its initial value.
 const MAX_LOG_DECREASE: f64 = 20.0;
 
 impl Coordinate {
@@ -135,8 +135,8 @@ pub struct FreeModel {
     pub initial: Initial,
 }
 
-/// Smallest response of the denominator of an admissible point at the Nyquist frequency, relative to its leading
-/// coefficient.
+/// Minimum magnitude of the denominator at the Nyquist frequency, relative to its leading coefficient. Points below it
+/// are not admissible.
 const MIN_NYQUIST_RESPONSE_RATIO: f64 = 0.02;
 
 impl FreeModel {
@@ -411,7 +411,8 @@ impl TimeUnit {
         })
     }
 
-    /// Relative decrease of a coefficient per unit of a free order, if its value in the unit of time is constant.
+    /// Return the relative decrease of a coefficient in seconds per unit of a free order, if its value in the scaled
+    /// unit of time is constant.
     pub(crate) fn relative_decrease(&self, coefficient: usize, order: usize) -> f64 {
         let weight = |(_, weights): &TimePower| weights.get(order).copied().unwrap_or(0.0);
         self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit

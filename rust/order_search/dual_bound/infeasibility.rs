@@ -12,13 +12,13 @@ use crate::linalg::small::packed_index;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, Wide, NO_INDEX};
 use crate::simd::LANE_COUNT;
 
-/// Maximum number of steps of the search for multipliers of the test vectors. Three suffice on average.
+/// Maximum number of iterations in the search for multipliers of the test vectors. Three suffice on average.
 const MAX_MULTIPLIER_STEPS: usize = 12;
 /// Relative rounding margin of a diagonal element and its row: k² ε with a safety factor.
 const DEFINITENESS_MARGIN: f64 = 1e-12;
 
-/// Contribution of one unknown to a group of conditions: to ⟨t, w⟩ divided by the limit, to d‖t‖ (real and imaginary
-/// part each), and ρ.
+/// Contribution of one unknown to the conditions of a group of test vectors t. `error` is its part of ⟨t, w⟩ divided by
+/// the limit, and `divisor` its part of d‖t‖, each as real and imaginary part. `slack` is its ρ.
 #[derive(Debug, Clone, Copy)]
 struct Effect {
     error: [Wide; 2],

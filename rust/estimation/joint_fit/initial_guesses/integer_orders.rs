@@ -50,15 +50,16 @@ const SECTION_EVALUATIONS: usize = 40;
 /// Relative difference of two costs below which they belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
 const COST_TOLERANCE: f64 = 1e-8;
-/// Largest p/2 and √q of a section, times the step. The samples do not determine faster real poles, nor pairs above the
-/// Nyquist frequency.
+/// Maximum of p/2 times the sampling interval, for a section s² + p s + q. `MAX_FREQUENCY_STEP` is the maximum of √q
+/// times the sampling interval. The samples do not determine faster real poles, nor pole pairs above the Nyquist
+/// frequency.
 const MAX_DECAY_STEP: f64 = 1.0;
 const MAX_FREQUENCY_STEP: f64 = PI;
-/// Smallest magnitude of a pole times the duration of the longest run.
+/// Minimum of the magnitude of a pole times the duration of the longest run.
 const MIN_POLE_DURATION: f64 = 1e-4;
-/// Smallest damping of an initial guess.
+/// Minimum damping ratio of an initial guess.
 const MIN_DAMPING: f64 = 1e-4;
-/// Smallest number of runs on which guesses are compared.
+/// Minimum number of runs on which guesses are compared.
 const MIN_RUNS: usize = 2;
 /// Number of delays for which guesses are refined.
 const CONTINUED_DELAYS: usize = 3;
@@ -72,8 +73,7 @@ type Pole = (f64, f64);
 struct Equation<'a> {
     model: FreeModel,
     experiments: &'a [Experiment],
-    /// Index of the coefficient of each order of the output, from the lowest order. Lower orders than that are
-    /// integrators.
+    /// Index of the coefficient of each output derivative, in ascending order. Orders below the lowest are integrators.
     own: Vec<usize>,
     integrators: usize,
     stop: &'a Stop,
@@ -443,7 +443,7 @@ impl<'a> Equation<'a> {
         self.at_poles(point, &poles.into_iter().map(within).collect::<Vec<_>>())
     }
 
-    /// Logarithms of p and q of the sections s² + p s + q, then of the remaining real pole.
+    /// Return ln p and ln q of each section s² + p s + q, then the logarithm of the remaining real pole.
     fn sections(&self, poles: &[Pole]) -> Vec<f64> {
         let slowest = MIN_POLE_DURATION / self.duration;
         let mut real: Vec<f64> = poles.iter().filter(|(_, im)| *im == 0.0).map(|(re, _)| (-re).max(slowest)).collect();

@@ -151,7 +151,7 @@ impl<'a> OrderGrids<'a> {
         records.iter().map(|record| self.low_passes.filter_record(record, corner)).collect()
     }
 
-    /// Reject a zero-order-hold input with an order above that of its equation: jumps have no derivative.
+    /// Reject a zero-order-hold input whose order exceeds the order of its equation: jumps have no derivative.
     fn check_hold_orders(&self, free: &ParameterSet) -> Result<()> {
         let (inputs, signals) = (self.source.inputs(), &free.structure.signals);
         for item in free.structure.equations.iter().filter(|e| !e.order.is_free()) {
@@ -189,8 +189,8 @@ impl InitialGuessSource for OrderGrids<'_> {
     }
 }
 
-/// Largest distance of neighboring initial guesses of a delay, as phase at the bandwidth of the output. There are at
-/// most [`MAX_DELAY_STARTS`] combinations over all inputs with free parameters.
+/// Maximum phase difference at the output's bandwidth between neighboring initial guesses of a delay \[rad\]. There are
+/// at most [`MAX_DELAY_STARTS`] combinations over all inputs with free parameters.
 const MAX_DELAY_PHASE_RAD: f64 = 1.0;
 const MAX_DELAY_STARTS: f64 = 12.0;
 /// Number of initial guesses of a saturation or dead zone, from [`MIN_LIMIT_RATIO`] of the largest input upwards.

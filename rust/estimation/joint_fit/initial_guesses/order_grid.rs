@@ -227,9 +227,9 @@ const ROWS_BY_LAW: usize = 4;
 const MAX_GUESSES_UNDER_ORDER_LAW: usize = 8;
 /// Number of best rows of an order grid from which the initial guesses under an order law are chosen.
 const ROWS_UNDER_ORDER_LAW: usize = 4000;
-/// Smallest difference of two initial guesses in at least one order: more than one increment of the grid.
+/// Minimum difference in at least one order between two initial guesses: more than one increment of the grid.
 const MIN_ORDER_SEPARATION: f64 = 0.35;
-/// Ratios of a coefficient law at which the coefficients of one equation follow from those of another.
+/// Trial ratios of a coefficient law. At a fixed ratio the coefficients of one equation follow from another equation.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
 /// Absolute and relative difference below which two orders are equal.
 const ORDER_TOLERANCES: (f64, f64) = (1e-9, 1e-5);
@@ -340,7 +340,7 @@ const START_INCREMENT: f64 = 0.2;
 const MAX_START_CANDIDATES: u128 = 200_000;
 /// Lower end of the typical interval of highest orders without prior knowledge.
 const MIN_TYPICAL_ORDER: f64 = 0.2;
-/// Largest initial guess of the order of a term below the highest derivative.
+/// Maximum initial guess of the order of a term below the highest derivative.
 const MAX_LOWER_TERM_ORDER: f64 = 2.0;
 /// Inverse of the resolution to which orders are rounded.
 const ROUNDING_STEPS_PER_ORDER: f64 = 1e9;

@@ -9,9 +9,10 @@ use crate::signal::statistics::mean;
 /// Samples of the coarse fits over all runs; each run has at least `MIN_RUN_SAMPLES`.
 pub const MAX_COARSE_SAMPLES: usize = 1200;
 const MIN_RUN_SAMPLES: usize = 400;
-/// Largest decimation without a check of the bandwidth. With a larger one, half a period of the frequency below which
-/// 90 % of the power lies needs at least [`MIN_SAMPLES_PER_HALF_PERIOD`]. The first part of a record represents the
-/// record if the standard deviation of its outputs is at least [`MIN_DEVIATION_RATIO`] of that of the whole.
+/// Maximum decimation without a check of the bandwidth. For a larger decimation, let f be the frequency below which 90
+/// % of the power lies. Half a period of f must then have at least [`MIN_SAMPLES_PER_HALF_PERIOD`] samples. The first
+/// part of a record represents the record if its outputs have at least [`MIN_DEVIATION_RATIO`] times the standard
+/// deviation of the whole record.
 const MAX_UNCHECKED_DECIMATION: usize = 10;
 const MIN_SAMPLES_PER_HALF_PERIOD: f64 = 6.0;
 const MIN_DEVIATION_RATIO: f64 = 0.7;

@@ -15,7 +15,7 @@ use crate::parallel::Stop;
 /// [`SECOND_BUDGET_EVALUATIONS`].
 pub(super) const FIRST_BUDGET_EVALUATIONS: usize = 15;
 pub(super) const SECOND_BUDGET_EVALUATIONS: usize = 60;
-/// Smallest number of initial guesses of a submodel that continue after the prescreening.
+/// Minimum number of initial guesses of a submodel that continue after the prescreening.
 pub(super) const MIN_SURVIVORS: usize = 8;
 /// Number of evaluations of each candidate in the prescreening.
 pub(super) const PRESCREEN_EVALUATIONS: usize = 2;
@@ -192,7 +192,7 @@ pub fn is_same_optimum(one: &Candidate, other: &Candidate) -> bool {
         && are_all_close(&inputs(other), &inputs(one), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
-/// True if two candidates agree in all parameters, as those of order grids with common points do.
+/// True if two candidates agree in all parameters, such as candidates from order grids with common points.
 #[must_use]
 pub fn is_same_iterate(one: &Candidate, other: &Candidate) -> bool {
     are_all_close(&other.result.values(), &one.result.values(), SAME_PARAMETER_TOLERANCE, 0.0)

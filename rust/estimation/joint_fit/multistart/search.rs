@@ -172,7 +172,7 @@ fn integer_order_optima(
     Ok(candidates)
 }
 
-/// Optimize a submodel from its own initial guesses; the best `going` of them continue.
+/// Optimize a submodel from its initial guesses. The best `going` guesses continue after the prescreening.
 ///
 /// The second budget is for optima that can compete with `level`, the cost per residual of the full problem, and for
 /// the best one. For integer orders the leading intervals of long records suffice. Empty if two of its terms coincide.

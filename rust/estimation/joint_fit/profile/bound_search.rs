@@ -4,29 +4,30 @@ use super::likelihood::{ProfileLikelihood, Refit, MAX_REFIT_EVALUATIONS};
 use crate::error::Result;
 use crate::estimation::joint_fit::problem::OptimizationResult;
 
-/// Tolerance of a bound: the square root of the rise of the cost is within this of its threshold. Newton's next step
-/// must also be shorter than [`BOUND_TOLERANCE`] times the distance from the optimum.
+/// Tolerance of a bound: maximum difference of the root of the cost rise from its threshold. Newton's next step must
+/// also be shorter than [`BOUND_TOLERANCE`] times the distance from the optimum.
 const RISE_TOLERANCE: f64 = 0.1;
-/// Largest Newton step at a bound, relative to the distance from the optimum.
+/// Maximum Newton step at a converged bound, relative to the distance from the optimum.
 const BOUND_TOLERANCE: f64 = 0.02;
 /// Maximum number of refits for one bound.
 pub(super) const MAX_REFITS_PER_BOUND: usize = 40;
-/// Largest distance of a bound, in half-widths of the Wald interval. Beyond it the interval is unbounded.
+/// Maximum distance of a bound from the optimum, in half-widths of the Wald interval. Beyond it the interval counts as
+/// unbounded.
 const MAX_BOUND_DISTANCE: f64 = 1e3;
-/// Smallest first step, relative to the Wald half-width.
+/// Minimum length of the first step, relative to the Wald half-width.
 const MIN_FIRST_STEP_RATIO: f64 = 0.01;
 /// A bracket is narrow if its width is [`BOUND_TOLERANCE`] times the value inside it, or times this fraction of its
 /// distance from the optimum.
 const BRACKET_SCALE_RATIO: f64 = 0.1;
-/// Smallest factor by which the distance from the optimum grows in one step.
+/// Minimum factor by which one step increases the distance from the optimum.
 const MIN_STEP_FACTOR: f64 = 1.1;
-/// Largest factor by which the distance from the optimum grows in one step.
+/// Maximum factor by which one step increases the distance from the optimum.
 const MAX_STEP_FACTOR: f64 = 4.0;
-/// Rise of the root cost in one step, relative to the last step, up to which the cost levels off. The root cost must
-/// also be below this fraction of the threshold.
+/// Maximum ratio of the rises of the root cost in two successive steps at which the cost counts as leveling off. The
+/// root cost must also be below this fraction of the threshold.
 const LEVELING_RATIO: f64 = 0.5;
 const LEVELING_MARGIN: f64 = 0.05;
-/// Smallest distance of a step from the ends of its bracket, as a fraction of its width.
+/// Minimum distance of a step from both ends of its bracket, as a fraction of the bracket width.
 const BRACKET_MARGIN: f64 = 0.05;
 
 /// Interval of one parameter, or one side of it.
@@ -36,7 +37,7 @@ pub struct Interval {
     pub low: f64,
     /// Upper bound.
     pub high: f64,
-    /// Value and rise of the sum of squares at each refit, in units of the noise variance.
+    /// (parameter value, rise of the sum of squares in units of the noise variance) at each refit.
     pub points: Vec<(f64, f64)>,
     /// Number of simulations.
     pub evaluations: usize,
@@ -72,7 +73,7 @@ pub enum BoundOutcome {
     Found(Interval),
     /// The budget is exhausted, or the search was cancelled.
     Paused,
-    /// Parameters of an optimum below that of the fit.
+    /// Parameters of an optimum with a lower cost than the fit.
     Lower(Vec<f64>),
 }
 
@@ -194,7 +195,7 @@ impl BoundSearch {
         interval
     }
 
-    /// Choose the next distance after a refit; return that of the bound if it is found. NaN ends the search.
+    /// Choose the distance of the next refit. Return the distance of the bound if it is found; NaN ends the search.
     fn step(&mut self, around: &ProfileLikelihood<'_>, refit_result: Option<OptimizationResult>) -> Option<f64> {
         let (i, width) = (self.parameter, self.width);
         let (mut rise, mut following, mut near) = (f64::INFINITY, f64::INFINITY, false);

@@ -376,7 +376,8 @@ impl<'a> CostSurface<'a> {
         inner(&rest, &rest)
     }
 
-    /// Sum of squares at each pair of values, rows of the second; infinite if the simulation is not finite.
+    /// Return the sum of squares at each pair of parameter values, with one row per value in `second`. It is infinite
+    /// if the simulation is not finite.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -419,7 +420,8 @@ fn finite<T>(outcome: Result<T>) -> Result<Option<T>> {
 /// Significant singular vectors and values of sensitivities with unit rows.
 type Sensitivities = SingularValues;
 
-/// Singular values of the sensitivities of all parameters but some, scaled to unit rows, and the norms of the rows.
+/// Return the singular value decomposition of the sensitivities, without the parameters `without`, and the norms of the
+/// rows. Rows are first scaled to norm 1.
 fn other_sensitivities(result: &OptimizationResult, without: &[usize]) -> Result<(Sensitivities, Vec<f64>)> {
     let others = result.jacobian.iter().enumerate().filter(|(j, _)| !without.contains(j)).map(|(_, row)| row);
     let (mut scaled, mut lengths) = (Vec::new(), Vec::new());
@@ -445,7 +447,8 @@ fn other_sensitivities(result: &OptimizationResult, without: &[usize]) -> Result
     Ok((factors, lengths))
 }
 
-/// Residuals after one linear step of the parameters of these sensitivities.
+/// Return the residuals after one least-squares step of the linearized parameters: the projection orthogonal to
+/// `sensitivities`.
 fn projected_residuals(result: &OptimizationResult, sensitivities: &Sensitivities) -> Vec<f64> {
     let mut rest = result.residuals.clone();
     for direction in &sensitivities.left {

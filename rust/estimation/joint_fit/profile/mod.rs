@@ -19,15 +19,15 @@ pub use likelihood::{CostSurface, FitState, ProfileLikelihood, MAX_REFIT_EVALUAT
 
 use bound_search::MAX_REFITS_PER_BOUND;
 
-/// Largest relative error of a bound of the Wald interval, from one linear step of all other parameters. Above it the
-/// parameter is profiled.
+/// Maximum relative error of a bound of the Wald interval. It is estimated with one linear step of all other
+/// parameters. Above it the parameter is profiled.
 const MAX_QUADRATIC_ERROR: f64 = 0.1;
-/// Smallest budget of simulations with which the search for a bound continues.
+/// Minimum remaining number of simulations with which the search for a bound continues.
 const MIN_BUDGET_PER_BOUND: usize = 10;
 /// A lower optimum is reported if it lowers the sum of squares by more than this fraction of the rise at one standard
 /// error.
 const MIN_COST_REDUCTION: f64 = 0.1;
-/// Largest number of lower optima from which the search continues.
+/// Maximum number of optima below the fit from which the search is restarted.
 const MAX_LOWER_OPTIMA: usize = 5;
 
 /// Settings of profile-likelihood intervals: parameters, confidence level and resources.
