@@ -39,7 +39,8 @@ pub struct Equation {
     pub coefficients: Vec<f64>,
 }
 
-/// Exponents of t closer than this to that of an offset are not separately identifiable.
+/// Minimum difference between the exponent of an initial term and the exponent of an offset. Closer exponents are not
+/// separately identifiable.
 const OFFSET_EXPONENT_TOLERANCE: f64 = 0.05;
 
 /// Initial conditions of a record.

@@ -414,7 +414,10 @@ class Candidates:
         check_choice("rows", rows, ("haar", "time"))
         prior = as_floats("prior_covariance", prior_covariance)
         if prior.ndim > 1 or (prior.ndim and prior.size != len(self._terms)) or not np.all(prior > 0):
-            raise ModelError(f"prior_covariance is not positive, or not one number or {len(self._terms)} of them")
+            raise ModelError(
+                f"prior_covariance is not positive, or has a wrong shape; give one positive number, or "
+                f"{len(self._terms)}, one per term"
+            )
         places = self._places(table)
         gram = self._gram(length, rows)
         normal = gram[places[:, :, None], places[:, None, :]]

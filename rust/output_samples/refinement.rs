@@ -361,7 +361,7 @@ fn refine_long_record(
     Ok(Some(RefinedSamples { samples: responses.samples(&best, initial)?, refinement, change }))
 }
 
-/// Ranges of the pieces of responses over a number of intervals.
+/// Divide responses of `intervals` sampling intervals into pieces; return the range of each piece.
 fn piece_ranges(intervals: usize) -> Vec<(usize, usize)> {
     let ends = std::iter::successors(Some(intervals + 1), |end| Some(end / PIECE_RATIO));
     let mut ends: Vec<usize> =

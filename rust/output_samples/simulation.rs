@@ -55,8 +55,8 @@ pub struct OutputSimulation {
 }
 
 impl OutputSimulation {
-    /// Simulation of equations, in the sequence of the outputs of the recording, some of them with friction. `times`
-    /// \[s\] are the sample times; None for the uniform samples of the recording.
+    /// Simulation of equations in the sequence of the recording's outputs. `frictions` holds (equation, friction law).
+    /// `times` are the sample times \[s\]; None for the uniform samples of the recording.
     ///
     /// # Errors
     /// Equations with signals that the recording lacks, or with other outputs.

@@ -10,7 +10,7 @@ use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
 use crate::simd::{self, LANE_COUNT};
 
-/// Number of terms of a block, and of values of its transform.
+/// Number of terms in a block. Its transform has the same number of values.
 pub const BLOCK_TERMS: usize = LANE_COUNT * LANE_COUNT;
 
 /// Real parts, then imaginary parts, of [`LANE_COUNT`] values.
@@ -21,7 +21,7 @@ type Square = [Tile; LANE_COUNT];
 
 /// Factors of the transform.
 struct Factors {
-    /// Factor e^{iπ j/128} of term j, which maps the roots of z⁶⁴ = i to those of z⁶⁴ = 1.
+    /// Factor e^{iπ j/128} of term j. It maps the roots of z⁶⁴ = i to the roots of z⁶⁴ = 1.
     shift: Square,
     /// Conjugates of `shift` divided by 64.
     inverse_shift: Square,

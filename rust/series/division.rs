@@ -103,8 +103,8 @@ impl simd::SimdKernel for Substitution<'_> {
 /// fastest of 8, 16 and 32 at m = 2048.
 const MAX_LEVEL_BLOCKS: usize = 32;
 
-/// Spectra of the solved blocks of one length, and of the pieces of the n² series by which they contribute to later
-/// blocks.
+/// Spectra of one block length: of the solved blocks, and of the pieces of the n² matrix series. Their products are the
+/// contributions of solved blocks to later blocks.
 ///
 /// Piece d contains the terms d·len to (d + 2)·len of a series. The second half of its product with block k is the
 /// contribution to block k + d + 1. Contributions of several blocks are summed as spectra, tile by tile, so the spectra
@@ -208,7 +208,8 @@ impl LevelBuffers {
     }
 }
 
-/// SIMD task: spectrum of the contribution of the first `count` blocks of a level to equation `i` in the next block.
+/// SIMD task: compute the spectrum that the first `count` blocks of a level contribute to equation `i` in the next
+/// block.
 struct Contributions<'a> {
     n: usize,
     i: usize,
@@ -427,8 +428,8 @@ impl Division {
     }
 }
 
-/// Index of the longest level with a block that ends at term `solved`, the length of its blocks, and the number of them
-/// that contribute to the next block.
+/// Return (level, block length, block count). The level is the longest with a block that ends at term `solved`. The
+/// count is the number of its blocks that contribute to the next block.
 fn level_at(solved: usize) -> (usize, usize, usize) {
     let (mut level, mut len, mut count) = (0, BLOCK_TERMS, solved / BLOCK_TERMS);
     while count != 0 && count.is_multiple_of(MAX_LEVEL_BLOCKS) {
@@ -497,7 +498,7 @@ pub struct Solver<'a> {
 }
 
 impl<'a> Solver<'a> {
-    /// Solver of an n × n matrix of series of m terms.
+    /// Solver for an n × n matrix whose elements are series of m terms.
     ///
     /// # Errors
     /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].

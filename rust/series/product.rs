@@ -35,7 +35,7 @@ pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     out
 }
 
-/// Products mod z^m of one series of m terms with many signals of m terms, in place. O(m log m) a signal.
+/// Multiply many signals by one series modulo z^m, in place. Signals and series have m terms. O(m log m) per signal.
 ///
 /// The spectrum of the series is computed once. `signals` holds them one after another; a remainder of fewer than m
 /// terms is unchanged. The product is exact for a series that is zero from its second term on.
@@ -94,7 +94,7 @@ pub struct Kernel {
 }
 
 impl Kernel {
-    /// Kernel of a series of length m for signals of up to m points.
+    /// Kernel (cached spectrum) of a series of length m, for products with signals of up to m points.
     #[must_use]
     pub fn new(series: &[f64]) -> Self {
         Self::with_length(series, 2 * series.len())
@@ -174,7 +174,7 @@ pub struct SumOfProducts {
 }
 
 impl SumOfProducts {
-    /// An empty sum of products of series of m terms.
+    /// Empty sum, to which products of series with m terms can be added.
     #[must_use]
     pub fn new(m: usize) -> Self {
         Self::with_length(2 * m)

@@ -100,7 +100,7 @@ impl RunningSumSystem {
         Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
     }
 
-    /// Response of the n unknown series of m terms to each list of sources.
+    /// Solve for the n unknown series of m terms, for each list of sources.
     ///
     /// # Errors
     /// [`Error::Length`] for a source shorter than m.

@@ -320,7 +320,8 @@ impl SampleInterpolation {
         out
     }
 
-    /// Corrections of the samples of I^η of a held signal: exact response to the jumps minus that in the pulse means.
+    /// Corrections of the samples of I^η of a zero-order-hold signal: exact response to its jumps minus the response in
+    /// the pulse means.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn kink_corrections(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {

@@ -5,7 +5,8 @@ use crate::simd::{dispatch_simd, dot, SimdKernel};
 
 /// Median absolute deviation of a normal variable, in units of its standard deviation.
 pub const NORMAL_MAD_PER_SIGMA: f64 = 0.674_489_750_196_081_7;
-/// Huber's threshold in standard deviations. Under normal noise the efficiency is 95 % of that of least squares.
+/// Huber's threshold in standard deviations. Under normal noise the efficiency is 95 % of the efficiency of least
+/// squares.
 pub const HUBER_THRESHOLD: f64 = 1.345;
 /// 99 % quantile of a normal variable. A test with this quantile rejects 1 % of true models.
 const NORMAL_99: f64 = 2.326_347_874_040_840_8;
@@ -201,7 +202,7 @@ pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
     degrees * libm::pow(1.0 - spread + quantile * spread.sqrt(), 3.0)
 }
 
-/// Number of samples of the shortest run that are needed for each coefficient of an autoregression.
+/// Minimum number of samples in the shortest run per coefficient of an autoregression.
 const SAMPLES_A_COEFFICIENT: usize = 10;
 /// Minimum length of the circulant matrix. Within it, a correlation of 0.99 per sample has decayed.
 const LEAST_CIRCLE: usize = 4096;
@@ -312,7 +313,7 @@ pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
     (best, remaining)
 }
 
-/// Number of samples of all runs that are needed for each lag of an input in an ARX model.
+/// Minimum number of samples in all runs per input lag of an ARX model.
 const SAMPLES_AN_INPUT_LAG: usize = 40;
 /// Relative residual of a regression column on the previous columns, below which the column is omitted.
 const COLUMN_TOLERANCE: f64 = 1e-8;

@@ -42,7 +42,7 @@ class Ratio:
     def model(self, output: str, signal: str, *, improper_order: float = 0.0) -> Model:
         """Return the model of this transfer function as an equation.
 
-        The order of the numerator may exceed that of the denominator by less than `improper_order`.
+        The order of the numerator may exceed the order of the denominator by less than `improper_order`.
         """
         bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
         if not bottom or not top:

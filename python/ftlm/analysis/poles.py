@@ -160,7 +160,7 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     Raises
     ------
     ModelError
-        If poles are outside the floating-point range, or their number differs from that of the argument principle.
+        If poles are outside the floating-point range, or their number differs from the count by the argument principle.
 
     Notes
     -----

@@ -146,7 +146,7 @@ def _filter_signal(
 ) -> _Signal:
     """Add Oustaloup's filter for s^power to a signal, one state per pole, and return the filtered signal.
 
-    `states` are the derivatives of the states, to which those of the filter are appended.
+    `states` are the derivatives of the states. The derivatives of the filter's states are appended.
     """
     roots, residues, gain = oustaloup(power, band, order)
     parts = [(gain, signal)]

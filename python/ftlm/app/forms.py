@@ -380,7 +380,7 @@ def _roles(columns: Any) -> dict[str, Any]:
     if columns is None:
         return {}
     if not isinstance(columns, list) or len(columns) > MAX_SIGNALS:
-        raise DataError(f"columns is not a list of at most {MAX_SIGNALS} columns")
+        raise DataError(f"columns is not a list of at most {MAX_SIGNALS} columns; send one object per column")
     roles: dict[str, Any] = {}
     for entry in columns:
         if not isinstance(entry, Mapping):

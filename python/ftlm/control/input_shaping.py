@@ -224,7 +224,7 @@ def input_shaper(
 
 
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-    """Return the amplitude of the vibration after the last impulse, relative to that of a single unit impulse."""
+    """Return the vibration amplitude after the last impulse, divided by the amplitude after one unit impulse."""
     w, z = np.broadcast_arrays(as_floats("frequency", frequency), as_floats("damping", damping))
     if not (np.all(np.abs(w) < POLE_RANGE_RAD_S[1]) and np.all(np.abs(z) <= 1.0)):
         raise DataError("frequency or damping is out of range; give rad/s, finite, and damping ratios from -1 to 1")

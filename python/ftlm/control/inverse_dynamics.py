@@ -122,7 +122,7 @@ def point_to_point(
     """
     reach = real_number("distance", distance)
     if not math.isfinite(reach):
-        raise ModelError(f"size = {short_repr(distance)} is not a finite number")
+        raise ModelError(f"{setting('distance')} {short_repr(distance)} is not a finite number; give a number")
     times = positive("duration", duration), positive("rate", rate)
     rests = [real_number(n, v) for n, v in (("dwell_before", dwell_before), ("dwell_after", dwell_after))]
     if not all(0 <= r < math.inf for r in rests):

@@ -43,7 +43,7 @@ class Observer:
     process_noise
         Process noise intensity: standard deviation of the change of the disturbance within one second.
     gain
-        Kalman gain of the correction, shape (states + 1, measured); the last row is that of the disturbance.
+        Kalman gain of the correction, shape (states + 1, measured); the last row belongs to the disturbance.
     deviations
         Steady-state standard deviation of the estimate of every output, by the model and its noise.
     """
@@ -157,7 +157,8 @@ def observer(
     measured : sequence of str, optional
         Names of the measured outputs; by default all.
     noise : mapping, optional
-        Standard deviation of the noise of each measured output; by default that of the residuals of the model's fit.
+        Standard deviation of the noise of each measured output; by default the standard deviation of the fit's
+        residuals.
     process_noise
         Process noise intensity: standard deviation of the change of an input disturbance within one second, in the unit
         of the input. The disturbance represents friction, offsets and other unmodeled effects.

@@ -310,7 +310,7 @@ class Run:
     def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
         """Mask of missing samples by name, for every output that has any.
 
-        The samples are those of `sample_times` if these are nonuniform.
+        For nonuniform `sample_times`, samples are counted at these times.
         """
         data = self._data if self.sample_times is None else self.sample_times.data
         masks = {name: missing_mask(data[name]) for name in self.outputs}
@@ -612,7 +612,7 @@ class Run:
         Raises
         ------
         DataError
-            If a name is invalid or that of an input, or its values are not N finite numbers.
+            If a name is invalid or belongs to an input, or its values are not N finite numbers.
         """
         values_by_name = {n: as_vector(v, f"output {n!r}")[0] for n, v in as_mapping("values", values).items()}
         for name, numbers in values_by_name.items():

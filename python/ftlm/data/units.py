@@ -135,7 +135,7 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
 def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
     """Return the unit of the coefficient of a term D^order signal, such as ``s^-1.8 rad/A``.
 
-    The equation is that of D^alpha of the output.
+    The equation determines D^alpha of the output.
 
     Empty if the unit of a signal is unknown or the coefficient is dimensionless.
     """

@@ -85,7 +85,7 @@ class CircuitProblem(ResponseProblem):
     def responses(self, values: Floats, *, jacobian: bool = True) -> list[tuple[Complex, Complex | None]]:
         """Return, for each record, the impedance and its Jacobian of shape (frequencies, parameters).
 
-        The derivatives are those with respect to the variables of the optimizer. Without `jacobian` they are None.
+        Derivatives are taken with respect to the variables of the optimizer. Without `jacobian` they are None.
         """
         by_parameter = dict(zip(self.names, self.in_seconds(values).tolist(), strict=True))
         out: list[tuple[Complex, Complex | None]] = []
@@ -119,7 +119,7 @@ class CircuitProblem(ResponseProblem):
     def sort_groups(self, values: Floats) -> Floats:
         """Return the parameters with identical parallel groups in series ordered from the fastest to the slowest.
 
-        Such groups can change places without a change of the impedance. The peak of -Im Z gives the speed of a group.
+        Two such groups can change places, and the impedance is unchanged. The peak of -Im Z gives the speed of a group.
         """
         kind, rest = self.circuit.tree
         if kind != "series" or self.circuit.values or self.bounds:

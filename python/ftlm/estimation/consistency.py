@@ -152,7 +152,7 @@ class Consistency(ReportMixin):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings that limit the conclusion: parameters that are not identifiable, then those of each segment."""
+        """Findings that limit the conclusion: first on parameters that are not identifiable, then on each segment."""
         out = []
         if self.not_identifiable and self.consistent is not None:
             out.append(make_finding("not_told_by_part", parameter=", ".join(self.not_identifiable)))

@@ -64,10 +64,10 @@ def fit_with_instruments(
     `joint` is the initial fit, to the runs in `answers`. They are the measured `runs` in which each input is replaced
     by the noise-free part that the reference explains.
 
-    The residuals are those of the measured runs. The instruments are the sensitivities of the outputs to the
-    parameters, computed with `answers`. Orthogonality of both removes the bias caused by feedback of noise, whatever
-    the accuracy of `answers` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9). The
-    equations are solved by Gauss-Newton. The covariance is robust to colored residuals.
+    The residuals belong to the measured runs. The instruments are the sensitivities of the outputs to the parameters,
+    computed with `answers`. Orthogonality of both removes the bias caused by feedback of noise, whatever the accuracy
+    of `answers` (Young, Recursive Estimation and Time-Series Analysis, 2011, chapters 7 and 9). The equations are
+    solved by Gauss-Newton. The covariance is robust to colored residuals.
     """
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
     every = max(joint.refinement, MIN_PULSES_PER_SAMPLE)

@@ -308,7 +308,7 @@ class FrequencyIdentification:
         Raises
         ------
         ModelError
-            If the impedance of the circuit is not a ratio of powers of s.
+            If the circuit's impedance is not a ratio of sums of powers of s.
         """
         if isinstance(self.system, Model):
             return self.system

@@ -374,7 +374,7 @@ def polynomial_mutation(children: Floats, low: Floats, high: Floats, random: Any
 class _ParentThreshold:
     """Largest error with which a candidate can become a parent of the next generation.
 
-    The smallest errors up to now are stored; their number is that of the parents.
+    The smallest errors up to now are stored; their number equals the number of parents.
     """
 
     def __init__(self, parents: int) -> None:

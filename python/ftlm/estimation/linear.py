@@ -87,7 +87,7 @@ def _estimate_coefficients(
 ) -> tuple[CoefficientFit, list[Record]]:
     """Return the coefficients at given orders, and the block-pulse records that they were estimated from.
 
-    With `smooth`, derivatives in non-linear terms are those of smoothed signals.
+    With `smooth`, derivatives in non-linear terms are computed from smoothed signals.
     """
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar, smooth=smooth)
     fit = CoefficientFit(records[0].m, records[0].initial)
@@ -186,7 +186,7 @@ def step_bias_findings(
 def _prior_findings(output: str, raw: list[float], weak: list[float], settings: SearchSettings) -> list[Finding]:
     """Return a finding if the prior covariance, not the data, determines the size of a coefficient.
 
-    `raw` are the coefficients with the prior of the settings, `weak` those with a weak prior.
+    `raw` are the coefficients with the prior of the settings, `weak` the coefficients with a weak prior.
     """
     shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
@@ -232,7 +232,7 @@ def multi_innovation_trace(
 ) -> MultiInnovationTrace:
     """Run the paper's recursion (44); return the coefficients and the simulation error (45) after each step.
 
-    Equation numbers are those of the paper.
+    Equation numbers refer to the paper.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ def multi_innovation_trace(
 def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> LineChart:
     """Return a chart of the simulation error (45) after each step of recursion (44), as in the paper's Figure 4(b).
 
-    Equations and figure are those of the paper.
+    Equation and figure numbers refer to the paper.
 
     Parameters
     ----------

@@ -193,7 +193,7 @@ class EstimationMethod(Protocol):
         threads: int | None,
         progress: ProgressCallback,
     ) -> Fit:
-        """Fit a structure with a fixed choice of offset to checked runs; other arguments are those of `identify`."""
+        """Fit a structure with a fixed choice of offset to checked runs; other arguments as in `identify`."""
 
 
 @check_arguments
@@ -201,7 +201,7 @@ class EstimationMethod(Protocol):
 class OutputError:
     """Output-error method: estimates orders and coefficients of all equations together, by maximum likelihood.
 
-    The likelihood is that of white noise.
+    The likelihood assumes white noise.
 
     Orders are continuous, initialization is automatic, and parameters have confidence intervals.
 
@@ -217,8 +217,8 @@ class OutputError:
         check. See :meth:`ftlm.Identification.profile`.
     start
         Additional initial guess: an identification, a model of the same outputs, or values of free parameters by name.
-        The cost of the fit is never larger than that of a fit from this guess alone. A missing coefficient starts at 0.
-        A free order that is fixed in the given model starts at the fixed value.
+        The cost of the fit is never larger than the cost of a fit from this guess alone. A missing coefficient starts
+        at 0. A free order that is fixed in the given model starts at the fixed value.
     reference
         Name of a reference signal of a closed loop in the runs, such as its set point. It serves as external
         instrument: the fit makes residuals orthogonal to sensitivities computed from the part of every input that the

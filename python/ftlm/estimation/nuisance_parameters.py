@@ -356,7 +356,7 @@ def fit_with_initial_conditions(
 def fit_score(joint: JointFit, reference: JointFit) -> float:
     """Return the information criterion of a fit, by which initial conditions and offsets are compared.
 
-    Lower is better. The noise color is that of the fit `reference`.
+    Lower is better. The noise color is taken from the fit `reference`.
     """
     own, others = _pooled_residuals(joint), _pooled_residuals(reference)
     return start_score(own, joint.initial_terms, others)

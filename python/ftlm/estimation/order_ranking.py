@@ -52,8 +52,8 @@ def search_orders(
     """Rank all points of an order grid for one equation, or for coupled equations under an order law.
 
     For each candidate, the coefficients are estimated from the equation error, and the candidate gets a score (Table 2
-    of the paper, steps 5-7). The table of best candidates equals that of a full evaluation of every candidate. It is
-    the same bit for bit for any number of threads on processors of one kind.
+    of the paper, steps 5-7). The table of best candidates equals the table of a full evaluation of every candidate. It
+    is the same bit for bit for any number of threads on processors of one kind.
 
     Parameters
     ----------
@@ -64,9 +64,9 @@ def search_orders(
     order_grid
         Intervals and increment of the orders; see :func:`ftlm.order_grid`.
     criterion
-        Error that is scored. ``"output-error"``: that of a simulation of each equation, whose inputs include the
-        measured other outputs. ``"equation-error"``: that of the equation with measured signals on the right-hand side.
-        It prefers equations that are nearly identities, in which a signal predicts itself.
+        Error that is scored. ``"output-error"``: error of a simulation of each equation, whose inputs include the
+        measured other outputs. ``"equation-error"``: error of the equation with measured signals on the right-hand
+        side. It prefers equations that are nearly identities, in which a signal predicts itself.
     coefficients
         Estimator of the coefficients: ``"multi-innovation"`` (paper (44) in closed form), ``"least-squares"``, or
         ``"instrumental-variables"`` for refined instrumental variables, which noise on the outputs does not bias. With

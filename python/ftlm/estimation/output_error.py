@@ -41,8 +41,8 @@ class UnstableOptimum:
     is_accepted
         Whether the unstable optimum was chosen, because the data require it or no stable optimum exists.
     residual_excess
-        Relative excess of the RMS residuals of the stable optimum over those of the unstable one. Infinite if there is
-        no stable optimum; negative if the unstable point is not an optimum.
+        RMS residual of the stable optimum divided by the RMS residual of the unstable optimum, minus 1. Infinite if
+        there is no stable optimum; negative if the unstable point is not an optimum.
     at_stability_limit
         Whether the stable point lies on the stability limit, so that it is an optimum only under this constraint.
     """

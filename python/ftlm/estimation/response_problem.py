@@ -25,7 +25,7 @@ MAX_EXPONENT = 1.0
 
 
 def exponent_bound(name: str) -> str:
-    """Return a description of the upper bound of an exponent of an impedance, for messages."""
+    """Return a description of an impedance exponent's upper bound, for messages."""
     return f"exponent {name} is at most {MAX_EXPONENT:g}, unless {parameter('orders')} gives more"
 
 

@@ -203,8 +203,8 @@ def design_input(
     Returns
     -------
     DesignedInput
-        Commands, confidence intervals predicted for them, those of the model and of the square wave, and active
-        constraints. ``.save`` writes the commands for a rig.
+        Commands, active constraints, and confidence intervals: of the model now, predicted for the designed input, and
+        predicted for the square wave. ``.save`` writes the commands for a rig.
 
     Raises
     ------

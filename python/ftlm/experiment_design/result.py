@@ -62,12 +62,12 @@ class DesignedInput:
     values
         Values of the free parameters of the model by name.
     errors
-        Standard errors of the free parameters by case. ``"now"``: those of the model. ``"square"`` and ``"designed"``:
-        predicted for a fit to the square wave or to the designed run alone. ``"both"``: predicted for a fit to the
-        designed run together with the estimation runs.
+        Standard errors of the free parameters by case. ``"now"``: intervals of the model. ``"square"`` and
+        ``"designed"``: predicted for a fit to the square wave or to the designed run alone. ``"both"``: predicted for a
+        fit to the designed run together with the estimation runs.
     gain
-        Product of the interval widths of the parameters of interest for the square wave, divided by that for the
-        designed input.
+        Product of the interval widths of all parameters of interest with the square wave, divided by this product with
+        the designed input.
     gains
         Similar ratio for every candidate input, best first, in the measure of the criterion: for D the volume of the
         confidence ellipsoid, for E its longest axis to the power of the number of parameters.

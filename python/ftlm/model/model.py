@@ -354,8 +354,8 @@ class Model:
             ``control.StateSpace`` or ``control.TransferFunction``. The equations represent its transfer functions.
             Uncontrollable or unobservable parts are removed only if they cancel exactly.
         inputs, outputs
-            Names of the signals. By default those of the system, where ``u[0]`` becomes ``u``, or ``u0`` if there are
-            several.
+            Names of the signals. By default the names in the system, where ``u[0]`` becomes ``u``, or ``u0`` if there
+            are several.
 
         Raises
         ------

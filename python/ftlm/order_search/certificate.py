@@ -72,8 +72,8 @@ def certify_orders(
         Minimum difference between alpha and the orders of output terms, and between the orders of one signal. Equations
         with difference 0 are satisfied trivially. Default: the increment of the order grid.
     max_term_ratio
-        Maximum RMS of all terms of an equation together, relative to that of the output. Larger terms, which cancel one
-        another, are not identifiable.
+        Maximum RMS of all terms of an equation together, divided by the RMS of the output. Larger terms, which cancel
+        one another, are not identifiable.
     max_cells
         Maximum number of boxes. When it is reached, the bound so far is returned.
     m

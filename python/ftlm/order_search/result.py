@@ -44,7 +44,7 @@ class OrderCertificate:
     min_separation
         Minimum difference between alpha and the orders of output terms, and between the orders of one signal.
     max_term_ratio
-        Maximum RMS of all terms of an equation together, relative to that of the output.
+        Maximum RMS of all terms of an equation together, divided by the RMS of the output.
     cells
         Number of boxes of orders for which a bound was computed.
     open_cells

@@ -432,8 +432,8 @@ def resume_search(
     Returns
     -------
     dict of SearchResult
-        Results by output, or by ``"stage"`` for a search under an order law. They equal those of uninterrupted searches
-        bit for bit. The results of a complete file are only read.
+        Results by output, or by ``"stage"`` for a search under an order law. They equal the results of uninterrupted
+        searches bit for bit. The results of a complete file are only read.
 
     Raises
     ------

@@ -52,7 +52,7 @@ class ClaimVerdict:
     factors
         Factors on which the outcome depends, the most decisive first.
     cases, holding_cases
-        Number of cases, and of those in which the claim holds.
+        Number of cases, and number of cases in which the claim holds.
     levels
         (level, cases, cases in which it holds) of the first factor.
     """

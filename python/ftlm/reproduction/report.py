@@ -270,7 +270,7 @@ def make_table(
     key
         Key of the table in page.toml.
     rows
-        Rows, or the rows of every angle by name, or those of other groups by heading.
+        Rows, or a mapping to rows from the name of an angle or the heading of another group.
     heads
         Heads of columns besides `COLUMN_HEADS`.
     **values

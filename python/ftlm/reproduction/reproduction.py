@@ -194,7 +194,7 @@ def reproduce(
     genetic
         Seeds and evaluations of the genetic algorithm and of differential evolution. By default there are ten seeds, or
         as many as 20 000 evaluations per angle allow. Each seed has as many evaluations as the compared order grid has
-        candidates. Order grid and norm are those of the comparison and must not be given.
+        candidates. The order grid and the norm come from the comparison and must not be given.
     rivals_increment
         Smallest increment of the order grid on which multi-innovation, the genetic algorithm and differential
         evolution are compared. The paper's 0.05 takes sixteen times as long as the default.

@@ -336,7 +336,7 @@ def resolve_common_initial_conditions(runs: Sequence[Run], structure: Structure)
 
 
 def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Return the excess of squared residuals with few initial terms over those with many, over the noise variance.
+    """Return the sum of squared residuals with few minus with many initial terms, divided by the noise variance.
 
     If the few terms are sufficient, it has a chi-squared distribution. Its degrees of freedom are the number of
     additional terms.

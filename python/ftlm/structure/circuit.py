@@ -234,7 +234,7 @@ class Circuit:
         Raises
         ------
         ModelError
-            If the impedance of an element is not a ratio of powers of s.
+            If the impedance of an element is not a ratio of sums of powers of s.
         """
 
         def product(one: Polynomial, other: Polynomial) -> Polynomial:
@@ -286,7 +286,7 @@ def impedance_and_derivatives(
     w
         Angular frequencies [rad/s].
     more
-        Parameter values by name, in addition to those of the circuit.
+        Parameter values by name, in addition to the values in the circuit.
     node
         Part of the circuit's tree; None for the whole circuit.
     """

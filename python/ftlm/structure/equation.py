@@ -27,9 +27,9 @@ class Term:
     Parameters
     ----------
     signal
-        Name of the signal; in an expression, that of its first signal.
+        Name of the signal; in an expression, the unit of its first signal.
     order
-        Order of the derivative of the signal or of the expression as a whole.
+        Order of the derivative that is applied to the signal, or to the whole expression.
     coefficient
         Name of a free coefficient, or its value.
     factor
@@ -169,8 +169,8 @@ class Stribeck:
 class Friction:
     """Coulomb friction ``factor * coefficient * sign(D output)`` on the output of an equation, set-valued at rest.
 
-    The sign is that of the simulated velocity, not of a measured one. At rest, the sign is replaced by the value in
-    [-1, 1] that keeps the output at rest. If there is no such value, the output slides.
+    The sign is taken from the simulated velocity, not from a measured one. At rest, the sign is replaced by the value
+    in [-1, 1] that keeps the output at rest. If there is no such value, the output slides.
 
     Parameters
     ----------

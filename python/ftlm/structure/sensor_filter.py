@@ -32,8 +32,8 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Raises
     ------
     ModelError
-        If there is no signal, a signal is repeated, a term is invalid, or the order of the numerator exceeds that of
-        the denominator.
+        If there is no signal, a signal is repeated, a term is invalid, or the order of the numerator exceeds the order
+        of the denominator.
     """
 
     signals: tuple[str, ...]

@@ -359,7 +359,7 @@ NO_SCORE = "#9aa3ad"
 class Landscape(Figure):
     """Heat map of scores over two orders, in which the best scores are dark.
 
-    The other orders are fixed at those of the best model.
+    The other orders are fixed at their values in the best model.
 
     Parameters
     ----------

@@ -138,8 +138,8 @@ class Comparison:
     Parameters
     ----------
     output_error, equation_error
-        Metrics by output, over all runs. The output error is that of the simulation; the equation error is that of the
-        equation with measured signals on its right-hand side.
+        Metrics by output, over all runs. The output error is the error of the simulation; the equation error is the
+        error of the equation with measured signals on its right-hand side.
     per_run
         (equation error, output error) of each run by name, each as metrics by output.
     simulated, measured

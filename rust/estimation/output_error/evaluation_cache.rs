@@ -227,7 +227,7 @@ impl EvaluationCache {
         Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref(), self.total))
     }
 
-    /// Samples of the response of the sensor filter of an output to an impulse or its derivative, weighted.
+    /// Return the weighted samples of the sensor filter's response to an impulse or to its derivative.
     pub(crate) fn impulse_samples(&mut self, experiment: &Experiment, output: usize, exponent: f64) -> Vec<f64> {
         let samples = || {
             let mut means = vec![vec![0.0; experiment.record.m()]; experiment.samples.len()];

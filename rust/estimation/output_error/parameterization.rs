@@ -389,7 +389,7 @@ impl TimeUnit {
         Self::from_log_spans(model, &experiments.iter().map(log_span).collect::<Vec<_>>())
     }
 
-    /// Unit of time from the logarithm of sampling interval times duration of each run.
+    /// Choose the unit of time: geometric mean of sampling interval and duration over all runs, divided by π. `spans` holds ln(sampling interval × duration) of each run.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn from_log_spans(model: &FreeModel, spans: &[f64]) -> Self {
         // Geometric mean of the lowest frequency of the record and the Nyquist frequency.

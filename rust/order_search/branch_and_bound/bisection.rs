@@ -247,7 +247,7 @@ fn inverse_correlation(columns: &[usize], product: impl Fn(usize, usize) -> f64)
     small::inverse(&matrix, columns.len())
 }
 
-/// Lower bound of the errors of all candidates of a box.
+/// Lower bound of the error that holds for every candidate of a box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoxBound {
     /// First candidate. The box contains the candidates `first + i·stride + j` with i below `rows` and j below

@@ -242,7 +242,8 @@ pub(crate) struct ResidualSumOfSquares {
     /// Diagonal of the Gram matrix, and its square roots.
     diagonal: Vec<f64>,
     norms: Vec<f64>,
-    /// Rounding-error bound of a residual sum of squares, per unit of the squared sum of the norms of its columns.
+    /// Factor of the rounding-error bound of a residual sum of squares. The bound is this factor times (sum of the
+    /// column norms)².
     unit: f64,
     /// Rounding-error bound of the minimal residual sum of squares over all coefficients.
     slack: f64,
@@ -297,8 +298,7 @@ impl ResidualSumOfSquares {
         &self.norms
     }
 
-    /// Rounding-error bound of a minimal residual sum of squares, per unit of the squared sum of the norms of its
-    /// columns.
+    /// Rounding-error bound of a minimal residual sum of squares, divided by (sum of the column norms)².
     #[inline(always)]
     pub(super) fn slack(&self) -> f64 {
         self.slack

@@ -10,7 +10,8 @@ use crate::simd::Lanes;
 /// Maximum number of common terms of a row, not counting the varying term.
 const MAX_COMMON_TERMS: usize = 7;
 
-/// Factor L D Lᵀ of the correlation matrix of all common terms, and the residual of the target after their regression.
+/// Factor L D Lᵀ of the correlation matrix of all common terms, and the residual of the target's regression on these
+/// terms.
 pub(crate) struct CommonFactor<'a> {
     squares: &'a ResidualSumOfSquares,
     count: usize,
@@ -24,7 +25,7 @@ pub(crate) struct CommonFactor<'a> {
     norms: [f64; MAX_COMMON_TERMS],
     /// Residual sum of squares of the target after the common terms.
     residual: f64,
-    /// Trace of the inverse of the correlation matrix of the common terms, an upper bound of every inverse eigenvalue.
+    /// Trace of the inverse correlation matrix of the common terms. It bounds every inverse eigenvalue from above.
     trace: f64,
 }
 

@@ -21,7 +21,7 @@ use crate::order_search::control::Control;
 use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
 use crate::order_search::result::Failure;
 
-/// Row of one half of the join: values of the free orders of this half, and the addend of the other half.
+/// Row of one half of the join: values of this half's free orders, and the addend that the other half contributes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct HalfRow {
     /// Number of the hash bucket. It is computed from the two addends that the row has in common with matching rows of
@@ -303,7 +303,7 @@ pub(super) const UNEVALUATED_ENTRY: ScoreEntry = ScoreEntry { value: 0.0, class:
 /// Entries of every candidate of every equation.
 pub(super) type ScoreTables = Vec<Vec<ScoreEntry>>;
 
-/// Range of candidates `first … last − 1` of one equation that are evaluated up to a limit of the scaled score.
+/// Candidates `first … last − 1` of one equation. Their evaluation stops at a limit of the scaled score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
     /// Number of the equation.

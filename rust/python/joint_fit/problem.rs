@@ -39,7 +39,7 @@ impl JointProblem {
         run_attached(|| Ok(self.inner.orders.clone()))
     }
 
-    /// Names of the free coefficients, including those of a coefficient law.
+    /// Names of the free coefficients, including the parameters of a coefficient law.
     #[getter]
     fn coefficients(&self) -> PyResult<Vec<String>> {
         run_attached(|| Ok(self.inner.coefficients.clone()))

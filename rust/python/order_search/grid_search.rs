@@ -103,7 +103,8 @@ impl OrderTable {
     }
 }
 
-/// Plan of a search: number of candidates, ends of its generations, and version of the present algorithm.
+/// Return the plan of a search: number of candidates, index after the last batch of each generation, and version of the
+/// present algorithm.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_plan(
@@ -123,7 +124,8 @@ pub fn search_plan(
     })
 }
 
-/// Result of a search from the parts of its batches, for records with this number of samples.
+/// Join the partial results of all batches, and return the result of the search. `samples` is the total number of
+/// samples of the records.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_join<'py>(
