@@ -417,8 +417,8 @@ pub fn grains(order: f64) -> i64 {
     (order * 1e9).round() as i64
 }
 
-/// Largest magnitude of an order law within the bounds of its free orders. A law may exceed the range of one order,
-/// which is checked at every point. The memory of tables by integer order is proportional to this limit.
+/// Maximum magnitude of an order law within the bounds of its free orders. A law may exceed the range of one order,
+/// because the range is checked at every point. The memory of tables by integer order is proportional to this limit.
 pub const MAX_REACHED_ORDER: f64 = 100.0;
 
 /// An affine order law: constant + Σ weight·free order.
@@ -513,8 +513,8 @@ impl Filter {
     }
 }
 
-/// Largest number of equations that is checked. The check examines all 2^n sets of columns, so larger systems are not
-/// checked.
+/// Maximum number n of equations for which the check is done. It examines all 2^n sets of columns, so larger systems
+/// are not checked.
 const MOST_EQUATIONS: usize = 16;
 
 /// Leading term of a polynomial entry: order, coefficient, and sum of the absolute values added to that coefficient.

@@ -73,9 +73,9 @@ pub enum Error {
     /// Order grid with too many candidates.
     #[error("the order grid has up to {count} candidates, more than the limit of {limit}; at 10 ns per candidate, the best case, a search takes {} on one core; take a larger step, narrower intervals or fixed orders", format_search_time(*count))]
     OrderGridTooLarge {
-        /// Number of candidates, or of all tuples of the axes if they were not enumerated.
+        /// Number of candidates. If they were not enumerated, the number of all tuples of the axes.
         count: u128,
-        /// Largest number of candidates.
+        /// Maximum number of candidates.
         limit: u128,
     },
     /// Bank of regressors over the memory limit.
@@ -257,7 +257,7 @@ fn format_number(value: f64) -> String {
     }
 }
 
-/// Shortest duration of a search over so many candidates, at 10 ns each, as text.
+/// Return the minimum duration of a search over `count` candidates as text, at 10 ns per candidate.
 #[allow(clippy::cast_precision_loss)]
 fn format_search_time(candidates: u128) -> String {
     let seconds = candidates as f64 * 1e-8;
@@ -320,7 +320,7 @@ pub fn check_memory(what: impl FnOnce() -> String, bytes: usize, limit: usize) -
     Err(Error::Memory { what: what(), bytes: bytes as u128, limit: limit as u128 })
 }
 
-/// Largest size of a dense matrix: two gigabytes. Dense matrices serve study only.
+/// Maximum number of rows of a dense matrix, which then takes two gigabytes. Dense matrices serve study only.
 pub const LARGEST_DENSE: usize = 1 << 14;
 
 /// Return an error for a dense matrix without rows or with more than [`LARGEST_DENSE`].

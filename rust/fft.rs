@@ -48,7 +48,7 @@ pub fn fast_length(n: usize) -> usize {
     }
 }
 
-/// Longest transform whose plan is never evicted. A plan takes about 20 bytes a point.
+/// Maximum length of a transform whose plan is never evicted from the cache. A plan takes about 20 bytes per point.
 const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
 /// Total points of longer plans above which the least recently used are evicted.
 ///

@@ -323,6 +323,6 @@ fn exceeds_growth_limit(series: &[f64]) -> bool {
     !(second <= MAX_SERIES_GROWTH * first && first.is_finite())
 }
 
-/// Largest ratio of the second half to the first. The rounding error of a transform, 1e−12 of its largest value, then
-/// affects half of the digits.
+/// Maximum ratio of the peaks in the second and the first half of a series. At this ratio the rounding error of a
+/// transform, 1e−12 of the largest value, affects half of the digits.
 const MAX_SERIES_GROWTH: f64 = 1e3;

@@ -6,8 +6,8 @@ use faer::{Accum, Mat, MatRef, Par};
 use crate::linalg::orthogonal;
 use crate::parallel::{self, Stop};
 
-/// Smallest number of rows in one part of a product of long columns. The parts, at most [`MAX_ROW_PARTS`], do not
-/// depend on the number of threads, so neither do the sums.
+/// Minimum number of rows in one block of a product of long columns. There are at most [`MAX_ROW_PARTS`] blocks. They
+/// do not depend on the number of threads, so neither do the sums.
 const MIN_PART_ROWS: usize = 1 << 14;
 const MAX_ROW_PARTS: usize = 16;
 /// Number of columns in a tile of a Gram matrix product.
@@ -78,7 +78,7 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     out
 }
 
-/// First row and number of rows of each part of a product.
+/// Return (first row, number of rows) of each row block of a product.
 fn pieces(m: usize) -> Vec<(usize, usize)> {
     let len = m.div_ceil(MAX_ROW_PARTS).max(MIN_PART_ROWS);
     (0..m).step_by(len).map(|from| (from, len.min(m - from))).collect()

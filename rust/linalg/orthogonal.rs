@@ -10,7 +10,7 @@ const QR_BLOCK_ROWS: usize = 1 << 10;
 /// Number of directions that are projected out between two checks for cancellation.
 const AT_ONCE: usize = 16;
 
-/// Smallest squared norm in factorizations. Below it, or above [`MAX_SQUARED_NORM`], sums of squares lose accuracy or
+/// Minimum squared norm in factorizations. Below it, or above [`MAX_SQUARED_NORM`], sums of squares lose accuracy or
 /// overflow.
 const MIN_SQUARED_NORM: f64 = 1e-280;
 const MAX_SQUARED_NORM: f64 = 1e280;

@@ -9,7 +9,8 @@ use crate::series::{Buffers, Kernel};
 
 /// Length of a block that is summed directly. Transforms of shorter blocks are slower.
 const DIRECT_SUM_LENGTH: usize = 64;
-/// Largest integer order whose kernel is summed as a polynomial. Sums of higher ones lose digits on long runs.
+/// Maximum integer order whose kernel is summed as a polynomial. Running sums of higher orders lose digits on long
+/// runs.
 const MAX_POLYNOMIAL_ORDER: usize = 3;
 
 /// Kernel of an online convolution, shared by all signals.
@@ -40,8 +41,8 @@ impl ConvolutionKernel {
         Self { values, memory: Memory::Blocks(spectra) }
     }
 
-    /// Kernel of an integral of this order, given its values. For integer orders it is a polynomial in the lag from lag
-    /// 1 on. Up to order 3, running sums then replace the transforms.
+    /// Kernel of the integral I^order, whose values are given. For integer orders it is a polynomial in the lag from
+    /// lag 1 on. Running sums then replace the transforms up to order 3.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn of_integral(order: f64, values: Vec<f64>) -> Self {

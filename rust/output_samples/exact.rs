@@ -10,7 +10,7 @@ use crate::recording::{Role, MIN_SIGNAL_PEAK};
 use crate::state_space::{self, InputSignal};
 
 impl OutputSimulation {
-    /// Exact samples of a model with integer orders; None if the model has to be discretized by block pulses.
+    /// Return exact samples of a model with integer orders. None if the model must be discretized by block pulses.
     ///
     /// Block pulses are needed for fractional orders, friction, a sensor filter, nonuniform samples, missing samples of
     /// inputs, and equations that are singular or nearly singular.

@@ -20,7 +20,7 @@ const RATIO_TEST_GRIDS: usize = 4;
 /// Function (finer rows, coarser rows) that returns the change of each output relative to its largest value.
 pub(super) type Measure<'a> = &'a dyn Fn(&Rows, &Rows) -> Vec<f64>;
 
-/// Largest absolute value; NaN if any value is.
+/// Return the largest absolute value; NaN if any value is NaN.
 pub(super) fn peak(row: &[f64]) -> f64 {
     row.iter().fold(0.0, |most: f64, v| if v.is_nan() || most.is_nan() { f64::NAN } else { most.max(v.abs()) })
 }
@@ -59,7 +59,7 @@ impl LimitEstimate {
     }
 }
 
-/// Largest change; infinite if a change is unknown.
+/// Return the largest change; infinite if a change is NaN.
 fn largest_change(change: &[f64]) -> f64 {
     change.iter().fold(0.0, |most: f64, c| if c.is_nan() { f64::INFINITY } else { most.max(*c) })
 }

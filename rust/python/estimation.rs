@@ -161,9 +161,9 @@ pub fn instrumental_variables(
 /// Nonuniform samples: (sample positions in pulses, positions and sizes of the jumps of each held signal).
 pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
-/// Experiment from a dictionary with these keys: record, pulses per sampling interval, samples of each output, filter
-/// of the simulated outputs, weight of each output, (values at the samples, whether held) of each signal, robust
-/// weights of the samples of each output, nonuniform sample times.
+/// Experiment from a dictionary with the names of these fields as keys. `samples` and `robust_weights` have one row per
+/// output. `filter` is (series, flag per output) of the filter of simulated outputs. `signals` holds (values at the
+/// samples, true for a zero-order hold) of each signal.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct ExperimentFields<'py> {

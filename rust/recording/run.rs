@@ -17,7 +17,7 @@ use crate::signal::nonuniform::{check_times, interpolate, interpolate_gaps, Nonu
 
 /// Minimum number of samples of a recording.
 const MIN_SAMPLES: usize = 3;
-/// Smallest peak of a signal that is not zero. Squares of smaller signals underflow.
+/// Minimum peak of a nonzero signal. Squares of smaller signals underflow.
 pub(crate) const MIN_SIGNAL_PEAK: f64 = 1e-140;
 
 /// Sampling of the runs: step, decimation and length.

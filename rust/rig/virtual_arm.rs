@@ -26,7 +26,7 @@ pub struct Sensors {
     pub range: f64,
     /// Resolution of the converters in bits. 0 disables quantization.
     pub bits: u32,
-    /// Largest current of the amplifiers \[A\].
+    /// Maximum current that each amplifier supplies \[A\].
     pub current_limit: [f64; 2],
     /// Disturbance of each motor current while its amplifier is enabled \[A\].
     pub offset: [f64; 2],
@@ -225,7 +225,8 @@ fn outside(name: &str, value: f64, range: &str) -> Error {
     }
 }
 
-/// Highest resolution of the converters. With more bits the quantization step is below the rounding error of the volts.
+/// Maximum resolution of the converters in bits. With more bits the quantization step is below the rounding error of a
+/// voltage.
 const MOST_BITS: u32 = 52;
 
 impl Sensors {
@@ -284,7 +285,7 @@ pub struct Pace {
 /// Time before a deadline of busy waiting, because a sleep ends late by some tens of microseconds.
 const SPIN_WAIT: Duration = Duration::from_micros(120);
 
-/// Longest sampling interval in real time \[s\], one day, so that times do not overflow.
+/// Maximum sampling interval in real time \[s\]: one day, so that times do not overflow.
 const LONGEST_STEP: f64 = 86_400.0;
 
 impl Pace {

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 
 use crate::fft::{self, Bin, Plan, Workspace};
 
-/// Largest length of the shorter factor of a direct product. Up to it, direct products are faster and have no rounding
+/// Maximum length of the shorter factor of a direct product. Up to it, direct products are faster and have no rounding
 /// error of transforms.
 const MAX_DIRECT_TERMS: usize = 64;
 
@@ -65,7 +65,7 @@ pub fn multiply_signals(series: &[f64], signals: &mut [f64]) {
     }
 }
 
-/// Longest transform whose buffers a thread reuses.
+/// Maximum length of a transform whose buffers a thread reuses.
 const MAX_REUSED_BUFFER_POINTS: usize = 1 << 17;
 
 thread_local!(static BUFFERS: RefCell<Buffers> = RefCell::default());

@@ -9,7 +9,7 @@ use crate::error::{check_length, Error, Result};
 use crate::linalg::small;
 use crate::simd::{dispatch_simd, SimdKernel};
 
-/// Highest order of an integral. For higher orders transforms are as fast.
+/// Maximum order of an integral. For higher orders transforms are as fast.
 pub const MAX_SUMS: usize = 6;
 
 /// Number of right-hand sides solved in parallel lanes, which hides the latency of the recursion.

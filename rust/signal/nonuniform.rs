@@ -8,9 +8,9 @@ use std::borrow::Cow;
 use super::block_pulse::{check_pulses, Intersample, PulseMeans};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 
-/// Largest distance of a sample time from a pulse edge, in pulses, at which the two coincide.
+/// Tolerance in pulses: a sample time within this distance of a pulse edge counts as the edge.
 const EDGE_TOLERANCE_PULSES: f64 = 1e-6;
-/// Relative tolerance of comparisons of times, as a share of the duration.
+/// Tolerance for comparing times, as a fraction of the duration.
 pub(crate) const TIME_TOLERANCE: f64 = 1e-12;
 
 /// Samples of one signal with their times \[s\].

@@ -8,7 +8,7 @@
 use crate::equation::{Equation, Structure};
 use crate::error::{Error, Result};
 
-/// Largest number of iterations accepted: an iteration that has not converged by then cycles.
+/// Maximum permitted number of iterations. An iteration that has not converged by then cycles.
 const MAX_ITERATIONS: usize = 1000;
 
 /// Termination criteria of the iteration.

@@ -28,7 +28,7 @@ const MULTISTART_PROGRESS_SHARE: f64 = 0.5;
 const SWEEP_PROGRESS_SHARE: f64 = 0.3;
 /// Noise standard deviation assumed in a coarse fit, relative to the standard deviation of the output.
 const COARSE_RESIDUAL_RATIO: f64 = 0.01;
-/// Smallest noise standard deviation of an output in a warm start, relative to the standard deviation of the output.
+/// Minimum noise standard deviation of an output in a warm start, relative to the standard deviation of the output.
 const MIN_NOISE_RATIO: f64 = 1e-3;
 const MIN_NOISE_DEVIATION: f64 = 1e-300;
 /// Maximum number of evaluations of each survivor of the multistart on all samples, or on the first part of a long

@@ -16,7 +16,7 @@ pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
 /// Increase of twice the log-likelihood predicted for a full step below which a fit that is only compared with others
 /// has converged.
 const COMPARISON_LIKELIHOOD_TOLERANCE: f64 = 2e-4;
-/// Largest acceptable discretization error, in standard deviations of the noise.
+/// Maximum acceptable discretization error, in standard deviations of the noise.
 const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
 /// Finest grid, in block pulses per sampling interval.
 pub const MAX_PULSES_PER_SAMPLE: usize = 16;

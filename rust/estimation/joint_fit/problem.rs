@@ -233,7 +233,7 @@ impl OptimizationResult {
     }
 }
 
-/// Smallest difference between the highest order of an equation and the orders of its autoregressive terms.
+/// Minimum difference between the highest order of an equation and the orders of its autoregressive terms.
 const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 /// Rounding error of the difference of two orders, each rounded to 1e-9. Orders of other signals may equal the highest.
 const ORDER_ROUNDING_TOLERANCE: f64 = 2e-9;

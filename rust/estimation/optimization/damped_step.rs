@@ -14,7 +14,7 @@ use crate::linalg::orthogonal::norm;
 use crate::linalg::small::{self, back_substitute};
 use crate::signal::statistics::inner;
 
-/// Smallest damping; below it the rounding error of the QR factor dominates.
+/// Minimum damping. Below it the rounding error of the QR factor dominates.
 pub(crate) const MIN_DAMPING: f64 = 1e-12;
 /// Distance from a linear constraint up to which it is active. The distance is the change of the residuals, relative to
 /// their norm.
@@ -495,7 +495,7 @@ const MAX_GAIN_PER_STEP: f64 = 1e-3;
 const MAX_TRIAL_EVALUATIONS: usize = 6;
 /// Initial factor by which the sum of the steps is multiplied.
 const INITIAL_EXTRAPOLATION_FACTOR: f64 = 2.0;
-/// Largest factor by which the sum of the steps is multiplied.
+/// Maximum factor by which the sum of the steps is multiplied.
 const MAX_EXTRAPOLATION_FACTOR: f64 = 16.0;
 
 /// Last steps of a minimization, and the point before a trial extrapolation.

@@ -23,7 +23,8 @@ const MAX_POWERS_LONG_RECORD: usize = 8;
 /// Maximum number of cached powers of t for short records.
 const MAX_POWERS_SHORT_RECORD: usize = 64;
 
-/// Smallest length of a run relative to the longest on its grid; shorter runs would need unnecessarily long transforms.
+/// Minimum length of a run divided by the longest run with the same cache. Shorter runs would need unnecessarily long
+/// transforms.
 const MIN_LENGTH_RATIO: f64 = 0.7;
 
 /// Cache of runs with the same step and filter: kernels, powers of t, and A⁻¹ at the last point, for the longest run.

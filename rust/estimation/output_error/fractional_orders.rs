@@ -512,7 +512,7 @@ mod tests {
         value.ok_or_else(|| Error::Diverged { what: "experiments without exact samples".into(), index: 0 })
     }
 
-    /// Largest difference, relative to the largest value.
+    /// Return the largest difference, divided by the largest absolute value of `exact`.
     fn distance(actual: &[f64], exact: &[f64]) -> f64 {
         assert_eq!(actual.len(), exact.len());
         let peak = exact.iter().fold(0.0, |most: f64, v| most.max(v.abs()));

@@ -23,10 +23,10 @@ use crate::state_space::{InputGains, Transition};
 
 /// Difference below which an order or exponent is an integer.
 const INTEGER_TOLERANCE: f64 = 1e-9;
-/// Largest order of an equation.
+/// Maximum order of an equation.
 const MAX_ORDER: usize = 12;
-/// Largest magnitude of a pole times the sampling interval, at the Nyquist frequency. The effect of faster poles on the
-/// samples is not distinguishable from noise.
+/// Maximum of the magnitude of a pole times the sampling interval: the Nyquist frequency. The effect of faster poles on
+/// the samples is not distinguishable from noise.
 const MAX_POLE_PHASE_RAD: f64 = std::f64::consts::PI;
 
 /// Equations of integer orders whose inputs are held or linear in every experiment.

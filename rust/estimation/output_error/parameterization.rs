@@ -368,7 +368,7 @@ impl InputLaw {
     }
 }
 
-/// Largest logarithm of a scaling factor; larger logarithms are clipped.
+/// Maximum logarithm of a scaling factor. Larger logarithms are clipped.
 const MAX_LOG_FACTOR: f64 = 300.0;
 /// Difference below which two exponents of time are equal.
 const EXPONENT_TOLERANCE: f64 = 1e-9;

@@ -22,7 +22,8 @@ use crate::linalg::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, RunningSumSystem, SumOfProducts};
 
-/// Smallest difference of α and the order of an autoregressive term. At 0 the equation would not depend on the input.
+/// Minimum difference between α and the order of an autoregressive term. At 0 the equation would not depend on the
+/// input.
 pub(crate) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
 /// Response of an experiment to an initial term: equation, weighted samples, pulse means.

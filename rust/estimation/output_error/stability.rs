@@ -2,12 +2,12 @@
 
 use std::f64::consts::PI;
 
-/// Ratio of one power of s to the sum of all others, above which the range of frequencies ends.
+/// Ratio of one term's magnitude to the sum of all other terms. The frequency range ends where it is exceeded.
 const DOMINANCE_RATIO: f64 = 1e3;
-/// Largest step in ln ω. A pole closer to the imaginary axis than [`MIN_LOG_FREQUENCY_STEP`] counts as on the axis.
+/// Maximum step in ln ω. A pole closer to the imaginary axis than [`MIN_LOG_FREQUENCY_STEP`] counts as on the axis.
 const MAX_LOG_FREQUENCY_STEP: f64 = 0.25;
 const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
-/// Largest change of the angle of the curve \[rad\] between two points.
+/// Maximum change of the curve's angle between two points \[rad\].
 const MAX_ANGLE_STEP_RAD: f64 = 0.5;
 /// Difference below which two exponents of s are merged: they are distinguishable only beyond ω = e^1000.
 const EXPONENT_TOLERANCE: f64 = 1e-3;

@@ -27,7 +27,7 @@ pub(super) struct Node {
 /// Largest sums of coefficients over an interval of values.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CoefficientSums {
-    /// Largest sum of the moduli of the coefficients of û.
+    /// Maximum over the interval of Σ|c|, where c are the coefficients of û.
     pub(super) sum: f64,
 }
 

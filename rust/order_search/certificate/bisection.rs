@@ -28,7 +28,7 @@ const MIDPOINTS_PER_PASS: usize = 4;
 pub struct CertificateOptions {
     /// Relative tolerance: no orders may have an error below (1 − tolerance) times the best error found.
     pub tolerance: f64,
-    /// Largest sum of the terms' norms relative to the output: Σ ‖c x‖ ≤ `max_coefficient`·‖y‖.
+    /// Maximum sum of the terms' norms, relative to the norm of the output y: Σ ‖c x‖ ≤ `max_coefficient`·‖y‖.
     pub max_coefficient: f64,
     /// Maximum number of cells. If it is reached, the bisection ends with the bound proved up to then.
     pub max_cells: u64,

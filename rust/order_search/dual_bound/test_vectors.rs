@@ -15,7 +15,7 @@ use crate::simd::LANE_COUNT;
 /// One value for each of [`LANE_COUNT`] test vectors.
 pub(super) type Wide = [f64; LANE_COUNT];
 
-/// Lowest frequency of a test vector [cycles per record].
+/// Minimum frequency of a test vector [cycles per record].
 const MIN_CYCLES_PER_RECORD: f64 = 0.3;
 
 /// Memory of the spectra of test vectors per batch \[bytes\].

@@ -16,7 +16,7 @@ use crate::signal::statistics::white_noise_deviation;
 
 /// Time over which a velocity is measured, as a fraction of the duration of the run.
 const VELOCITY_SPAN_FRACTION: f64 = 0.01;
-/// Smallest motion over that time that counts as sliding, in standard deviations of the noise.
+/// Minimum motion within that time that counts as sliding, in standard deviations of the noise.
 const VELOCITY_NOISE_RATIO: f64 = 5.0;
 /// Iterations in which the friction force at rest is recomputed from the input forces.
 const MAX_REST_ITERATIONS: usize = 4;

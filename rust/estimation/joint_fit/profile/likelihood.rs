@@ -24,7 +24,7 @@ const REFIT_TOLERANCE: f64 = 1e-4;
 const LOWER_OPTIMUM_MARGIN: f64 = 0.02;
 /// Relative change of another parameter in one step above which power laws are also tried as initial guesses.
 const POWER_LAW_MOVE_RATIO: f64 = 0.3;
-/// Largest exponent of these power laws.
+/// Maximum exponent of these power laws.
 const MAX_POWER_LAW_EXPONENT: f64 = 4.0;
 /// Relative singular value below which a direction of the other parameters has no effect.
 const SINGULAR_VALUE_TOLERANCE: f64 = 1e-12;
