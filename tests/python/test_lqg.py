@@ -462,7 +462,7 @@ def test_intervals_too_wide_for_a_path_are_refused_in_words():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"distance": math.nan}, "size = nan"),
+        ({"distance": math.nan}, "distance = nan"),
         ({"distance": "20"}, "distance = '20'"),
         ({"duration": 0.0}, "duration = 0.0"),
         ({"duration": 0.01}, "fewer than ten samples"),

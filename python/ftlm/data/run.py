@@ -64,7 +64,7 @@ class Run:
     name : str
         Name of the run in reports.
     step, start : float
-        Sampling interval and source time of the first sample [s].
+        Sampling interval, and time of the first sample on the time axis of the file [s].
     inputs, outputs : tuple of str
         Names of the signals.
     notes : tuple of str
@@ -375,7 +375,7 @@ class Run:
         Returns
         -------
         Run
-            Run whose `start` is the source time of its first row.
+            Run whose `start` is the time of its first row on the time axis of the file.
 
         Raises
         ------
