@@ -1,5 +1,7 @@
 """Findings that weigh as much as they show: noise that buries, a coupling that is left out, a design in doubt."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lsim, lti
@@ -115,13 +117,19 @@ def test_an_outlier_at_an_end_of_the_run_is_named_and_not_taken_for_a_poor_model
 
 def test_a_flexible_link_names_what_it_leaves_out_of_an_arm():
     left = [make_finding("residuals_not_white", output="theta11")]
-    (said,) = arm_findings(ftlm.flexible_link(stage=1), left)
-    assert said.numbers["parts"] == "dry friction of the hubs and the other link"
-    assert "friction=" in said.remedy
-    assert "cross_stage='inertial'" in said.remedy
+    friction, link = arm_findings(ftlm.flexible_link(stage=1), left)
+    assert "dry friction of the hubs" in friction.text
+    assert "friction=" in friction.remedy
+    assert "cross_stage" not in friction.remedy
+    assert "the other link" in link.text
+    assert "cross_stage='inertial'" in link.remedy
     # It leads what shares its topic.
-    assert group_findings([*left, said])[0].first_finding is said
+    assert group_findings([*left, friction])[0].first_finding is friction
     both = ftlm.flexible_link(stage="both", coupling="simulated", friction=True, cross_stage="inertial")
     assert arm_findings(both, left) == []
     assert arm_findings(ftlm.flexible_link(stage=1), []) == []
+    # A deflection that follows measured hubs of both stages omits neither.
+    inertial = ftlm.flexible_link(stage=1, cross_stage="inertial", coupling="measured")
+    deflection = replace(inertial, equations=inertial.equations[1:])
+    assert arm_findings(deflection, [make_finding("residuals_not_white", output="theta12")]) == []
     assert arm_findings(ftlm.equation("D y = a y + b u"), left) == []

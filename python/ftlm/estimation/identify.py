@@ -701,14 +701,18 @@ def _coupling_finding(item: Finding, structure: Structure) -> Finding:
 
 
 def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Finding]:
-    """Return a finding on the effects that the flexible-link model neglects, if residual tests fail."""
+    """Return findings on the effects that the flexible-link model neglects, if residual tests fail.
+
+    The friction of a hub acts on its own equation. It enters that of a deflection only by the angle of the hub.
+    """
     if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in LEFT_OUT_CODES for f in findings):
         return []
-    parts = [] if structure.has_friction else ["dry friction of the hubs"]
-    stages = {name[len("theta")] for name in structure.signals if name.startswith("theta")}
-    parts += ["the other link"] if len(stages) == 1 else []
     outputs = enumerate_names(list(dict.fromkeys(f.output for f in findings if f.code in LEFT_OUT_CODES)))
-    return [make_finding("arm_leaves_out", output=outputs, parts=enumerate_names(parts))] if parts else []
+    stages = {name[len("theta")] for name in structure.signals if name.startswith("theta")}
+    has_hub = not {"theta11", "theta21"}.isdisjoint(structure.outputs)
+    kinds = ["hub_friction_missing"] if has_hub and not structure.has_friction else []
+    kinds += ["other_link_missing"] if len(stages) == 1 else []
+    return [make_finding(kind, output=outputs) for kind in kinds]
 
 
 def _with_feedback_bias(fit: Fit, tests: Residuals) -> Residuals:
