@@ -223,7 +223,7 @@ def demo_details(demo: Demo) -> str:
 
 
 def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the demonstration as one HTML page: verdicts, fits on the validation run, then the tables of each stage."""
+    """Write the demonstration as one HTML page: verdicts, the validation run, fits, then the tables of each stage."""
     boxes = Markup("").join(
         verdict_box(checked.verdict, f"Stage {stage}, output error: ")
         for stage, checked in demo.validations.items()
@@ -238,10 +238,16 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
             title="Fit of the free run",
         )
     ]
+    predictions = [
+        chart
+        for stage, checked in demo.validations.items()
+        for chart in comparison_charts(checked, units=demo.results[stage]["output error"].model.units)
+    ]
     sections = [
+        Section("Validation: measured and simulated", figures=predictions),
         Section("Which model predicts", figures=bars, small=True),
         *(_stage_section(demo, stage) for stage in demo.results),
-        Section("Validation", tables=[fits_table(stage) for stage in demo.stages.values()]),
+        Section("Fits", tables=[fits_table(stage) for stage in demo.stages.values()]),
     ]
     return write_page(
         path, title="ftlm demo", sections=sections, lead=page_text("demo_lead"), force=force, verdict=boxes
@@ -254,7 +260,6 @@ def _stage_section(demo: Demo, stage: int) -> Section:
     best = results["output error"]
     compared = {
         "output error, square run": best.comparison,
-        "output error, sine run": demo.validations[stage],
         "multi-innovation, p = 7, square run": results["p = 7"].comparison,
     }
     charts: list[Figure] = [
