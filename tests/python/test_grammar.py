@@ -1,6 +1,7 @@
 """Equations as people write them: forms that mean the same, transfer functions, and texts that are printed and read."""
 
 import itertools
+import unicodedata
 
 import numpy as np
 import pytest
@@ -246,3 +247,11 @@ def test_a_polynomial_with_too_many_products_of_coefficients_is_refused():
     factors = " ".join(f"(p{k} s + q{k})" for k in range(20))
     with pytest.raises(ftlm.ModelError, match="more than 200 terms after multiplication"):
         ftlm.equation(f"y = 1/({factors}) u")
+
+
+@pytest.mark.parametrize("name", ["größe", "ü", "ö_1", "Fläche", "fu\u0308r", "é", "żółw"])
+def test_dotted_letters_of_a_language_are_no_derivatives(name):
+    assert str(ftlm.equation(f"D {name} = a {name} + b u")) == str(
+        ftlm.equation(f"D {unicodedata.normalize('NFC', name)} = a {unicodedata.normalize('NFC', name)} + b u")
+    )
+    assert unicodedata.normalize("NFC", name) in ftlm.equation(f"D {name} = a {name} + b u").outputs

@@ -63,16 +63,23 @@ MAX_LEIBNIZ_TOKENS = 8
 #: Signs of printed texts, by the symbols of the grammar.
 _PRINTED_SIGNS = str.maketrans("−·⋅×", "-***")
 _SUPERSCRIPT_PATTERN = re.compile("[⁰¹²³⁴-⁹]+")
-#: A signal under combining dots, with the rest of its name.
-_DOTTED_PATTERN = re.compile(r"([^\W\d_])([\u0307\u0308\u20db]+)(\w*)")
+#: A signal of one letter, perhaps under combining dots, with its subscript.
+_DOTTED_PATTERN = re.compile(
+    r"(?<![\w\u0307\u0308\u20db])([^\W\d_][\u0307\u0308\u20db]*)((?:_\w*|\d+)?)(?![\w\u0307\u0308\u20db])"
+)
 #: Order of the derivative that a combining dot, two dots and three dots stand for.
 _DOT_ORDERS = {"\u0307": 1, "\u0308": 2, "\u20db": 3}
+#: Letters of alphabets, whose dots are no derivative.
+_UMLAUT_LETTERS = "äëïöüÄËÏÖÜ"
 
 
 def _prime_notation(dotted: re.Match[str]) -> str:
-    """Return a signal with combining dots as the signal with primes."""
-    letter, dots, rest = dotted.groups()
-    return f"{letter}{rest}{chr(39) * sum(_DOT_ORDERS[dot] for dot in dots)}"
+    """Return a signal of one letter under dots as the signal with primes; other names are unchanged."""
+    name, rest = dotted.groups()
+    parts = unicodedata.normalize("NFD", name)
+    if name in _UMLAUT_LETTERS or not set(parts[1:]) <= set(_DOT_ORDERS):
+        return dotted.group()
+    return f"{parts[0]}{rest}{chr(39) * sum(_DOT_ORDERS[dot] for dot in parts[1:])}"
 
 
 #: What follows the name of an offset in parentheses, by the kind of offset.
@@ -144,8 +151,7 @@ class EquationParser:
 
     def __init__(self, text: str, signals: Collection[str] = ()) -> None:
         text = _SUPERSCRIPT_PATTERN.sub(lambda power: "^" + unicodedata.normalize("NFKC", power[0]), text)
-        text = _DOTTED_PATTERN.sub(_prime_notation, unicodedata.normalize("NFD", text))
-        text = unicodedata.normalize("NFC", text)
+        text = _DOTTED_PATTERN.sub(_prime_notation, unicodedata.normalize("NFC", text))
         self.text = text
         self._signals = signals
         self._depth = 0
