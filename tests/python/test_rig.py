@@ -452,6 +452,12 @@ def test_live_estimates_are_shown(tmp_path, capsys):
     assert "1.00 s: a3 = " in shown.err
 
 
+def test_a_live_estimate_whose_simulation_fails_says_so(tmp_path, capsys):
+    # Friction and the other link act on the default arm, which equation errors do not show.
+    assert command("record", "-o", tmp_path / "run.csv", "--live", "flexible-link:1") == 0
+    assert "live: DO NOT USE: the simulation explains little of theta12" in capsys.readouterr().err
+
+
 def test_a_live_estimate_is_of_the_equation_that_identify_takes_and_its_prior_is_named(tmp_path, capsys):
     words = ("record", "--parameters", "linear", "--input", "prbs", "--duration", 4, "--live", "flexible-link:1")
     assert command(*words, "-o", tmp_path / "weak.csv") == 0

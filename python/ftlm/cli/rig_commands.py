@@ -19,7 +19,10 @@ from ftlm.cli.framework import NonNegative, command, numbers, parse_numbers
 from ftlm.cli.reading_options import given_fields
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, ModelError
+from ftlm.estimation.identify import identify
 from ftlm.estimation.linear import Streaming, estimate_coefficients
+from ftlm.estimation.methods import MultiInnovation
+from ftlm.estimation.verdict import Verdict
 from ftlm.findings import Finding
 from ftlm.order_search.options import SearchSettings
 from ftlm.progress import Progress
@@ -128,19 +131,25 @@ class LiveOptions:
     @property
     def settings(self) -> SearchSettings:
         """Return the settings of the estimate after the last sample."""
-        options = {
-            n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance") and v is not None
-        }
-        return SearchSettings(row_basis="time", **options)
+        return SearchSettings(**self._options)
 
-    def findings(self, run: Run, stream: Streaming) -> list[Finding]:
-        """Return the findings on the estimate of a stream after a recorded run."""
+    @property
+    def _options(self) -> dict[str, Any]:
+        given = {n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance")}
+        return {"row_basis": "time", **{n: v for n, v in given.items() if v is not None}}
+
+    def judge(self, run: Run, stream: Streaming) -> tuple[Verdict, list[Finding]] | None:
+        """Return the verdict on the estimate of a stream after a recorded run, and findings about the estimator.
+
+        The result is None for a run that was stopped too early for an estimate.
+        """
+        structure = replace(stream.structure, initial="rest")
         try:
-            fit = estimate_coefficients([run], replace(stream.structure, initial="rest"), self.settings, stream.pulses)
+            own = estimate_coefficients([run], structure, self.settings, stream.pulses).findings
+            result = identify(run, structure, method=MultiInnovation(**self._options), m=stream.pulses)
         except FtlmError:
-            # A run that was stopped early.
-            return []
-        return fit.findings
+            return None
+        return result.verdict, own
 
 
 @command
@@ -237,8 +246,10 @@ def record(
         signals.restore()
     if stream is not None:
         print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
-        for finding in live.findings(run, stream):
-            print(f"! {finding}", file=sys.stderr)
+        judgement = live.judge(run, stream)
+        if judgement is not None:
+            verdict, findings = judgement
+            print(f"live: {verdict}", *(f"! {finding}" for finding in findings), sep="\n", file=sys.stderr)
     if as_json:
         summary = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}
         print(json.dumps(summary, indent=1, ensure_ascii=False))
