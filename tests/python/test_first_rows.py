@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 from scipy.stats import beta
@@ -508,6 +509,25 @@ def test_an_integrating_plant_has_its_rate_despite_an_offset_of_its_input(words,
         error = abs(result.coefficients["b"] - num[0])
         assert error < 4 * result.standard_errors["b"]
         assert error < 0.05 * num[0]
+
+
+def test_a_nonlinear_plant_with_an_offset_of_its_input_agrees_with_its_differential_equation():
+    # y'' = -0.8 y' - 4 y^3 + u - 0.5 by an adaptive solver of ordinary differential equations.
+    g, h = np.random.default_rng(0), 0.02
+    u = np.repeat(g.uniform(-3.0, 3.0, 40), 25)
+    state, y = np.zeros(2), []
+    for value in u:
+        y.append(state[0])
+        motion = solve_ivp(
+            lambda _, x, f=value: [x[1], -0.8 * x[1] - 4.0 * x[0] ** 3 + f], (0.0, h), state, rtol=1e-9, atol=1e-10
+        )
+        state = motion.y[:, -1]
+    run = run_of(u + 0.5, np.array(y) + 0.005 * g.standard_normal(u.size), h)
+    result = ftlm.identify(run, ftlm.equation("D^2 y = -d D y - k y^3 + b u"))
+    assert "constant_estimated" in codes(result)
+    for name, true in (("d", 0.8), ("k", 4.0), ("b", 1.0)):
+        assert abs(result.coefficients[name] - true) < 4 * result.standard_errors[name]
+    assert result.comparison.offsets[0]["y"]["constant"] == pytest.approx(-0.5, abs=0.02)
 
 
 def test_colored_noise_of_an_integrator_is_rarely_taken_for_an_offset():

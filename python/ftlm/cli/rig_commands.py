@@ -20,11 +20,9 @@ from ftlm.cli.reading_options import given_fields
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, ModelError
 from ftlm.estimation.identify import identify
-from ftlm.estimation.linear import Streaming, estimate_coefficients
+from ftlm.estimation.linear import Streaming
 from ftlm.estimation.methods import MultiInnovation
-from ftlm.estimation.verdict import Verdict
-from ftlm.findings import Finding
-from ftlm.order_search.options import SearchSettings
+from ftlm.estimation.result import Identification
 from ftlm.progress import Progress
 from ftlm.rig import recording as experiment
 from ftlm.rig.arm_parameters import ArmParameters
@@ -124,32 +122,25 @@ class LiveOptions:
             structure.with_orders(free),
             step=1.0 / rate,
             longest=limit + 1.0,
-            innovation_length=self.settings.innovation_length,
-            prior_covariance=self.settings.prior_covariance,
+            innovation_length=self.method.innovation_length,
+            prior_covariance=self.method.prior_covariance,
         )
 
     @property
-    def settings(self) -> SearchSettings:
-        """Return the settings of the estimate after the last sample."""
-        return SearchSettings(**self._options)
-
-    @property
-    def _options(self) -> dict[str, Any]:
+    def method(self) -> MultiInnovation:
+        """Estimation method of the stream."""
         given = {n: v for n, v in vars(self).items() if n in ("innovation_length", "prior_covariance")}
-        return {"row_basis": "time", **{n: v for n, v in given.items() if v is not None}}
+        return MultiInnovation(row_basis="time", **{n: v for n, v in given.items() if v is not None})
 
-    def judge(self, run: Run, stream: Streaming) -> tuple[Verdict, list[Finding]] | None:
-        """Return the verdict on the estimate of a stream after a recorded run, and findings about the estimator.
+    def identify(self, run: Run, stream: Streaming) -> Identification | None:
+        """Return the estimate of a stream after a recorded run as a result with a verdict.
 
         The result is None for a run that was stopped too early for an estimate.
         """
-        structure = replace(stream.structure, initial="rest")
         try:
-            own = estimate_coefficients([run], structure, self.settings, stream.pulses).findings
-            result = identify(run, structure, method=MultiInnovation(**self._options), m=stream.pulses)
+            return identify(run, replace(stream.structure, initial="rest"), method=self.method, m=stream.pulses)
         except FtlmError:
             return None
-        return result.verdict, own
 
 
 @command
@@ -246,10 +237,10 @@ def record(
         signals.restore()
     if stream is not None:
         print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
-        judgement = live.judge(run, stream)
-        if judgement is not None:
-            verdict, findings = judgement
-            print(f"live: {verdict}", *(f"! {finding}" for finding in findings), sep="\n", file=sys.stderr)
+        result = live.identify(run, stream)
+        if result is not None:
+            prior = [f"! {finding}" for finding in result.findings if finding.code == "prior_pulls"]
+            print(f"live: {result.verdict}", *prior, sep="\n", file=sys.stderr)
     if as_json:
         summary = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}
         print(json.dumps(summary, indent=1, ensure_ascii=False))

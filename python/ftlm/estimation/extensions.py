@@ -145,7 +145,7 @@ class FittedExtension:
 
     @property
     def is_physical(self) -> bool:
-        """Whether a coefficient that must be positive is; friction with a negative one is another, unknown effect."""
+        """Whether the sign of the coefficient is possible: negative friction would drive the motion."""
         name = self.extension.positive_coefficient
         return not name or self.fit.coefficients[name] > 0.0
 

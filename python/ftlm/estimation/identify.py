@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass, replace
@@ -43,6 +42,7 @@ from ftlm.estimation.nuisance_parameters import (
     constant_input,
     fit_score,
     fit_without_history,
+    fits_better,
     has_colored_residuals,
     has_white_residuals,
     offset_test,
@@ -202,15 +202,16 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
 
 
 def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
-    """Return the fit of an integrating plant with a constant in its equations; None if the runs do not prefer it.
+    """Return the fit with a constant in the equations; None if a level can replace it or the runs do not prefer it.
 
-    An integrating plant responds to the offset of an input sensor by a drift, which no level of its output describes.
+    No output level describes the response of an integrating or non-linear plant to the offset of an input sensor.
     The fit has initial guesses of its own, because a fit that lacks the constant may end at any wrong optimum.
     """
     automatic = structure.initial == "auto" and structure.offset == "none" and hypotheses.decides_offset
-    if fit.joint is None or not automatic or fit.task.structure.offset != "none" or not structure.integrates:
+    if fit.joint is None or not automatic or fit.task.structure.offset != "none":
         return None
-    if has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
+    level_suffices = structure.is_linear and not structure.integrates
+    if level_suffices or has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
         return None
     request = replace(structure, offset="constant")
     try:
@@ -218,7 +219,7 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
     except FtlmError:
         return None
     joint = candidate.joint
-    if joint is None or joint.unstable_optimum is not None or not _is_preferred(joint, fit.joint):
+    if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint):
         return None
     whole = _fit_in_motion(candidate, request, hypotheses) or hypotheses.take(request, candidate)
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
@@ -280,7 +281,7 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
     margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
 
     def is_preferred(joint: JointFit) -> bool:
-        return _is_preferred(joint, best, margin)
+        return fits_better(joint, best, margin)
 
     for initial in LEVEL_STARTS:
         request = replace(structure, initial=initial, offset="level")
@@ -303,12 +304,6 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
     # Another run may start otherwise.
     model = replace(whole.model, structure=replace(whole.model.structure, initial=structure.initial))
     return replace(whole, model=model, findings=[*whole.findings, make_finding("level_estimated", **about)])
-
-
-def _is_preferred(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
-    """Whether a fit has the lower criterion, with the noise color of the fit with larger residuals."""
-    worse = max((other, joint), key=lambda either: math.prod(either.noise.values()))
-    return fit_score(joint, worse) < fit_score(other, worse) + margin
 
 
 def _suggests_level(fit: Fit) -> bool:
@@ -421,9 +416,9 @@ def identify(
         ``"level"``: an unknown constant that is added to each output. ``"ramp"``: such a constant and a linear drift.
         ``"auto"``: a constant in the equations if it is significant at 99 %, with the statistic in
         ``.settings["offset_test"]``. Each run has its own values, which are in ``.comparison.offsets``. An offset
-        cannot be distinguished from initial terms for a nonzero past (``"history"``). Default: that of the structure;
-        if it has none, runs in motion get ``"level"``, and an integrating plant ``"constant"``, if they fit the runs
-        better. ``"none"`` prevents this, except for a run that rests at a level before an input changes.
+        cannot be distinguished from initial terms for a nonzero past (``"history"``). Default: that of the structure.
+        Without one, ``"level"`` is tried for runs in motion, and ``"constant"`` for integrating or non-linear plants.
+        ``"none"`` prevents both, except for a run that rests at a level before an input changes.
     bounds
         (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
     m

@@ -362,6 +362,15 @@ def fit_score(joint: JointFit, reference: JointFit) -> float:
     return start_score(own, joint.initial_terms, others)
 
 
+def fits_better(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
+    """Whether the criterion of a fit is lower than that of another fit plus a margin.
+
+    The noise color is taken from the fit with the larger residuals.
+    """
+    worse = max((other, joint), key=lambda either: math.prod(either.noise.values()))
+    return fit_score(joint, worse) < fit_score(other, worse) + margin
+
+
 def has_colored_residuals(joint: JointFit) -> bool:
     """Whether the residuals have the color that a missing term or a wrong initial condition produces."""
     inflation = (variance_inflation(drop_missing(series)) for series in _pooled_residuals(joint))

@@ -36,14 +36,14 @@ SPLIT_CODES = ("plant_needs_pieces", "plant_unstable_in_pieces")
 
 @dataclass(frozen=True)
 class PieceTest:
-    """Simulation of a model on short segments of runs, each segment with its own initial values.
+    """Simulation of a model on short pieces of runs, each piece with its own initial values.
 
     Parameters
     ----------
     seconds
         Length of a piece [s].
     residual
-        RMS of the residuals divided by the RMS of the output, whose mean is subtracted in each segment; the largest
+        RMS of the residuals divided by the RMS of the output, whose mean is subtracted in each piece; the largest
         over all outputs.
     """
 
@@ -52,17 +52,17 @@ class PieceTest:
 
     @property
     def passed(self) -> bool:
-        """Whether the residual is so small that the model explains the segments."""
+        """Whether the residual is so small that the model explains the pieces."""
         return self.residual <= MAX_PIECE_RESIDUAL
 
     @property
     def fit(self) -> float:
-        """Fit of the simulation to the segments in percent."""
+        """Fit of the simulation to the pieces in percent."""
         return 100.0 * (1.0 - self.residual)
 
 
 def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
-    """Simulate an unstable model on short segments of the runs and return the result; None if not possible.
+    """Simulate an unstable model on short pieces of the runs and return the result; None if not possible.
 
     Runs of an unstable plant are bounded only because a controller feeds back the output. A correct unstable model
     follows the output within a piece. A wrongly unstable model of a stable plant does not, over five time constants,
@@ -105,7 +105,7 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
 
 
 def unstable_plant_findings(fit: Fit, model: Model, runs: Sequence[Run], comparison: Comparison) -> list[Finding]:
-    """Return a finding if short segments of the runs are evidence of an unstable plant.
+    """Return a finding if short pieces of the runs are evidence of an unstable plant.
 
     The pieces are simulated with the model, and with a least-squares fit at its orders.
     """

@@ -218,7 +218,7 @@ class Structure:
 
     @property
     def integrates(self) -> bool:
-        """Whether an equation has no term in its own output, so that it determines only derivatives of the output."""
+        """Whether an equation contains only derivatives of its output, not the output itself."""
         return not all(
             any(term.signal == item.output and not term.order.names and term.order.constant == 0 for term in item.terms)
             for item in self.equations
