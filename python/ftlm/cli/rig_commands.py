@@ -133,9 +133,9 @@ class LiveOptions:
         return MultiInnovation(row_basis="time", **{n: v for n, v in given.items() if v is not None})
 
     def identify(self, run: Run, stream: Streaming) -> Identification | None:
-        """Return the estimate of a stream after a recorded run as a result with a verdict.
+        """Return the final estimate of the stream from the recorded run, as a result with a verdict.
 
-        The result is None for a run that was stopped too early for an estimate.
+        The result is None if the run was stopped too early for an estimate.
         """
         try:
             return identify(run, replace(stream.structure, initial="rest"), method=self.method, m=stream.pulses)

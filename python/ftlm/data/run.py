@@ -786,7 +786,7 @@ class Run:
         write_parquet(self, path, force=force)
 
     def to_frame(self) -> Any:
-        """Return the run as a pandas DataFrame: one column per signal in SI units, over the time ``t_s`` of the file [s].
+        """Return the run as a pandas DataFrame: one column per signal in SI units, indexed by ``t_s`` [s].
 
         `Run.from_frame` converts it back. Its ``attrs`` contain units, inputs, outputs, intersample and name.
 

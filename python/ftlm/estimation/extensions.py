@@ -193,7 +193,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
             fits += fit_each(_input_extensions(structure, joint, runs, names))
             fits += fit_each(_friction_extensions(structure, joint, runs))
             fits += fit_each(_load_step_extensions(structure, [joint, *offset_fits[:1]], runs))
-        best = _clear_extension([f for f in fits if f.is_physical], own) or _clear_extension(fits, own)
+        best = _best_extension([f for f in fits if f.is_physical], own) or _best_extension(fits, own)
         findings = _extension_findings(best, structure, joint, runs, names, about) if best else []
     except FtlmError:
         # The fit to the first samples failed, with which extensions are compared.
@@ -364,8 +364,8 @@ def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> Fi
     return min(fits, key=lambda f: max(f.fit.noise.values()), default=None)
 
 
-def _clear_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
-    """Return the extension with the lowest criterion; None if it is not clearly below that of the original structure.
+def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> FittedExtension | None:
+    """Return the extension with the lowest criterion; None if the decrease is below `MIN_CRITERION_DECREASE`.
 
     Extensions are listed by preference. A later one must be better than an earlier one by `MIN_CRITERION_GAP`.
     """

@@ -145,15 +145,15 @@ class Hypotheses:
     ----------
     fit
         Function that fits a structure.
-    decides_offset
-        Whether a level or a constant may be added to a structure without an offset.
+    may_add_offset
+        Whether a level or a constant may be added; False if the user gave an offset.
     complete
         Function that adds all confidence intervals to a joint fit of a structure; None if :attr:`fit` already gives
         them.
     """
 
     fit: Callable[[Structure], Fit]
-    decides_offset: bool
+    may_add_offset: bool
     complete: Callable[[Structure, JointFit | None], Fit] | None = None
 
     def take(self, structure: Structure, fit: Fit) -> Fit:
@@ -202,12 +202,12 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
 
 
 def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
-    """Return the fit with a constant in the equations; None if a level can replace it or the runs do not prefer it.
+    """Return the fit with a constant in the equations; None if a level suffices or the constant is no improvement.
 
     No output level describes the response of an integrating or non-linear plant to the offset of an input sensor.
-    The fit has initial guesses of its own, because a fit that lacks the constant may end at any wrong optimum.
+    The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum.
     """
-    automatic = structure.initial == "auto" and structure.offset == "none" and hypotheses.decides_offset
+    automatic = structure.initial == "auto" and structure.offset == "none" and hypotheses.may_add_offset
     if fit.joint is None or not automatic or fit.task.structure.offset != "none":
         return None
     level_suffices = structure.is_linear and not structure.integrates
@@ -245,7 +245,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
         # A constant input gives no evidence of rest.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
-    offsets = MOTION_OFFSETS if structure.offset == "none" and hypotheses.decides_offset else (structure.offset,)
+    offsets = MOTION_OFFSETS if structure.offset == "none" and hypotheses.may_add_offset else (structure.offset,)
     for offset in offsets:
         request = replace(structure, initial="caputo", offset=offset)
 
@@ -274,7 +274,7 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
     means suggest a level, the optimum moves far and automatic initial guesses are used. Otherwise the fit starts from
     the optimum without a level.
     """
-    if fit.joint is None or not hypotheses.decides_offset:
+    if fit.joint is None or not hypotheses.may_add_offset:
         return None
     best = fit.joint
     candidate: tuple[Structure, Fit] | None = None
@@ -415,10 +415,10 @@ def identify(
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor bias or a load.
         ``"level"``: an unknown constant that is added to each output. ``"ramp"``: such a constant and a linear drift.
         ``"auto"``: a constant in the equations if it is significant at 99 %, with the statistic in
-        ``.settings["offset_test"]``. Each run has its own values, which are in ``.comparison.offsets``. An offset
-        cannot be distinguished from initial terms for a nonzero past (``"history"``). Default: that of the structure.
-        Without one, ``"level"`` is tried for runs in motion, and ``"constant"`` for integrating or non-linear plants.
-        ``"none"`` prevents both, except for a run that rests at a level before an input changes.
+        ``.settings["offset_test"]``. Each run has its own offset, in ``.comparison.offsets``. It is not identifiable
+        together with ``initial="history"``. Default: the offset of the structure. If it has none, a level or, for
+        integrating or non-linear plants, a constant is added if it improves the fit. ``"none"`` prevents this; a run
+        that rests before an input changes keeps its level.
     bounds
         (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
     m
@@ -484,7 +484,7 @@ def _fit_runs(
     runs: Runs,
     structure: Structure,
     estimator: EstimationMethod,
-    decides_offset: bool,
+    may_add_offset: bool,
     *,
     m: int | None,
     threads: int | None,
@@ -503,12 +503,12 @@ def _fit_runs(
             raise ModelError(f"the method {estimator.name!r} fitted a {type(fit).__name__}, not a Fit")
         return fit
 
-    light, hypotheses = getattr(estimator, "hypothesis", None), Hypotheses(estimate, decides_offset)
+    light, hypotheses = getattr(estimator, "hypothesis", None), Hypotheses(estimate, may_add_offset)
     if light is not None:
         course = ShareTracker(progress)
         hypotheses = Hypotheses(
             partial(estimate, method=light, report=course.subtask(HYPOTHESES_SHARE, 0.9)),
-            decides_offset,
+            may_add_offset,
             lambda request, joint: estimate(request, report=course.subtask(1.0, 1.0), fitted=joint),
         )
     return fit_with_offset_decision(runs, structure, estimate, hypotheses)

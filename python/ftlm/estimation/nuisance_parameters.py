@@ -363,9 +363,9 @@ def fit_score(joint: JointFit, reference: JointFit) -> float:
 
 
 def fits_better(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
-    """Whether the criterion of a fit is lower than that of another fit plus a margin.
+    """Whether the criterion of a fit is below the other fit's criterion plus `margin`, which may be negative.
 
-    The noise color is taken from the fit with the larger residuals.
+    Both criteria use the noise color of the fit with the larger residuals.
     """
     worse = max((other, joint), key=lambda either: math.prod(either.noise.values()))
     return fit_score(joint, worse) < fit_score(other, worse) + margin

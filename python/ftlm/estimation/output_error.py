@@ -370,7 +370,7 @@ def fit_output_error(
 
 
 def level_count(runs: Sequence[Run], structure: Structure) -> int:
-    """Return the number of output levels over all runs, which the core does not count as initial terms."""
+    """Return the number of output levels over all runs. The core does not count them as initial terms."""
     return len(runs) * len(structure.outputs) if structure.offset == "level" else 0
 
 

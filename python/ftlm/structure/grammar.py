@@ -74,7 +74,7 @@ _UMLAUT_LETTERS = "äëïöüÄËÏÖÜ"
 
 
 def _prime_notation(dotted: re.Match[str]) -> str:
-    """Return a signal of one letter under dots as the signal with primes; other names are unchanged."""
+    """Return a dotted one-letter signal with primes, such as y'' for ÿ; other names are unchanged."""
     name, rest = dotted.groups()
     parts = unicodedata.normalize("NFD", name)
     if name in _UMLAUT_LETTERS or not set(parts[1:]) <= set(_DOT_ORDERS):

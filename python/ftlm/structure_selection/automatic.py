@@ -102,9 +102,9 @@ class IntegerOrderForm:
 
 
 def _with_offset(structure: Structure, offset: str) -> Structure:
-    """Return a structure with an offset; the level of an integrating plant is a constant in its equation.
+    """Return a structure with an offset; for an integrating plant ``"level"`` becomes ``"constant"``.
 
-    No level of the output describes the response of an integrator to the offset of an input sensor.
+    No level of the output describes the response of an integrating plant to the offset of an input sensor.
     """
     level = "constant" if structure.integrates else "level"
     return replace(structure, offset=check_offset(level if offset == "level" else offset))

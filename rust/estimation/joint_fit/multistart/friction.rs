@@ -70,15 +70,15 @@ pub fn run_friction_multistart(free: &ParameterSet, course: MultistartContext<'_
     let is_at_noise = reached.first().is_some_and(|c| c.cost_per_residual() <= NOISE_FLOOR_FACTOR * course.floor);
     if !is_at_noise && !has_stribeck_body(structure) {
         // The structure without friction is nested in this one, so its optima are initial guesses.
-        let more = frictionless_guesses(free, course, &grid)?;
+        let more = guesses_from_frictionless_optima(free, course, &grid)?;
         reached.extend(optimize_on_coarse_grids(free, &grid, &more, course.threads)?);
         reached = sort_by_cost(reached);
     }
     Ok(reached)
 }
 
-/// Initial guesses from the optima without friction: zero friction, and fractions of the input force.
-fn frictionless_guesses(
+/// Initial guesses from the optima without friction. Friction starts at zero and at fractions of the input force.
+fn guesses_from_frictionless_optima(
     free: &ParameterSet,
     course: MultistartContext<'_>,
     grid: &Objective<'_>,
@@ -90,7 +90,7 @@ fn frictionless_guesses(
     for optimum in optima.iter().take(MAX_FINAL_SURVIVORS) {
         let values = values_of(&linear, optimum);
         guesses.push(guess_at(free, &values, format!("{}, without friction", optimum.origin))?);
-        guesses.extend(force_guesses(free, grid, &values, &optimum.origin)?);
+        guesses.extend(coulomb_force_guesses(free, grid, &values, &optimum.origin)?);
     }
     Ok(guesses)
 }
@@ -511,7 +511,7 @@ fn coulomb_guesses(
         Ok(optimum) => Candidate { result: optimum, origin: String::new(), duplicates: Vec::new() },
     };
     values.extend(values_of(&linear, &optimum));
-    out.extend(force_guesses(free, grid, &values, origin)?);
+    out.extend(coulomb_force_guesses(free, grid, &values, origin)?);
     Ok(out)
 }
 
@@ -538,7 +538,12 @@ fn guess_with_friction(
 }
 
 /// Initial guesses of Coulomb friction from fractions of the largest input force on each body.
-fn force_guesses(free: &ParameterSet, grid: &Objective<'_>, values: &Values, origin: &str) -> Result<Vec<Candidate>> {
+fn coulomb_force_guesses(
+    free: &ParameterSet,
+    grid: &Objective<'_>,
+    values: &Values,
+    origin: &str,
+) -> Result<Vec<Candidate>> {
     let coulomb = free_coulomb_coefficients(&free.structure);
     let force = |(item, factor, _): &(&ParametricEquation, f64, _)| {
         Ok(largest_input_force(grid.source(), item, values)? / factor)
