@@ -219,7 +219,9 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
     except FtlmError:
         return None
     joint = candidate.joint
-    if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint):
+    # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a constant.
+    margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
+    if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint, margin):
         return None
     whole = _fit_in_motion(candidate, request, hypotheses) or hypotheses.take(request, candidate)
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
