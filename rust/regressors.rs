@@ -12,7 +12,7 @@ use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::fractional::kernels::{kernel, power_means, power_pulses};
 use crate::parallel::{self, Stop};
 use crate::series::{self, Buffers, Kernel};
-use crate::signal::block_pulse::{pulse_means, Intersample, PulseMeans};
+use crate::signal::block_pulse::{pulse_means, Intersample, PulseJump, PulseMeans};
 
 /// Memory limit of a single bank, and default limit of a search, in bytes.
 pub const BANK_LIMIT: u64 = 2 << 30;
@@ -30,6 +30,8 @@ pub struct Record {
     deviations: Vec<Option<Vec<f64>>>,
     /// Filter responses to an impulse and its derivatives, if known more accurately than from the pulse grid.
     impulse_responses: Vec<Vec<f64>>,
+    /// Jumps of each zero-order-hold signal within pulses, in the sequence of time. Empty if unknown.
+    jumps: Vec<Vec<PulseJump>>,
 }
 
 impl Record {
@@ -67,6 +69,7 @@ impl Record {
             filter_transients: Vec::new(),
             deviations: Vec::new(),
             impulse_responses: Vec::new(),
+            jumps: Vec::new(),
         })
     }
 
@@ -89,6 +92,39 @@ impl Record {
             pulse_means(samples, samples.len().saturating_sub(1), *between)
         };
         Self::new(step, signals.iter().map(means).collect::<Result<_>>()?, None)
+    }
+
+    /// Add the jumps of each signal within pulses. Dry friction needs them: a body at rest starts to slide at a jump.
+    ///
+    /// # Errors
+    /// [`Error::Length`] for another number of signals; [`Error::OutOfRange`] for a jump outside of the pulses, or one
+    /// that is not later than the previous jump of its signal.
+    pub fn with_jumps(mut self, jumps: Vec<Vec<PulseJump>>) -> Result<Self> {
+        check_length("jumps of signals", self.len(), jumps.len())?;
+        for row in &jumps {
+            let mut before = (0, 0.0);
+            for jump in row {
+                let (place, share) = ((jump.pulse, jump.share), jump.share);
+                if jump.pulse >= self.m() || !(share > 0.0 && share < 1.0) || place <= before {
+                    return Err(Error::OutOfRange {
+                        name: format!("share of a pulse before a jump (pulse {} of {})", jump.pulse, self.m()),
+                        value: share,
+                        range: "(0, 1)".into(),
+                        remedy: "give the jumps of a signal within the pulses, in the sequence of time".into(),
+                    });
+                }
+                check_finite("values around a jump", &[jump.before, jump.after])?;
+                before = place;
+            }
+        }
+        self.jumps = jumps;
+        Ok(self)
+    }
+
+    /// Jumps of a signal within pulses.
+    #[must_use]
+    pub fn jumps(&self, index: usize) -> &[PulseJump] {
+        self.jumps.get(index).map_or(&[], Vec::as_slice)
     }
 
     /// Add a low-noise substitute of every signal, for instrumental variables.
@@ -121,6 +157,7 @@ impl Record {
             filter_transients: transients,
             deviations: moving,
             impulse_responses: answers,
+            jumps: self.jumps.clone(),
         }
     }
 

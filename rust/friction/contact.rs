@@ -46,6 +46,12 @@ impl FrictionProblem {
         Ok(Self { laws, gains })
     }
 
+    /// Friction problem of the same bodies over a part of the pulse, given as a fraction of it.
+    #[must_use]
+    pub fn over_part(&self, length: f64) -> Self {
+        Self { laws: self.laws.clone(), gains: self.gains.iter().map(|gain| length * gain).collect() }
+    }
+
     /// Number of bodies.
     #[must_use]
     pub fn count(&self) -> usize {
@@ -140,8 +146,12 @@ impl FrictionProblem {
     }
 
     /// Solution of (1 + diag(slopes) (G − diag G)) x = `vector`.
-    fn solve_coupled(&self, slopes: &[f64], vector: &[f64]) -> Vec<f64> {
+    #[must_use]
+    pub fn solve_coupled(&self, slopes: &[f64], vector: &[f64]) -> Vec<f64> {
         let n = self.count();
+        if n == 1 {
+            return vector.to_vec();
+        }
         let mut matrix = vec![0.0; n * n];
         for a in 0..n {
             for b in 0..n {

@@ -3,6 +3,7 @@
 use super::convolution::{edge_kernel, ConvolutionKernel, MAX_FEEDTHROUGH_ORDER};
 use crate::equation::ORDER_GRAIN;
 use crate::fractional::kernels::kernel_and_slope;
+use crate::signal::block_pulse::PulseJump;
 
 /// Channel of an output that the equations determine.
 #[derive(Debug, Clone, Copy)]
@@ -101,7 +102,17 @@ pub(super) struct SystemDerivatives {
     /// Derivatives of fc, fs and vs of each friction.
     pub(super) laws: Vec<[f64; 3]>,
     /// Derivatives of recorded signals that are inputs.
-    pub(super) inputs: Vec<(usize, Vec<f64>)>,
+    pub(super) inputs: Vec<InputDerivative>,
+}
+
+/// Derivative of an input with respect to a parameter.
+#[derive(Debug, Clone)]
+pub(super) struct InputDerivative {
+    pub(super) signal: usize,
+    /// Derivatives of the pulse means.
+    pub(super) means: Vec<f64>,
+    /// Derivatives of the share and of the values of each jump within a pulse.
+    pub(super) jumps: Vec<PulseJump>,
 }
 
 /// Reason for which a pulse has no solution.

@@ -4,7 +4,11 @@
 //! within the pulse. Non-linear terms change p only slightly within a pulse, so the iteration for φ converges in a few
 //! steps.
 
+use std::borrow::Cow;
+
 use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
+use super::jumps::Interval;
+use super::march::LinearizedRun;
 use crate::error::Result;
 use crate::friction::contact::{FrictionProblem, MAX_FRICTION_ERROR_RATIO, VELOCITY_ROUNDING_RATIO};
 use crate::friction::law::{FrictionLaw, Phase, Pulse as FrictionPulse, PulseDerivatives};
@@ -56,9 +60,13 @@ pub struct BodyMotion {
     pub phases: Vec<Phase>,
 }
 
-/// Motion and friction of one body in one pulse.
+/// Motion and friction of one body in one interval of a pulse.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BodyState {
+    /// Length of the interval as a fraction of the pulse.
+    length: f64,
+    /// Change of the velocity per pulse without any friction.
+    rate: f64,
     /// Velocity at the start.
     start_velocity: f64,
     /// Velocity at the end without the friction of the body.
@@ -72,11 +80,24 @@ pub(super) struct BodyState {
 pub(super) struct BodyDerivatives {
     /// Initial output and velocity of each body.
     pub(super) starts: Vec<(f64, f64)>,
-    /// Derivative of each body's friction gain with respect to the parameter. The gain is the change of the body's
-    /// velocity at the end of a pulse per unit of its friction force in the pulse.
+    /// Derivatives of the gains, row-major. A gain is the decrease of the velocity of a body at the end of a pulse per
+    /// unit of the friction force on a body in the pulse.
     gains: Vec<f64>,
     /// Derivatives of fc, fs and vs of each body.
     laws: Vec<[f64; 3]>,
+}
+
+/// Derivatives of the motion in a pulse with respect to a parameter.
+struct PulseMotionDerivatives<'a> {
+    /// Velocities at the start.
+    starts: &'a [f64],
+    /// Velocities at the end without friction.
+    ends: &'a [f64],
+    /// Gains ([`BodyDerivatives`]).
+    gains: &'a [f64],
+    /// Parameters fc, fs and vs of each body.
+    laws: &'a [[f64; 3]],
+    intervals: &'a [Interval],
 }
 
 /// Solver of the friction forces of all bodies, pulse by pulse.
@@ -90,9 +111,10 @@ pub(super) struct ContactSolver<'a> {
     last_outputs: Vec<(f64, bool)>,
     /// True if a body is at rest in this pulse and in the previous one.
     is_resting: Vec<bool>,
+    /// Mean friction forces of the pulse.
     forces: Vec<f64>,
     rounding: Vec<f64>,
-    at: Vec<(f64, FrictionPulse)>,
+    /// State of each body in each interval of the pulse.
     contacts: Vec<BodyState>,
 }
 
@@ -133,14 +155,18 @@ impl ContactOperators {
     }
 
     /// Motion of each body, from its contact states pulse by pulse.
-    pub(super) fn motions(&self, forcing: &ForcingTerms, contacts: &[BodyState]) -> Vec<BodyMotion> {
+    pub(super) fn motions(&self, forcing: &ForcingTerms, run: &LinearizedRun) -> Vec<BodyMotion> {
         let of = |(body, start): (usize, &(f64, f64))| {
-            let pulses = || contacts.iter().skip(body).step_by(self.count()).map(|contact| &contact.pulse);
-            BodyMotion {
-                force: pulses().map(|pulse| pulse.force).collect(),
-                velocity: std::iter::once(start.1).chain(pulses().map(|pulse| pulse.end)).collect(),
-                phases: pulses().map(|pulse| pulse.phase).collect(),
+            let mut motion = BodyMotion { force: Vec::new(), velocity: vec![start.1], phases: Vec::new() };
+            for pulse in 0..run.pulses() {
+                let states = || run.contacts_of(pulse).iter().skip(body).step_by(self.count());
+                motion.force.push(states().map(|state| state.length * state.pulse.force).sum());
+                if let Some(last) = states().next_back() {
+                    motion.velocity.push(last.pulse.end);
+                    motion.phases.push(last.pulse.phase);
+                }
             }
+            motion
         };
         forcing.starts.iter().enumerate().map(of).collect()
     }
@@ -163,7 +189,6 @@ impl ContactOperators {
             is_resting,
             forces,
             rounding,
-            at: Vec::new(),
             contacts: Vec::new(),
         }
     }
@@ -178,8 +203,8 @@ impl ContactOperators {
     ) -> Result<BodyDerivatives> {
         let (states, n) = (self.states, self.count());
         let count = gains.len() / states;
-        let of = |a: usize| -> f64 {
-            let friction = count - n + a;
+        let of = |at: usize| -> f64 {
+            let (a, friction) = (at / n, count - n + at % n);
             let response: Vec<f64> = (0..states)
                 .map(|s| (0..states).map(|r| self.inverse[s * states + r] * gains[r * count + friction]).sum())
                 .collect();
@@ -193,14 +218,64 @@ impl ContactOperators {
         starts.resize(n, (0.0, 0.0));
         let mut laws = derivatives.laws.clone();
         laws.resize(n, [0.0; 3]);
-        Ok(BodyDerivatives { starts, gains: (0..n).map(of).collect(), laws })
+        Ok(BodyDerivatives { starts, gains: (0..n * n).map(of).collect(), laws })
+    }
+
+    /// Friction problem of an interval of a pulse.
+    fn problem_over(&self, length: f64) -> Cow<'_, FrictionProblem> {
+        if length == 1.0 {
+            Cow::Borrowed(&self.problem)
+        } else {
+            Cow::Owned(self.problem.over_part(length))
+        }
+    }
+
+    /// Derivatives of the mean friction forces of a pulse with these intervals.
+    fn force_derivatives(
+        &self,
+        at: &[BodyState],
+        intervals: &[Interval],
+        moved: &PulseMotionDerivatives<'_>,
+    ) -> Vec<f64> {
+        let n = self.count();
+        let (mut velocities, mut means) = (moved.starts.to_vec(), vec![0.0; n]);
+        for ((states, interval), change) in at.chunks(n).zip(intervals).zip(moved.intervals) {
+            let (length, problem) = (interval.length, self.problem_over(interval.length));
+            let gain = |a: usize, b: usize| change.length * self.problem.gain(a, b) + length * moved.gains[a * n + b];
+            let (mut slopes, mut right, mut ends) = (vec![0.0; n], vec![0.0; n], vec![0.0; n]);
+            for (a, &BodyState { rate, start_velocity, free_velocity, pulse, .. }) in states.iter().enumerate() {
+                let pushed =
+                    |b: usize| moved.gains[a * n + b] * interval.forces[b] + self.problem.gain(a, b) * change.forces[b];
+                let rate_derivative = moved.ends[a] - moved.starts[a] + (0..n).map(pushed).sum::<f64>();
+                let free = velocities[a] + change.length * rate + length * rate_derivative;
+                let others = (0..n).filter(|&b| b != a).map(|b| gain(a, b) * states[b].pulse.force).sum::<f64>();
+                ends[a] = free - others - gain(a, a) * pulse.force;
+                let derivatives = PulseDerivatives {
+                    start: velocities[a],
+                    free: free - others,
+                    first: gain(a, a),
+                    law: moved.laws[a],
+                };
+                let own = problem.own(a);
+                right[a] = problem.law(a).slope(start_velocity, free_velocity, own, &pulse, &derivatives).0;
+                slopes[a] = problem.force_slope(a, start_velocity, free_velocity, &pulse);
+            }
+            let forces = problem.solve_coupled(&slopes, &right);
+            for (a, state) in states.iter().enumerate() {
+                let by_friction: f64 = (0..n).map(|b| problem.gain(a, b) * forces[b]).sum();
+                velocities[a] = if state.pulse.phase == Phase::Stick { 0.0 } else { ends[a] - by_friction };
+                means[a] += change.length * state.pulse.force + length * forces[a];
+            }
+        }
+        means
     }
 
     /// Add the derivatives of the friction forces of a pulse to the derivatives of the sources. Update the derivatives
-    /// of outputs and velocities.
+    /// of outputs and velocities. `intervals` holds the intervals of the pulse and their derivatives.
     pub(super) fn add_friction_derivatives(
         &self,
         at: &[BodyState],
+        intervals: (&[Interval], &[Interval]),
         derivatives: &BodyDerivatives,
         motion: &mut [(f64, f64)],
         (gains, inverse): (&[f64], &[f64]),
@@ -216,23 +291,43 @@ impl ContactOperators {
             (0..states).map(of).collect()
         };
         let responses: Vec<Vec<f64>> = (0..n).map(response).collect();
-        let (mut matrix, mut right) = (vec![0.0; n * n], vec![0.0; n]);
-        for (a, &BodyState { start_velocity: start, free_velocity: free, pulse, .. }) in at.iter().enumerate() {
-            let own = self.problem.own(a);
-            let slope = self.problem.force_slope(a, start, free, &pulse);
-            for b in 0..n {
-                let direct = if a == b { 1.0 - slope * own } else { 0.0 };
-                matrix[a * n + b] = direct - slope * responses[b][self.velocities[a]];
-            }
-            let end = derivatives.starts[a].1 + x[self.velocities[a]];
-            let moved = PulseDerivatives {
-                start: motion[a].1,
-                free: end + pulse.force * derivatives.gains[a],
-                first: derivatives.gains[a],
-                law: derivatives.laws[a],
+        let mean = |b: usize| at.iter().skip(b).step_by(n).map(|state| state.length * state.pulse.force).sum::<f64>();
+        let means: Vec<f64> = (0..n).map(mean).collect();
+        let end = |a: usize| {
+            let through: f64 = (0..n).map(|b| derivatives.gains[a * n + b] * means[b]).sum();
+            derivatives.starts[a].1 + x[self.velocities[a]] + through
+        };
+        let (starts, ends): (Vec<f64>, Vec<f64>) = (0..n).map(|a| (motion[a].1, end(a))).unzip();
+        let moved = PulseMotionDerivatives {
+            starts: &starts,
+            ends: &ends,
+            gains: &derivatives.gains,
+            laws: &derivatives.laws,
+            intervals: intervals.1,
+        };
+        let right = self.force_derivatives(at, intervals.0, &moved);
+        // The friction changes the end velocities without friction by way of the state channels.
+        let (zeros, no_gains, no_laws) = (vec![0.0; n], vec![0.0; n * n], vec![[0.0; 3]; n]);
+        let constant: Vec<Interval> =
+            intervals.0.iter().map(|_| Interval { length: 0.0, forces: zeros.clone() }).collect();
+        let mut matrix = vec![0.0; n * n];
+        for c in 0..n {
+            let unit: Vec<f64> = (0..n).map(|a| if a == c { 1.0 } else { 0.0 }).collect();
+            let moved = PulseMotionDerivatives {
+                starts: &zeros,
+                ends: &unit,
+                gains: &no_gains,
+                laws: &no_laws,
+                intervals: &constant,
             };
-            right[a] = self.problem.law(a).slope(start, free, own, &pulse, &moved).0;
+            let slopes = self.force_derivatives(at, intervals.0, &moved);
+            for (a, slope) in slopes.iter().enumerate() {
+                for b in 0..n {
+                    matrix[a * n + b] -= slope * (responses[b][self.velocities[c]] + self.problem.gain(c, b));
+                }
+            }
         }
+        (0..n).for_each(|a| matrix[a * n + a] += 1.0);
         let solution = small::inverse(&matrix, n)?;
         for b in 0..n {
             let force: f64 = (0..n).map(|c| solution[b * n + c] * right[c]).sum();
@@ -247,7 +342,7 @@ impl ContactOperators {
 
     /// For each body at rest, replace the derivative of its output by the derivative in the last pulse.
     pub(super) fn fix_resting_outputs(&self, at: &[BodyState], motion: &[(f64, f64)], free: &mut [f64]) {
-        for (a, _) in at.iter().enumerate().filter(|(_, at)| at.is_resting) {
+        for (a, _) in at.iter().take(self.count()).enumerate().filter(|(_, at)| at.is_resting) {
             free[self.outputs[a]] = motion[a].0;
         }
     }
@@ -258,7 +353,11 @@ impl ContactSolver<'_> {
     ///
     /// A constant friction cannot balance a force that varies within the pulse, so the mean output of a body at rest
     /// would drift with the square of the step. The solver keeps it constant from one pulse at rest to the next.
-    pub(super) fn solve(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), PulseFailure> {
+    pub(super) fn solve(
+        &mut self,
+        pulse: &mut impl PulseEquations,
+        intervals: &[Interval],
+    ) -> std::result::Result<(), PulseFailure> {
         for (rests, (before, now)) in self.is_resting.iter_mut().zip(self.last_outputs.iter().zip(&self.velocities)) {
             *rests = before.1 && *now == 0.0;
         }
@@ -266,11 +365,11 @@ impl ContactSolver<'_> {
             for (a, rests) in self.is_resting.iter().enumerate() {
                 pulse.fix(self.contact.outputs[a], rests.then_some(self.last_outputs[a].0));
             }
-            self.solve_friction(pulse)?;
+            self.solve_friction(pulse, intervals)?;
             let mut is_done = true;
-            for (rests, (_, found)) in self.is_resting.iter_mut().zip(&self.at) {
-                if *rests && found.end != 0.0 {
-                    (*rests, is_done) = (false, false);
+            for a in 0..self.contact.count() {
+                if self.is_resting[a] && !self.is_at_rest(a) {
+                    (self.is_resting[a], is_done) = (false, false);
                 }
             }
             if is_done {
@@ -279,7 +378,22 @@ impl ContactSolver<'_> {
         }
     }
 
-    fn solve_friction(&mut self, pulse: &mut impl PulseEquations) -> std::result::Result<(), PulseFailure> {
+    /// True if a body does not move in the whole pulse.
+    fn is_at_rest(&self, body: usize) -> bool {
+        let mut states = self.contacts.iter().skip(body).step_by(self.contact.count());
+        self.velocities[body] == 0.0 && states.all(|state| state.pulse.end == 0.0)
+    }
+
+    /// Velocity of a body at the end of the pulse.
+    fn end_velocity(&self, body: usize) -> f64 {
+        self.contacts[self.contacts.len() - self.contact.count() + body].pulse.end
+    }
+
+    fn solve_friction(
+        &mut self,
+        pulse: &mut impl PulseEquations,
+        intervals: &[Interval],
+    ) -> std::result::Result<(), PulseFailure> {
         let (contact, n) = (self.contact, self.contact.count());
         let mut miss = f64::INFINITY;
         let mut size: f64 = 0.0;
@@ -292,15 +406,17 @@ impl ContactSolver<'_> {
             for (rounding, free) in self.rounding.iter_mut().zip(&free) {
                 *rounding = f64::max(*rounding, VELOCITY_ROUNDING_RATIO * free.abs());
             }
-            contact.problem.solve(&self.velocities, &free, &self.rounding, &self.forces, &mut self.at);
+            self.solve_intervals(&free, intervals);
             (miss, size) = (0.0, 0.0);
-            for (a, (_, found)) in self.at.iter().enumerate() {
+            for a in 0..n {
+                let states = self.contacts.iter().skip(a).step_by(n);
+                let force: f64 = states.map(|state| state.length * state.pulse.force).sum();
                 let own = contact.problem.own(a);
-                miss = f64::max(miss, (found.force - self.forces[a]).abs() * own);
+                miss = f64::max(miss, (force - self.forces[a]).abs() * own);
                 size = size.max(self.velocities[a].abs() + free[a].abs() + contact.problem.breakaway(a) * own);
-                self.forces[a] = found.force;
+                self.forces[a] = force;
             }
-            if self.at.iter().any(|(_, found)| found.end.is_nan()) {
+            if self.contacts.iter().any(|state| state.pulse.end.is_nan()) {
                 return Err(PulseFailure::Overflow);
             }
             if miss <= FRICTION_ROUNDING_RATIO * size {
@@ -316,20 +432,46 @@ impl ContactSolver<'_> {
         if miss > MAX_FRICTION_ERROR_RATIO * size {
             return Err(PulseFailure::Contact);
         }
-        for (a, (_, found)) in self.at.iter().enumerate() {
-            *pulse.channel(contact.velocities[a]) = found.end - self.initial_velocities[a];
+        for a in 0..n {
+            *pulse.channel(contact.velocities[a]) = self.end_velocity(a) - self.initial_velocities[a];
         }
         Ok(())
     }
 
+    /// Solve the friction problem of each interval of the pulse. `free` holds the velocities at its end without
+    /// friction.
+    fn solve_intervals(&mut self, free: &[f64], intervals: &[Interval]) {
+        let (contact, n) = (self.contact, self.contact.count());
+        let (mut velocities, mut forces, mut at) = (self.velocities.clone(), self.forces.clone(), Vec::new());
+        self.contacts.clear();
+        for Interval { length, forces: pushes } in intervals {
+            let problem = contact.problem_over(*length);
+            let pushed = |a: usize| (0..n).map(|b| contact.problem.gain(a, b) * pushes[b]).sum::<f64>();
+            let ends: Vec<f64> = (0..n).map(|a| free[a] + pushed(a)).collect();
+            let frictionless: Vec<f64> =
+                (0..n).map(|a| length * ends[a] + (velocities[a] - length * self.velocities[a])).collect();
+            problem.solve(&velocities, &frictionless, &self.rounding, &forces, &mut at);
+            for (a, &(free_velocity, pulse)) in at.iter().enumerate() {
+                self.contacts.push(BodyState {
+                    length: *length,
+                    rate: ends[a] - self.velocities[a],
+                    start_velocity: velocities[a],
+                    free_velocity,
+                    is_resting: self.is_resting[a],
+                    pulse,
+                });
+                (velocities[a], forces[a]) = (pulse.end, pulse.force);
+            }
+        }
+    }
+
     /// Advance to the next pulse. Return the contact states of the solved pulse, whose state channels are `z`.
     pub(super) fn advance(&mut self, z: &[f64]) -> &[BodyState] {
-        self.contacts.clear();
-        for (a, &(free_velocity, pulse)) in self.at.iter().enumerate() {
-            let start_velocity = self.velocities[a];
-            self.contacts.push(BodyState { start_velocity, free_velocity, is_resting: self.is_resting[a], pulse });
-            self.last_outputs[a] = (z[self.contact.outputs[a]], start_velocity == 0.0 && pulse.end == 0.0);
-            self.velocities[a] = pulse.end;
+        for a in 0..self.contact.count() {
+            self.last_outputs[a] = (z[self.contact.outputs[a]], self.is_at_rest(a));
+        }
+        for a in 0..self.contact.count() {
+            self.velocities[a] = self.end_velocity(a);
         }
         &self.contacts
     }

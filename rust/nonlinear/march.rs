@@ -11,6 +11,7 @@ use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, 
 use super::contact::{BodyDerivatives, BodyMotion, BodyState, ContactOperators, PulseEquations};
 use super::convolution::{average_neighbors, product, ConvolutionKernel, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
 use super::initial_state::{derivative_powers, power_term_means, EndVelocityForcing, Link};
+use super::jumps::ForceJumps;
 use super::system::{NonlinearSystem, MIN_INTEGRATION_ORDER};
 use crate::equation::{Equation, ORDER_GRAIN};
 use crate::error::{Error, Result};
@@ -90,6 +91,8 @@ pub(super) struct Operators {
     algebraic: bool,
     /// Dry friction; None without friction.
     contact: Option<ContactOperators>,
+    /// Jumps of the forces on bodies with friction within pulses.
+    jumps: ForceJumps,
 }
 
 /// Simulation with its linearization at every pulse.
@@ -100,8 +103,22 @@ pub(super) struct LinearizedRun {
     slopes: Vec<f64>,
     /// Inverse of the linearized equations of each pulse.
     inverses: Vec<f64>,
-    /// Motion and friction of each body, pulse by pulse.
+    /// Motion and friction of each body in each interval of each pulse.
     contacts: Vec<BodyState>,
+    /// Index of the first contact of each pulse, and the number of contacts.
+    contact_starts: Vec<usize>,
+}
+
+impl LinearizedRun {
+    /// Contacts of a pulse, interval by interval.
+    pub(super) fn contacts_of(&self, pulse: usize) -> &[BodyState] {
+        &self.contacts[self.contact_starts[pulse]..self.contact_starts[pulse + 1]]
+    }
+
+    /// Number of simulated pulses.
+    pub(super) fn pulses(&self) -> usize {
+        self.contact_starts.len() - 1
+    }
 }
 
 /// Pulse at which a simulation ends early, and the reason.
@@ -242,6 +259,7 @@ impl Operators {
             gains,
             algebraic,
             contact,
+            jumps: ForceJumps::new(system, record),
         })
     }
 
@@ -324,7 +342,7 @@ impl Operators {
 
     /// Motion of each body with friction in the simulation.
     pub(super) fn body_motions(&self, forcing: &ForcingTerms, run: &LinearizedRun) -> Vec<BodyMotion> {
-        self.contact.as_ref().map_or_else(Vec::new, |contact| contact.motions(forcing, &run.contacts))
+        self.contact.as_ref().map_or_else(Vec::new, |contact| contact.motions(forcing, run))
     }
 
     /// Simulation with a forcing of the state channels.
@@ -338,6 +356,7 @@ impl Operators {
             slopes: Vec::with_capacity(self.m * self.values() * width),
             inverses: Vec::with_capacity(self.m * states * states),
             contacts: Vec::new(),
+            contact_starts: vec![0],
         };
         let mut lanes: Vec<OnlineConvolution<'_>> =
             self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
@@ -352,7 +371,7 @@ impl Operators {
             pulse.predict(&run.sources);
             pulse.known.iter_mut().zip(&self.known).for_each(|(value, (_, means))| *value = means[k]);
             let solved = match &mut motion {
-                Some(motion) => motion.solve(&mut pulse),
+                Some(motion) => motion.solve(&mut pulse, &self.jumps.intervals(k)),
                 None => pulse.solve(),
             };
             if let Err(failure) = solved {
@@ -378,6 +397,7 @@ impl Operators {
             if let Some(motion) = &mut motion {
                 run.contacts.extend_from_slice(motion.advance(&pulse.z));
             }
+            run.contact_starts.push(run.contacts.len());
             for (lane, convolution) in self.lanes.iter().zip(&mut lanes) {
                 let of = |part: &Contribution| part.weight * pulse.source(part.source);
                 convolution.push(lane.contributions.iter().map(of).sum());
@@ -724,7 +744,8 @@ impl Operators {
             }
         }
         for (signal, lanes) in self.inputs_by_signal() {
-            let moved = derivatives.inputs.iter().find(|(of, _)| *of == signal).map(|(_, slope)| Kernel::new(slope));
+            let moved =
+                derivatives.inputs.iter().find(|input| input.signal == signal).map(|input| Kernel::new(&input.means));
             let mut spectrum = None;
             for lane in lanes {
                 let (coefficient, order) = derivatives.terms[lane.at.0][lane.at.1];
@@ -748,8 +769,8 @@ impl Operators {
         }
         let mut known = Vec::new();
         for (at, ((signal, order), _)) in self.known.iter().enumerate() {
-            if let Some((_, slope)) = derivatives.inputs.iter().find(|(of, _)| of == signal) {
-                known.push((at, derivative(slope, *order, self.step)?));
+            if let Some(input) = derivatives.inputs.iter().find(|input| input.signal == *signal) {
+                known.push((at, derivative(&input.means, *order, self.step)?));
             }
         }
         let bodies = match &self.contact {
@@ -759,7 +780,7 @@ impl Operators {
             }
             None => None,
         };
-        self.linear_run(run, &forcing, &known, bodies)
+        self.linear_run(run, &forcing, &known, bodies, derivatives)
     }
 
     /// Derivatives of the weights of the sources within a pulse, row-major.
@@ -785,6 +806,7 @@ impl Operators {
         forcing: &[Vec<f64>],
         known: &[(usize, Vec<f64>)],
         bodies: Option<(&ContactOperators, BodyDerivatives)>,
+        derivatives: &SystemDerivatives,
     ) -> Result<Vec<Vec<f64>>> {
         let (states, terms, values, count) = (self.states.len(), self.terms.len(), self.values(), self.sources());
         let width = states + self.known.len();
@@ -792,7 +814,7 @@ impl Operators {
         let mut lanes: Vec<OnlineConvolution<'_>> =
             self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
         let (mut free, mut x) = (vec![0.0; states], vec![0.0; count]);
-        let mut bodies = bodies.map(|(contact, derivatives)| (contact, derivatives.starts.clone(), derivatives));
+        let mut bodies = bodies.map(|(contact, bodies)| (contact, bodies.starts.clone(), bodies));
         for k in 0..self.m {
             free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
@@ -810,18 +832,15 @@ impl Operators {
                 }
             }
             if let Some((contact, motion, _)) = &bodies {
-                contact.fix_resting_outputs(
-                    &run.contacts[k * contact.count()..(k + 1) * contact.count()],
-                    motion,
-                    &mut free,
-                );
+                contact.fix_resting_outputs(run.contacts_of(k), motion, &mut free);
             }
             for a in 0..states {
                 x[a] = (0..states).map(|b| inverse[a * states + b] * free[b]).sum();
             }
-            if let Some((contact, motion, derivatives)) = &mut bodies {
-                let at = &run.contacts[k * contact.count()..(k + 1) * contact.count()];
-                contact.add_friction_derivatives(at, derivatives, motion, (&self.gains, inverse), &mut x)?;
+            if let Some((contact, motion, bodies)) = &mut bodies {
+                let intervals = (&*self.jumps.intervals(k), &*self.jumps.interval_derivatives(k, derivatives));
+                let at = run.contacts_of(k);
+                contact.add_friction_derivatives(at, intervals, bodies, motion, (&self.gains, inverse), &mut x)?;
             }
             for q in 0..terms {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();

@@ -11,6 +11,7 @@ mod contact;
 pub mod convolution;
 mod fit;
 mod initial_state;
+mod jumps;
 mod march;
 mod model;
 mod system;

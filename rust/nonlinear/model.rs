@@ -1,6 +1,6 @@
 //! Output-error problem of equations with non-linear terms: residuals of all experiments and their derivatives.
 
-use super::channels::{ForcingTerms, SystemDerivatives};
+use super::channels::{ForcingTerms, InputDerivative, SystemDerivatives};
 use super::initial_state::{merge_powers, InitialTerm};
 use super::march::{FrozenProducts, LinearizedRun, Operators};
 use super::system::NonlinearSystem;
@@ -11,6 +11,7 @@ use crate::expression::DerivedSignal;
 use crate::friction::FrictionLaw;
 use crate::parallel::Stop;
 use crate::regressors::{add_impulses, split_impulses, Record};
+use crate::signal::block_pulse::PulseJump;
 
 /// Friction law with free parameters, each a multiple of one coefficient.
 #[derive(Debug, Clone, PartialEq)]
@@ -140,8 +141,8 @@ pub(super) struct Part {
     record: Option<Record>,
     operators: Operators,
     run: LinearizedRun,
-    /// Derivatives of the means of each input with respect to its free parameter.
-    input_slopes: Vec<Vec<f64>>,
+    /// Derivative of each input with respect to its free parameter.
+    input_slopes: Vec<InputDerivative>,
 }
 
 impl NonlinearModel {
@@ -241,24 +242,37 @@ impl NonlinearModel {
                 let at = (point.orders.as_slice(), point.coefficients.as_slice(), unit.as_slice());
                 derivatives.forcing = self.initial_forcing(&part.operators, at)?;
             }
-            Parameter::Input(k) => derivatives.inputs.push((self.model.inputs[k].signal, part.input_slopes[k].clone())),
+            Parameter::Input(k) => derivatives.inputs.push(part.input_slopes[k].clone()),
         }
         Ok(derivatives)
     }
 
     /// Record with transformed inputs, and their derivatives in the free parameters. None without free inputs.
-    fn transform_inputs(&self, record: &Record, values: &[f64]) -> Result<(Option<Record>, Vec<Vec<f64>>)> {
+    fn transform_inputs(
+        &self,
+        experiment: &Experiment,
+        values: &[f64],
+    ) -> Result<(Option<Record>, Vec<InputDerivative>)> {
+        let record = &experiment.record;
         if self.model.inputs.is_empty() {
             return Ok((None, Vec::new()));
         }
         let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
+        let mut jumps: Vec<Vec<PulseJump>> = (0..record.len()).map(|s| record.jumps(s).to_vec()).collect();
         let mut slopes = Vec::with_capacity(self.model.inputs.len());
         for (&input, &value) in self.model.inputs.iter().zip(values) {
+            let signal = input.signal;
             let (means, slope) = self.model.apply_input_law(record, input, value)?;
-            signals[input.signal] = means;
+            let mut slope = InputDerivative { signal, means: slope, jumps: Vec::new() };
+            let is_hold = experiment.point_values.get(signal).is_some_and(|values| values.is_zero_order_hold);
+            if is_hold && !self.frictions.is_empty() {
+                (jumps[signal], slope.jumps) =
+                    self.model.apply_input_law_to_jumps(record, input, value)?.into_iter().unzip();
+            }
+            signals[signal] = means;
             slopes.push(slope);
         }
-        Ok((Some(Record::from_rows(record.step(), signals, None)?), slopes))
+        Ok((Some(Record::from_rows(record.step(), signals, None)?.with_jumps(jumps)?), slopes))
     }
 }
 
@@ -345,7 +359,7 @@ impl NonlinearModel {
         let mut out = Evaluation::empty();
         for (experiment, values) in experiments.iter().zip(&point.states) {
             stop.check()?;
-            let (acting, input_slopes) = self.transform_inputs(&experiment.record, &point.inputs)?;
+            let (acting, input_slopes) = self.transform_inputs(experiment, &point.inputs)?;
             let record = acting.as_ref().unwrap_or(&experiment.record);
             let system = self.system(&point.orders, &point.coefficients, record.len());
             // Same error as for a step that is too long, so that an optimizer shortens it.

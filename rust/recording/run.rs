@@ -11,7 +11,7 @@ use crate::estimation::output_error::{Experiment, InputLaw, NonuniformSamples, P
 use crate::regressors::Record;
 use crate::series;
 use crate::signal::block_pulse::{
-    check_pulses, delay_samples, point_samples, pulse_means, Intersample, PulseMeans, SampleInterpolation,
+    check_pulses, delay_samples, point_samples, pulse_means, Intersample, PulseJump, PulseMeans, SampleInterpolation,
 };
 use crate::signal::nonuniform::{check_times, interpolate, interpolate_gaps, NonuniformSignal, TIME_TOLERANCE};
 
@@ -112,6 +112,9 @@ pub struct Pulses {
     pub initial_levels: Vec<f64>,
     /// Pulse means of the known responses of the filter to an impulse and its derivatives.
     pub impulse_responses: Vec<Vec<f64>>,
+    /// Jumps of each zero-order-hold signal within pulses. Empty without friction, and for pulses that are longer than a
+    /// sampling interval.
+    pub jumps: Vec<Vec<PulseJump>>,
 }
 
 impl Pulses {
@@ -130,7 +133,12 @@ impl Pulses {
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
     pub fn into_record(self) -> Result<Record> {
-        Record::new(self.step, self.means, self.filter)
+        let record = Record::new(self.step, self.means, self.filter)?;
+        if self.jumps.is_empty() {
+            Ok(record)
+        } else {
+            record.with_jumps(self.jumps)
+        }
     }
 
     /// Record with the filter transients and initial levels, if there are any.
@@ -563,6 +571,10 @@ impl Recording {
             None => Vec::new(),
         };
         let transient = self.filter_states > 0 && series.is_some();
+        let within = |signal| self.with_signal(signal, |line| line.pulse_jumps(m, step)).unwrap_or_default();
+        // A pulse that is longer than a sampling interval averages over jumps.
+        let has_jumps = self.has_friction && m >= self.len() - 1;
+        let jumps = if has_jumps { (0..self.channels.len()).map(within).collect() } else { Vec::new() };
         Ok(Pulses {
             step,
             means,
@@ -570,6 +582,7 @@ impl Recording {
             has_transient: self.channels.iter().map(|channel| transient && channel.is_filtered).collect(),
             initial_levels: (0..self.channels.len()).map(|signal| self.initial_level(signal)).collect(),
             impulse_responses,
+            jumps,
         })
     }
 

@@ -67,6 +67,19 @@ impl PulseMeans {
     }
 }
 
+/// Jump of a zero-order-hold signal within a pulse.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PulseJump {
+    /// Index of the pulse.
+    pub pulse: usize,
+    /// Fraction of the pulse that precedes the jump.
+    pub share: f64,
+    /// Value before the jump.
+    pub before: f64,
+    /// Value after the jump.
+    pub after: f64,
+}
+
 /// Means over `m` equal pulses of [0, (N−1)h] of a signal with N samples. O(N + m).
 ///
 /// `m` is arbitrary. m = N − 1 is the grid of the samples, and a multiple of it is a finer grid. A smaller `m` gives

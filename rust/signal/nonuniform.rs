@@ -5,7 +5,7 @@
 
 use std::borrow::Cow;
 
-use super::block_pulse::{check_pulses, Intersample, PulseMeans};
+use super::block_pulse::{check_pulses, Intersample, PulseJump, PulseMeans};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 
 /// Tolerance in pulses: a sample time within this distance of a pulse edge counts as the edge.
@@ -158,6 +158,29 @@ impl<'a> NonuniformSignal<'a> {
         let mut before = 0.0;
         let sizes = self.values.iter().map(|&value| value - std::mem::replace(&mut before, value)).collect();
         (self.intersample == Intersample::Hold).then(|| (self.times.to_vec(), sizes))
+    }
+
+    /// Jumps of a zero-order-hold signal within `m` pulses of this width \[s\], without jumps at pulse edges. A linear
+    /// signal has none.
+    #[must_use]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::float_cmp)]
+    pub fn pulse_jumps(&self, m: usize, step: f64) -> Vec<PulseJump> {
+        if self.intersample != Intersample::Hold {
+            return Vec::new();
+        }
+        let jump = |(values, &time): (&[f64], &f64)| {
+            let place = time / step;
+            let pulse = place.floor();
+            let is_inside = (place - place.round()).abs() > EDGE_TOLERANCE_PULSES;
+            (is_inside && values[0] != values[1]).then_some(PulseJump {
+                pulse: pulse as usize,
+                share: place - pulse,
+                before: values[0],
+                after: values[1],
+            })
+        };
+        let times = self.times.iter().skip(1);
+        self.values.windows(2).zip(times).filter_map(jump).filter(|jump| jump.pulse < m).collect()
     }
 }
 

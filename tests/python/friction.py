@@ -9,7 +9,7 @@ moves the body.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -414,3 +414,35 @@ def slope_errors(at: Callable[[np.ndarray], dict], point: np.ndarray, numbers: i
         assert np.linalg.norm(expected) > 1e-6 * np.linalg.norm(columns[k]) > 0
         errors.append(float(np.linalg.norm(result[k] - expected) / np.linalg.norm(columns[k])))
     return errors
+
+
+def delayed_motor(
+    u: np.ndarray, step: float, delay: float, viscous: float, gain: float, friction: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angle and speed of a motor from rest, D^2 y = -viscous D y + gain u(t - delay) - friction sgn(D y).
+
+    u is held, and both are those at its samples. Between jumps, samples and stops the speed is an exponential, which
+    is written out.
+    """
+    rows = u.size
+    samples = np.arange(rows) * step
+    edges = np.unique(np.round(np.concatenate([samples, samples + delay]), 12))
+    edges = edges[edges <= samples[-1] + 1e-12]
+    y, v = np.zeros(rows), np.zeros(rows)
+    angle = speed = 0.0
+    for begin, end in pairwise(edges):
+        row = int(np.floor((begin - delay) / step + 1e-6))
+        force, left = (gain * u[row] if row >= 0 else 0.0), end - begin
+        while left > 1e-15 and (speed != 0.0 or abs(force) > friction):
+            side = np.sign(speed if speed != 0.0 else force)
+            limit, used = (force - side * friction) / viscous, left
+            if speed * limit < 0.0:
+                used = min(left, np.log(1.0 - speed / limit) / viscous)
+            faded = np.exp(-viscous * used)
+            angle += limit * used + (speed - limit) * (1.0 - faded) / viscous
+            speed = 0.0 if used < left else limit + (speed - limit) * faded
+            left -= used
+        near = round(end / step)
+        if abs(near * step - end) < 1e-9:
+            y[near], v[near] = angle, speed
+    return y, v

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from math import gamma
 
 import numpy as np
@@ -15,6 +16,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.estimation.free_parameters import FreeProblem
 from ftlm.estimation.linear import Streaming
 from ftlm.estimation.output_error import fit_output_error
+from ftlm.simulation.output_samples import simulate_samples
 from numbered_problem import NumberedProblem
 
 pytestmark = pytest.mark.usefixtures("no_extension_tests")
@@ -294,6 +296,42 @@ def test_a_free_delay_is_estimated_beside_friction(delay: float) -> None:
     for name, value in {"a": 2.0, "b": 10.0, "fc": 6.0, "delay_u": delay}.items():
         one = found.parameters[name]
         assert abs(one.value - value) < 4.0 * one.standard_error < 0.05 * value
+
+
+def motor_levels(seed: int, rows: int) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).uniform(-6.0, 6.0, rows // 60 + 1), 60)[:rows]
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.023, 0.0013, 0.0249])
+def test_a_delayed_motor_converges_with_the_square_of_the_step(delay: float) -> None:
+    """A body at rest slides from the jump of its force on, wherever in a pulse the delay puts it."""
+    u = motor_levels(0, 400)
+    y, _ = friction.delayed_motor(u, 0.005, delay, 8.0, 120.0, 90.0)
+    run = ftlm.Run.from_arrays(step=0.005, inputs={"u": u}, outputs={"y": y})
+    model = ftlm.Model(ftlm.equation("D^2 y = - 8 D y + 120 u - 90*sign(D y)", delay={"u": delay}))
+    errors = []
+    for pulses in (1, 4, 16):
+        simulated = simulate_samples(model, run, pulses, {"y": {}})[0][0]
+        errors.append(float(np.sqrt(np.mean((simulated - y) ** 2))))
+    assert errors[0] < 3e-4 * np.std(y)
+    assert all(fine < coarse / 10.0 for coarse, fine in pairwise(errors)), errors
+
+
+def test_intervals_of_a_delayed_motor_hold() -> None:
+    """At a delay of 4.6 rows and little noise, where an error of the scheme would show in every interval."""
+    truth = {"b": 8.0, "k": 120.0, "fc": 90.0, "delay_u": 0.023}
+    inside = []
+    for seed in range(6):
+        u = motor_levels(seed, 1500)
+        y, _ = friction.delayed_motor(u, 0.005, truth["delay_u"], truth["b"], truth["k"], truth["fc"])
+        noise = 0.01 * np.random.default_rng(1000 + seed).standard_normal(y.size)
+        run = ftlm.Run.from_arrays(step=0.005, inputs={"u": u}, outputs={"y": y + noise})
+        found = ftlm.identify(run, ftlm.equation("D^2 y = -b D y + k u(t - 0:0.1) - fc*sign(D y)"))
+        for name, value in truth.items():
+            one = found.parameters[name]
+            assert abs(one.value - value) < 1e-2 * value, name
+            inside.append(one.interval[0] <= value <= one.interval[1])
+    assert sum(inside) >= 21, inside
 
 
 def test_a_file_keeps_it(tmp_path) -> None:

@@ -13,6 +13,7 @@ mod coupled_instrumental_variables;
 mod coupled_search;
 mod equation;
 mod estimators;
+mod force_jumps;
 mod fractional;
 mod friction;
 mod given_points;

@@ -11,7 +11,7 @@ use super::stability::is_unstable;
 use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
-use crate::signal::block_pulse::delay_samples;
+use crate::signal::block_pulse::{delay_samples, PulseJump};
 use crate::simulate::nyquist_margin;
 
 /// Coordinate of a coefficient in an optimization. It affects the convergence, not the optimum.
@@ -219,8 +219,28 @@ impl FreeModel {
         value: f64,
     ) -> Result<(Vec<f64>, Vec<f64>)> {
         let means = record.signal(input.signal);
-        let before = if self.initial.is_at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
-        input.law.apply(means, value, record.step(), before)
+        input.law.apply(means, value, record.step(), self.value_before(means))
+    }
+
+    /// Jumps of an input within pulses after its non-linearity, and their derivatives with respect to its parameter.
+    pub(crate) fn apply_input_law_to_jumps(
+        &self,
+        record: &Record,
+        input: FreeInput,
+        value: f64,
+    ) -> Result<Vec<(PulseJump, PulseJump)>> {
+        let means = record.signal(input.signal);
+        let before = self.value_before(means);
+        input.law.apply_to_jumps(means, record.jumps(input.signal), value, record.step(), before)
+    }
+
+    /// Value of a delayed input before its first pulse.
+    fn value_before(&self, means: &[f64]) -> f64 {
+        if self.initial.is_at_rest() {
+            0.0
+        } else {
+            means.first().copied().unwrap_or(0.0)
+        }
     }
 
     pub(crate) fn structures(&self, orders: &[f64]) -> Vec<Structure> {
@@ -365,6 +385,45 @@ impl InputLaw {
                 })
                 .unzip(),
         })
+    }
+
+    /// Jumps of a zero-order hold within pulses behind the non-linearity, and their derivatives with respect to the
+    /// parameter: of the share, of the value before and of the value after.
+    ///
+    /// `jumps` are those before the non-linearity. A delay moves the jumps at the pulse edges only.
+    ///
+    /// # Errors
+    /// As [`InputLaw::apply`].
+    #[allow(clippy::float_cmp)]
+    pub(crate) fn apply_to_jumps(
+        self,
+        means: &[f64],
+        jumps: &[PulseJump],
+        value: f64,
+        step: f64,
+        before: f64,
+    ) -> Result<Vec<(PulseJump, PulseJump)>> {
+        if self == Self::Delay {
+            let steps = value / step;
+            let (whole, share) = (steps.floor(), steps - steps.floor());
+            if share == 0.0 {
+                return Ok(Vec::new());
+            }
+            let (near, far) = (delay_samples(means, whole, before)?, delay_samples(means, whole + 1.0, before)?);
+            let slope = |pulse| PulseJump { pulse, share: 1.0 / step, before: 0.0, after: 0.0 };
+            let pairs = far.into_iter().zip(near).enumerate().filter(|(_, (before, after))| before != after);
+            let jump = |(pulse, (before, after))| (PulseJump { pulse, share, before, after }, slope(pulse));
+            return Ok(pairs.map(jump).collect());
+        }
+        let ends: Vec<f64> = jumps.iter().flat_map(|jump| [jump.before, jump.after]).collect();
+        let (ends, slopes) = self.apply(&ends, value, step, before)?;
+        let jump = |(jump, (ends, slopes)): (&PulseJump, (&[f64], &[f64]))| {
+            (
+                PulseJump { before: ends[0], after: ends[1], ..*jump },
+                PulseJump { pulse: jump.pulse, share: 0.0, before: slopes[0], after: slopes[1] },
+            )
+        };
+        Ok(jumps.iter().zip(ends.chunks(2).zip(slopes.chunks(2))).map(jump).collect())
     }
 }
 

@@ -1,0 +1,144 @@
+//! Jumps of the forces on bodies with friction within a pulse.
+//!
+//! A zero-order hold behind a delay that is no whole number of pulses jumps within pulses. A body at rest stays there
+//! until the jump and slides after it, which the mean force of the pulse does not tell. The friction of such a pulse is
+//! therefore computed interval by interval between the jumps. Only terms c u of inputs u in the equations of bodies
+//! jump; derivatives and non-linear terms of inputs enter by their means.
+
+use std::borrow::Cow;
+
+use super::channels::SystemDerivatives;
+use super::system::NonlinearSystem;
+use crate::equation::ORDER_GRAIN;
+use crate::regressors::Record;
+
+/// Interval of a pulse between jumps, or its derivative with respect to a parameter.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Interval {
+    /// Length as a fraction of the pulse.
+    pub(super) length: f64,
+    /// External force on each body minus its mean over the pulse, in the unit of D^α y.
+    pub(super) forces: Vec<f64>,
+}
+
+/// Jump of an input within a pulse.
+#[derive(Debug, Clone, Copy)]
+struct InputJump {
+    pulse: usize,
+    share: f64,
+    size: f64,
+    signal: usize,
+    /// Index of the jump among those of its signal.
+    index: usize,
+}
+
+/// Coefficient of an input as a force on a body.
+#[derive(Debug, Clone, Copy)]
+struct InputForce {
+    signal: usize,
+    body: usize,
+    at: (usize, usize),
+    coefficient: f64,
+}
+
+/// Jumps of the forces on the bodies of a system.
+pub(super) struct ForceJumps {
+    /// Jumps in the sequence of time.
+    jumps: Vec<InputJump>,
+    forces: Vec<InputForce>,
+    /// The only interval of a pulse without jumps.
+    whole: [Interval; 1],
+    /// Derivative of this interval.
+    constant: [Interval; 1],
+}
+
+impl ForceJumps {
+    /// Jumps of the inputs of a record on the bodies of a system.
+    pub(super) fn new(system: &NonlinearSystem, record: &Record) -> Self {
+        let mut forces = Vec::new();
+        for (body, &(i, _)) in system.frictions.iter().enumerate() {
+            let equation = &system.equations[i];
+            for (k, (term, &coefficient)) in equation.structure.terms.iter().zip(&equation.coefficients).enumerate() {
+                let is_input = term.signal < system.recorded && system.output_index(i, term.signal).is_none();
+                if is_input && term.order < ORDER_GRAIN {
+                    forces.push(InputForce { signal: term.signal, body, at: (i, k), coefficient });
+                }
+            }
+        }
+        let mut signals: Vec<usize> = forces.iter().map(|force| force.signal).collect();
+        signals.sort_unstable();
+        signals.dedup();
+        let of = |&signal: &usize| {
+            record.jumps(signal).iter().enumerate().map(move |(index, jump)| InputJump {
+                pulse: jump.pulse,
+                share: jump.share,
+                size: jump.after - jump.before,
+                signal,
+                index,
+            })
+        };
+        let mut jumps: Vec<InputJump> = signals.iter().flat_map(of).collect();
+        jumps.sort_by(|a, b| a.pulse.cmp(&b.pulse).then(a.share.total_cmp(&b.share)));
+        let bodies = system.frictions.len();
+        let interval = |length: f64| [Interval { length, forces: vec![0.0; bodies] }];
+        Self { jumps, forces, whole: interval(1.0), constant: interval(0.0) }
+    }
+
+    fn of_pulse(&self, pulse: usize) -> &[InputJump] {
+        let first = self.jumps.partition_point(|jump| jump.pulse < pulse);
+        let count = self.jumps[first..].partition_point(|jump| jump.pulse == pulse);
+        &self.jumps[first..first + count]
+    }
+
+    /// Intervals of a pulse between its jumps.
+    pub(super) fn intervals(&self, pulse: usize) -> Cow<'_, [Interval]> {
+        let jumps = self.of_pulse(pulse);
+        if jumps.is_empty() {
+            return Cow::Borrowed(&self.whole);
+        }
+        let (mut mean, mut levels) = (vec![0.0; self.whole[0].forces.len()], Vec::with_capacity(jumps.len() + 1));
+        let (mut level, mut last) = (mean.clone(), 0.0);
+        for jump in jumps {
+            levels.push(Interval { length: jump.share - last, forces: level.clone() });
+            last = jump.share;
+            for force in self.forces.iter().filter(|force| force.signal == jump.signal) {
+                let size = force.coefficient * jump.size;
+                level[force.body] += size;
+                mean[force.body] += size * (1.0 - jump.share);
+            }
+        }
+        levels.push(Interval { length: 1.0 - last, forces: level });
+        for interval in &mut levels {
+            interval.forces.iter_mut().zip(&mean).for_each(|(force, mean)| *force -= mean);
+        }
+        Cow::Owned(levels)
+    }
+
+    /// Derivatives of the intervals of a pulse with respect to a parameter.
+    pub(super) fn interval_derivatives(&self, pulse: usize, derivatives: &SystemDerivatives) -> Cow<'_, [Interval]> {
+        let jumps = self.of_pulse(pulse);
+        if jumps.is_empty() {
+            return Cow::Borrowed(&self.constant);
+        }
+        let (mut mean, mut levels) = (vec![0.0; self.whole[0].forces.len()], Vec::with_capacity(jumps.len() + 1));
+        let (mut level, mut last) = (mean.clone(), 0.0);
+        for jump in jumps {
+            let input = derivatives.inputs.iter().find(|input| input.signal == jump.signal);
+            let slope = input.and_then(|input| input.jumps.get(jump.index));
+            let (share, size) = slope.map_or((0.0, 0.0), |slope| (slope.share, slope.after - slope.before));
+            levels.push(Interval { length: share - last, forces: level.clone() });
+            last = share;
+            for force in self.forces.iter().filter(|force| force.signal == jump.signal) {
+                let coefficient = derivatives.terms[force.at.0][force.at.1].0;
+                let change = coefficient * jump.size + force.coefficient * size;
+                level[force.body] += change;
+                mean[force.body] += change * (1.0 - jump.share) - force.coefficient * jump.size * share;
+            }
+        }
+        levels.push(Interval { length: -last, forces: level });
+        for interval in &mut levels {
+            interval.forces.iter_mut().zip(&mean).for_each(|(force, mean)| *force -= mean);
+        }
+        Cow::Owned(levels)
+    }
+}
