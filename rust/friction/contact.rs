@@ -46,12 +46,6 @@ impl FrictionProblem {
         Ok(Self { laws, gains })
     }
 
-    /// Friction problem of the same bodies over a part of the pulse, given as a fraction of it.
-    #[must_use]
-    pub fn over_part(&self, length: f64) -> Self {
-        Self { laws: self.laws.clone(), gains: self.gains.iter().map(|gain| length * gain).collect() }
-    }
-
     /// Number of bodies.
     #[must_use]
     pub fn count(&self) -> usize {
@@ -82,20 +76,28 @@ impl FrictionProblem {
         self.laws[body].breakaway()
     }
 
-    /// Decrease of the end velocity of a body by the friction forces on the other bodies.
+    /// Decrease of the end velocity of a body by the friction forces on the other bodies during a pulse.
     fn coupling_velocity(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
         (0..self.count()).filter(|&b| b != body).map(|b| self.gain(body, b) * forces(b)).sum()
     }
 
-    /// Solve a pulse that starts at the velocities `v` and would end at `p` without friction.
+    /// Solve a pulse, or a part of this length, that starts at the velocities `v` and would end at `p` without friction.
     ///
-    /// `at` receives the end velocity of each body without its own friction, and its pulse. `near` contains the initial
+    /// `length` is a fraction of the pulse, to which the gains are proportional. `at` receives the end velocity of each body without its own friction, and its pulse. `near` contains the initial
     /// friction forces.
-    pub fn solve(&self, v: &[f64], p: &[f64], rounding: &[f64], near: &[f64], at: &mut Vec<(f64, Pulse)>) {
+    pub fn solve(
+        &self,
+        length: f64,
+        (v, p): (&[f64], &[f64]),
+        rounding: &[f64],
+        near: &[f64],
+        at: &mut Vec<(f64, Pulse)>,
+    ) {
         let n = self.count();
+        let own = |a: usize| length * self.own(a);
         let of = |a: usize, forces: &[f64]| {
-            let free = p[a] - self.coupling_velocity(a, |b| forces[b]);
-            (free, self.laws[a].pulse(v[a], free, self.own(a), rounding[a]))
+            let free = p[a] - length * self.coupling_velocity(a, |b| forces[b]);
+            (free, self.laws[a].pulse(v[a], free, own(a), rounding[a]))
         };
         at.clear();
         at.extend((0..n).map(|a| of(a, near)));
@@ -104,19 +106,17 @@ impl FrictionProblem {
         }
         let mut forces = near.to_vec();
         let wrong = |at: &[(f64, Pulse)], forces: &[f64]| {
-            at.iter().zip(forces).enumerate().fold(0.0_f64, |w, (a, (x, f))| w.max((x.1.force - f).abs() * self.own(a)))
+            at.iter().zip(forces).enumerate().fold(0.0_f64, |w, (a, (x, f))| w.max((x.1.force - f).abs() * own(a)))
         };
         let mut miss = wrong(at, &forces);
-        let size = (0..n).map(|a| v[a].abs() + p[a].abs() + self.own(a) * self.breakaway(a)).fold(0.0, f64::max);
+        let size = (0..n).map(|a| v[a].abs() + p[a].abs() + own(a) * self.breakaway(a)).fold(0.0, f64::max);
         for _ in 0..MAX_CONTACT_ITERATIONS {
             if miss <= 4.0 * f64::EPSILON * size {
                 break;
             }
             let misses: Vec<f64> = at.iter().zip(&forces).map(|(x, f)| x.1.force - f).collect();
-            let newton = self.solve_coupled(
-                &(0..n).map(|a| self.force_slope(a, v[a], at[a].0, &at[a].1)).collect::<Vec<_>>(),
-                &misses,
-            );
+            let slopes: Vec<f64> = (0..n).map(|a| self.force_slope(a, length, v[a], &at[a])).collect();
+            let newton = self.solve_coupled(length, &slopes, &misses);
             let ahead: Vec<f64> = forces.iter().zip(&newton).map(|(f, s)| f + s).collect();
             let there: Vec<(f64, Pulse)> = (0..n).map(|a| of(a, &ahead)).collect();
             let left = wrong(&there, &ahead);
@@ -138,24 +138,23 @@ impl FrictionProblem {
         }
     }
 
-    /// Derivative of the friction force of a body with respect to its end velocity without friction.
+    /// Derivative of the friction force of a body in a part of a pulse with respect to its end velocity without
+    /// friction. `at` holds this velocity and the pulse, as [`FrictionProblem::solve`] returns them.
     #[must_use]
-    pub fn force_slope(&self, body: usize, velocity: f64, free: f64, pulse: &Pulse) -> f64 {
+    pub fn force_slope(&self, body: usize, length: f64, velocity: f64, at: &(f64, Pulse)) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
-        self.laws[body].slope(velocity, free, self.own(body), pulse, &unit).0
+        self.laws[body].slope(velocity, at.0, length * self.own(body), &at.1, &unit).0
     }
 
-    /// Solution of (1 + diag(slopes) (G − diag G)) x = `vector`.
+    /// Solution of (1 + `length` diag(slopes) (G − diag G)) x = `vector`: changes of the friction forces of coupled
+    /// bodies, from the changes that each would have alone.
     #[must_use]
-    pub fn solve_coupled(&self, slopes: &[f64], vector: &[f64]) -> Vec<f64> {
+    pub fn solve_coupled(&self, length: f64, slopes: &[f64], vector: &[f64]) -> Vec<f64> {
         let n = self.count();
-        if n == 1 {
-            return vector.to_vec();
-        }
         let mut matrix = vec![0.0; n * n];
         for a in 0..n {
             for b in 0..n {
-                matrix[a * n + b] = if a == b { 1.0 } else { slopes[a] * self.gains[a * n + b] };
+                matrix[a * n + b] = if a == b { 1.0 } else { length * slopes[a] * self.gains[a * n + b] };
             }
         }
         match small::inverse(&matrix, n) {

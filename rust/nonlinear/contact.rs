@@ -4,10 +4,8 @@
 //! within the pulse. Non-linear terms change p only slightly within a pulse, so the iteration for φ converges in a few
 //! steps.
 
-use std::borrow::Cow;
-
 use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
-use super::jumps::Interval;
+use super::jumps::{ForceJumps, Interval};
 use super::march::LinearizedRun;
 use crate::error::Result;
 use crate::friction::contact::{FrictionProblem, MAX_FRICTION_ERROR_RATIO, VELOCITY_ROUNDING_RATIO};
@@ -100,6 +98,43 @@ struct PulseMotionDerivatives<'a> {
     intervals: &'a [Interval],
 }
 
+/// Workspace of the derivatives of the friction forces of one pulse, one number per body.
+#[derive(Default)]
+struct DerivativeWorkspace {
+    velocities: Vec<f64>,
+    /// Derivatives of the mean friction forces.
+    means: Vec<f64>,
+    slopes: Vec<f64>,
+    forces: Vec<f64>,
+    ends: Vec<f64>,
+}
+
+/// Derivatives of the motion of the bodies at the start of a pulse with respect to a parameter.
+pub(super) struct MotionDerivatives {
+    outputs: Vec<f64>,
+    velocities: Vec<f64>,
+    /// Velocities at the end of the pulse without friction.
+    ends: Vec<f64>,
+    work: DerivativeWorkspace,
+}
+
+impl MotionDerivatives {
+    /// Derivatives at the start of a run.
+    pub(super) fn start(derivatives: &BodyDerivatives) -> Self {
+        let (outputs, velocities): (Vec<f64>, Vec<f64>) = derivatives.starts.iter().copied().unzip();
+        Self { ends: vec![0.0; outputs.len()], outputs, velocities, work: DerivativeWorkspace::default() }
+    }
+}
+
+/// Responses to friction forces in each pulse of a run, which all parameters share.
+pub(super) struct ContactResponses {
+    /// Responses of each state channel to each mean friction force, by pulse and body.
+    channels: Vec<f64>,
+    /// Derivatives of the mean friction forces with respect to those that the state channels alone would cause, by
+    /// pulse, row-major.
+    solutions: Vec<f64>,
+}
+
 /// Solver of the friction forces of all bodies, pulse by pulse.
 pub(super) struct ContactSolver<'a> {
     contact: &'a ContactOperators,
@@ -116,6 +151,17 @@ pub(super) struct ContactSolver<'a> {
     rounding: Vec<f64>,
     /// State of each body in each interval of the pulse.
     contacts: Vec<BodyState>,
+    work: IntervalWorkspace,
+}
+
+/// Workspace of the friction problems of the intervals of a pulse, one entry per body.
+#[derive(Default)]
+struct IntervalWorkspace {
+    velocities: Vec<f64>,
+    forces: Vec<f64>,
+    frictionless: Vec<f64>,
+    rates: Vec<f64>,
+    at: Vec<(f64, FrictionPulse)>,
 }
 
 impl ContactOperators {
@@ -190,6 +236,7 @@ impl ContactOperators {
             forces,
             rounding,
             contacts: Vec::new(),
+            work: IntervalWorkspace::default(),
         }
     }
 
@@ -221,129 +268,155 @@ impl ContactOperators {
         Ok(BodyDerivatives { starts, gains: (0..n * n).map(of).collect(), laws })
     }
 
-    /// Friction problem of an interval of a pulse.
-    fn problem_over(&self, length: f64) -> Cow<'_, FrictionProblem> {
-        if length == 1.0 {
-            Cow::Borrowed(&self.problem)
-        } else {
-            Cow::Owned(self.problem.over_part(length))
-        }
-    }
-
-    /// Derivatives of the mean friction forces of a pulse with these intervals.
+    /// Compute the derivatives of the mean friction forces of a pulse with these intervals.
     fn force_derivatives(
         &self,
         at: &[BodyState],
         intervals: &[Interval],
         moved: &PulseMotionDerivatives<'_>,
-    ) -> Vec<f64> {
-        let n = self.count();
-        let (mut velocities, mut means) = (moved.starts.to_vec(), vec![0.0; n]);
+        work: &mut DerivativeWorkspace,
+    ) {
+        let (n, problem) = (self.count(), &self.problem);
+        let DerivativeWorkspace { velocities, means, slopes, forces, ends } = work;
+        velocities.clear();
+        velocities.extend_from_slice(moved.starts);
+        for row in [&mut *means, slopes, forces, ends] {
+            row.clear();
+            row.resize(n, 0.0);
+        }
         for ((states, interval), change) in at.chunks(n).zip(intervals).zip(moved.intervals) {
-            let (length, problem) = (interval.length, self.problem_over(interval.length));
-            let gain = |a: usize, b: usize| change.length * self.problem.gain(a, b) + length * moved.gains[a * n + b];
-            let (mut slopes, mut right, mut ends) = (vec![0.0; n], vec![0.0; n], vec![0.0; n]);
-            for (a, &BodyState { rate, start_velocity, free_velocity, pulse, .. }) in states.iter().enumerate() {
-                let pushed =
-                    |b: usize| moved.gains[a * n + b] * interval.forces[b] + self.problem.gain(a, b) * change.forces[b];
-                let rate_derivative = moved.ends[a] - moved.starts[a] + (0..n).map(pushed).sum::<f64>();
-                let free = velocities[a] + change.length * rate + length * rate_derivative;
-                let others = (0..n).filter(|&b| b != a).map(|b| gain(a, b) * states[b].pulse.force).sum::<f64>();
-                ends[a] = free - others - gain(a, a) * pulse.force;
-                let derivatives = PulseDerivatives {
-                    start: velocities[a],
-                    free: free - others,
-                    first: gain(a, a),
-                    law: moved.laws[a],
-                };
-                let own = problem.own(a);
-                right[a] = problem.law(a).slope(start_velocity, free_velocity, own, &pulse, &derivatives).0;
-                slopes[a] = problem.force_slope(a, start_velocity, free_velocity, &pulse);
-            }
-            let forces = problem.solve_coupled(&slopes, &right);
+            let length = interval.length;
+            let gain = |a: usize, b: usize| change.length * problem.gain(a, b) + length * moved.gains[a * n + b];
             for (a, state) in states.iter().enumerate() {
-                let by_friction: f64 = (0..n).map(|b| problem.gain(a, b) * forces[b]).sum();
+                let pushed =
+                    |b: usize| moved.gains[a * n + b] * interval.forces[b] + problem.gain(a, b) * change.forces[b];
+                let rate = moved.ends[a] - moved.starts[a] + (0..n).map(pushed).sum::<f64>();
+                let by_others = |b: usize| if a == b { 0.0 } else { gain(a, b) * states[b].pulse.force };
+                let free =
+                    velocities[a] + change.length * state.rate + length * rate - (0..n).map(by_others).sum::<f64>();
+                let derivatives =
+                    PulseDerivatives { start: velocities[a], free, first: gain(a, a), law: moved.laws[a] };
+                let (law, own) = (problem.law(a), length * problem.own(a));
+                ends[a] = free - gain(a, a) * state.pulse.force;
+                forces[a] = law.slope(state.start_velocity, state.free_velocity, own, &state.pulse, &derivatives).0;
+                if n > 1 {
+                    let solved = (state.free_velocity, state.pulse);
+                    slopes[a] = problem.force_slope(a, length, state.start_velocity, &solved);
+                }
+            }
+            if n > 1 {
+                *forces = problem.solve_coupled(length, slopes, forces);
+            }
+            for (a, state) in states.iter().enumerate() {
+                let by_friction: f64 = (0..n).map(|b| length * problem.gain(a, b) * forces[b]).sum();
                 velocities[a] = if state.pulse.phase == Phase::Stick { 0.0 } else { ends[a] - by_friction };
                 means[a] += change.length * state.pulse.force + length * forces[a];
             }
         }
-        means
+    }
+
+    /// Responses of the state channels to the mean friction forces in each pulse, and how these forces respond to each
+    /// other by way of the state channels. `inverses` holds the inverse of the linearized equations of each pulse.
+    ///
+    /// # Errors
+    /// A singular matrix.
+    pub(super) fn responses(
+        &self,
+        run: &LinearizedRun,
+        jumps: &ForceJumps,
+        gains: &[f64],
+        inverses: &[f64],
+    ) -> Result<ContactResponses> {
+        let (states, n) = (self.states, self.count());
+        let count = gains.len() / states;
+        let mut out = ContactResponses { channels: Vec::new(), solutions: Vec::new() };
+        let (zeros, no_gains, no_laws) = (vec![0.0; n], vec![0.0; n * n], vec![[0.0; 3]; n]);
+        let (mut unit, mut matrix, mut work) = (zeros.clone(), no_gains.clone(), DerivativeWorkspace::default());
+        for (pulse, inverse) in inverses.chunks(states * states).enumerate() {
+            let at = run.contacts_of(pulse);
+            let moves_freely =
+                |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.is_resting && output == state);
+            let first = out.channels.len();
+            for b in 0..n {
+                for a in 0..states {
+                    let of = |s: usize| inverse[a * states + s] * gains[s * count + count - n + b];
+                    out.channels.push((0..states).filter(|&s| moves_freely(s)).map(of).sum());
+                }
+            }
+            let intervals = jumps.intervals(pulse);
+            let constant = vec![Interval { length: 0.0, forces: zeros.clone() }; intervals.len()];
+            (0..n * n).for_each(|at| matrix[at] = f64::from(u8::from(at % (n + 1) == 0)));
+            for c in 0..n {
+                unit.fill(0.0);
+                unit[c] = 1.0;
+                let moved = PulseMotionDerivatives {
+                    starts: &zeros,
+                    ends: &unit,
+                    gains: &no_gains,
+                    laws: &no_laws,
+                    intervals: &constant,
+                };
+                self.force_derivatives(at, &intervals, &moved, &mut work);
+                for (a, slope) in work.means.iter().enumerate() {
+                    for b in 0..n {
+                        let by_channels = out.channels[first + b * states + self.velocities[c]];
+                        matrix[a * n + b] -= slope * (by_channels + self.problem.gain(c, b));
+                    }
+                }
+            }
+            if n == 1 {
+                out.solutions.push(1.0 / matrix[0]);
+            } else {
+                out.solutions.extend(small::inverse(&matrix, n)?);
+            }
+        }
+        Ok(out)
     }
 
     /// Add the derivatives of the friction forces of a pulse to the derivatives of the sources. Update the derivatives
     /// of outputs and velocities. `intervals` holds the intervals of the pulse and their derivatives.
     pub(super) fn add_friction_derivatives(
         &self,
+        pulse: usize,
         at: &[BodyState],
-        intervals: (&[Interval], &[Interval]),
+        (intervals, changes): (&[Interval], &[Interval]),
+        responses: &ContactResponses,
         derivatives: &BodyDerivatives,
-        motion: &mut [(f64, f64)],
-        (gains, inverse): (&[f64], &[f64]),
+        motion: &mut MotionDerivatives,
         x: &mut [f64],
-    ) -> Result<()> {
+    ) {
         let (states, n, count) = (self.states, self.count(), x.len());
-        let moves_freely =
-            |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.is_resting && output == state);
-        let free: Vec<usize> = (0..states).filter(|&state| moves_freely(state)).collect();
-        // Response of the state channels to a friction, with the non-linear terms.
-        let response = |b: usize| -> Vec<f64> {
-            let of = |a: usize| free.iter().map(|&s| inverse[a * states + s] * gains[s * count + count - n + b]).sum();
-            (0..states).map(of).collect()
-        };
-        let responses: Vec<Vec<f64>> = (0..n).map(response).collect();
-        let mean = |b: usize| at.iter().skip(b).step_by(n).map(|state| state.length * state.pulse.force).sum::<f64>();
-        let means: Vec<f64> = (0..n).map(mean).collect();
-        let end = |a: usize| {
-            let through: f64 = (0..n).map(|b| derivatives.gains[a * n + b] * means[b]).sum();
-            derivatives.starts[a].1 + x[self.velocities[a]] + through
-        };
-        let (starts, ends): (Vec<f64>, Vec<f64>) = (0..n).map(|a| (motion[a].1, end(a))).unzip();
+        let MotionDerivatives { outputs, velocities, ends, work } = motion;
+        for (a, end) in ends.iter_mut().enumerate() {
+            let through = |state: (usize, &BodyState)| {
+                derivatives.gains[a * n + state.0 % n] * state.1.length * state.1.pulse.force
+            };
+            *end = derivatives.starts[a].1 + x[self.velocities[a]] + at.iter().enumerate().map(through).sum::<f64>();
+        }
         let moved = PulseMotionDerivatives {
-            starts: &starts,
-            ends: &ends,
+            starts: velocities,
+            ends,
             gains: &derivatives.gains,
             laws: &derivatives.laws,
-            intervals: intervals.1,
+            intervals: changes,
         };
-        let right = self.force_derivatives(at, intervals.0, &moved);
-        // The friction changes the end velocities without friction by way of the state channels.
-        let (zeros, no_gains, no_laws) = (vec![0.0; n], vec![0.0; n * n], vec![[0.0; 3]; n]);
-        let constant: Vec<Interval> =
-            intervals.0.iter().map(|_| Interval { length: 0.0, forces: zeros.clone() }).collect();
-        let mut matrix = vec![0.0; n * n];
-        for c in 0..n {
-            let unit: Vec<f64> = (0..n).map(|a| if a == c { 1.0 } else { 0.0 }).collect();
-            let moved = PulseMotionDerivatives {
-                starts: &zeros,
-                ends: &unit,
-                gains: &no_gains,
-                laws: &no_laws,
-                intervals: &constant,
-            };
-            let slopes = self.force_derivatives(at, intervals.0, &moved);
-            for (a, slope) in slopes.iter().enumerate() {
-                for b in 0..n {
-                    matrix[a * n + b] -= slope * (responses[b][self.velocities[c]] + self.problem.gain(c, b));
-                }
-            }
-        }
-        (0..n).for_each(|a| matrix[a * n + a] += 1.0);
-        let solution = small::inverse(&matrix, n)?;
+        self.force_derivatives(at, intervals, &moved, work);
+        let solution = &responses.solutions[pulse * n * n..(pulse + 1) * n * n];
+        let channels = &responses.channels[pulse * n * states..(pulse + 1) * n * states];
         for b in 0..n {
-            let force: f64 = (0..n).map(|c| solution[b * n + c] * right[c]).sum();
-            x[..states].iter_mut().zip(&responses[b]).for_each(|(x, r)| *x += r * force);
+            let force: f64 = (0..n).map(|c| solution[b * n + c] * work.means[c]).sum();
+            x[..states].iter_mut().zip(&channels[b * states..]).for_each(|(x, r)| *x += r * force);
             x[count - n + b] = force;
         }
-        for (a, motion) in motion.iter_mut().enumerate() {
-            *motion = (x[self.outputs[a]], derivatives.starts[a].1 + x[self.velocities[a]]);
+        for a in 0..n {
+            (outputs[a], velocities[a]) = (x[self.outputs[a]], derivatives.starts[a].1 + x[self.velocities[a]]);
         }
-        Ok(())
     }
 
     /// For each body at rest, replace the derivative of its output by the derivative in the last pulse.
-    pub(super) fn fix_resting_outputs(&self, at: &[BodyState], motion: &[(f64, f64)], free: &mut [f64]) {
+    pub(super) fn fix_resting_outputs(&self, at: &[BodyState], motion: &MotionDerivatives, free: &mut [f64]) {
         for (a, _) in at.iter().take(self.count()).enumerate().filter(|(_, at)| at.is_resting) {
-            free[self.outputs[a]] = motion[a].0;
+            free[self.outputs[a]] = motion.outputs[a];
         }
     }
 }
@@ -441,20 +514,25 @@ impl ContactSolver<'_> {
     /// Solve the friction problem of each interval of the pulse. `free` holds the velocities at its end without
     /// friction.
     fn solve_intervals(&mut self, free: &[f64], intervals: &[Interval]) {
-        let (contact, n) = (self.contact, self.contact.count());
-        let (mut velocities, mut forces, mut at) = (self.velocities.clone(), self.forces.clone(), Vec::new());
+        let (problem, n) = (&self.contact.problem, self.contact.count());
+        let IntervalWorkspace { velocities, forces, frictionless, rates, at } = &mut self.work;
+        velocities.clone_from(&self.velocities);
+        forces.clone_from(&self.forces);
         self.contacts.clear();
         for Interval { length, forces: pushes } in intervals {
-            let problem = contact.problem_over(*length);
-            let pushed = |a: usize| (0..n).map(|b| contact.problem.gain(a, b) * pushes[b]).sum::<f64>();
-            let ends: Vec<f64> = (0..n).map(|a| free[a] + pushed(a)).collect();
-            let frictionless: Vec<f64> =
-                (0..n).map(|a| length * ends[a] + (velocities[a] - length * self.velocities[a])).collect();
-            problem.solve(&velocities, &frictionless, &self.rounding, &forces, &mut at);
+            rates.clear();
+            frictionless.clear();
+            for a in 0..n {
+                let pushed: f64 = (0..n).map(|b| problem.gain(a, b) * pushes[b]).sum();
+                rates.push(free[a] + pushed - self.velocities[a]);
+                // Exactly `free` for a whole pulse.
+                frictionless.push(length * (free[a] + pushed) + (velocities[a] - length * self.velocities[a]));
+            }
+            problem.solve(*length, (velocities, frictionless), &self.rounding, forces, at);
             for (a, &(free_velocity, pulse)) in at.iter().enumerate() {
                 self.contacts.push(BodyState {
                     length: *length,
-                    rate: ends[a] - self.velocities[a],
+                    rate: rates[a],
                     start_velocity: velocities[a],
                     free_velocity,
                     is_resting: self.is_resting[a],

@@ -8,7 +8,9 @@
 //! need no iteration.
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
-use super::contact::{BodyDerivatives, BodyMotion, BodyState, ContactOperators, PulseEquations};
+use super::contact::{
+    BodyDerivatives, BodyMotion, BodyState, ContactOperators, ContactResponses, MotionDerivatives, PulseEquations,
+};
 use super::convolution::{average_neighbors, product, ConvolutionKernel, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
 use super::initial_state::{derivative_powers, power_term_means, EndVelocityForcing, Link};
 use super::jumps::ForceJumps;
@@ -671,20 +673,31 @@ const OVERFLOW_SIZE: f64 = 1e60;
 /// Reason of failure if no Newton step reduces the residual.
 const NO_DESCENT: PulseFailure = PulseFailure::Newton("no Newton step reduces its residual");
 
-/// Products of sources with kernels and with their derivatives, computed when first needed.
+/// Products of sources with kernels and with their derivatives, and responses to friction forces, computed when first
+/// needed.
 pub(super) struct FrozenProducts<'a> {
     operators: &'a Operators,
     run: &'a LinearizedRun,
     spectra: Vec<Option<Kernel>>,
     slopes: Vec<Option<Vec<f64>>>,
     found: std::collections::BTreeMap<(usize, usize, bool), Vec<f64>>,
+    contacts: Option<ContactResponses>,
 }
 
 impl<'a> FrozenProducts<'a> {
     pub(super) fn new(operators: &'a Operators, run: &'a LinearizedRun) -> Self {
         let spectra = (0..operators.sources()).map(|_| None).collect();
         let slopes = vec![None; operators.integrals.len()];
-        Self { operators, run, spectra, slopes, found: std::collections::BTreeMap::new() }
+        Self { operators, run, spectra, slopes, found: std::collections::BTreeMap::new(), contacts: None }
+    }
+
+    /// Compute the responses to friction forces if they are not known.
+    fn linearize_contacts(&mut self) -> Result<()> {
+        if let (Some(contact), None) = (&self.operators.contact, &self.contacts) {
+            let Operators { jumps, gains, .. } = self.operators;
+            self.contacts = Some(contact.responses(self.run, jumps, gains, &self.run.inverses)?);
+        }
+        Ok(())
     }
 
     /// Derivative of a kernel with respect to its order.
@@ -780,7 +793,8 @@ impl Operators {
             }
             None => None,
         };
-        self.linear_run(run, &forcing, &known, bodies, derivatives)
+        frozen.linearize_contacts()?;
+        self.linear_run(run, &forcing, &known, bodies, (derivatives, frozen.contacts.as_ref()))
     }
 
     /// Derivatives of the weights of the sources within a pulse, row-major.
@@ -806,7 +820,7 @@ impl Operators {
         forcing: &[Vec<f64>],
         known: &[(usize, Vec<f64>)],
         bodies: Option<(&ContactOperators, BodyDerivatives)>,
-        derivatives: &SystemDerivatives,
+        (derivatives, responses): (&SystemDerivatives, Option<&ContactResponses>),
     ) -> Result<Vec<Vec<f64>>> {
         let (states, terms, values, count) = (self.states.len(), self.terms.len(), self.values(), self.sources());
         let width = states + self.known.len();
@@ -814,7 +828,7 @@ impl Operators {
         let mut lanes: Vec<OnlineConvolution<'_>> =
             self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
         let (mut free, mut x) = (vec![0.0; states], vec![0.0; count]);
-        let mut bodies = bodies.map(|(contact, bodies)| (contact, bodies.starts.clone(), bodies));
+        let mut bodies = bodies.map(|(contact, bodies)| (contact, MotionDerivatives::start(&bodies), bodies));
         for k in 0..self.m {
             free.iter_mut().zip(forcing).for_each(|(free, row)| *free = row[k]);
             for (lane, convolution) in self.lanes.iter().zip(&lanes) {
@@ -837,10 +851,10 @@ impl Operators {
             for a in 0..states {
                 x[a] = (0..states).map(|b| inverse[a * states + b] * free[b]).sum();
             }
-            if let Some((contact, motion, bodies)) = &mut bodies {
+            if let (Some((contact, motion, bodies)), Some(responses)) = (&mut bodies, responses) {
                 let intervals = (&*self.jumps.intervals(k), &*self.jumps.interval_derivatives(k, derivatives));
                 let at = run.contacts_of(k);
-                contact.add_friction_derivatives(at, intervals, bodies, motion, (&self.gains, inverse), &mut x)?;
+                contact.add_friction_derivatives(k, at, intervals, responses, bodies, motion, &mut x);
             }
             for q in 0..terms {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();

@@ -316,7 +316,7 @@ fn of_all_combinations_of_bodies_at_rest_exactly_one_is_taken() {
         let laws = most.iter().map(|f| FrictionLaw::coulomb(*f)).collect();
         let problem = FrictionProblem::new(laws, gains).expect("a P-matrix");
         let mut at = Vec::new();
-        problem.solve(&vec![0.0; n], &p, &vec![0.0; n], &vec![0.0; n], &mut at);
+        problem.solve(1.0, (&vec![0.0; n], &p), &vec![0.0; n], &vec![0.0; n], &mut at);
         for (body, force) in at.iter().zip(&all[0]) {
             assert!((body.1.force - force).abs() < 1e-12, "{at:?} {all:?}");
         }
@@ -341,9 +341,9 @@ fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
             (0..2).map(|_| (random.uniform(-0.4, 0.4), random.uniform(-0.7, 0.7))).unzip();
         let problem = FrictionProblem::new(laws.clone(), gains.clone()).expect("a P-matrix");
         let (mut at, mut other) = (Vec::new(), Vec::new());
-        problem.solve(&v, &p, &[0.0; 2], &[0.0; 2], &mut at);
+        problem.solve(1.0, (&v, &p), &[0.0; 2], &[0.0; 2], &mut at);
         for begun in [[2.0, 2.0], [-2.0, 2.0], [0.3, -1.0]] {
-            problem.solve(&v, &p, &[0.0; 2], &begun, &mut other);
+            problem.solve(1.0, (&v, &p), &[0.0; 2], &begun, &mut other);
             assert!(at.iter().zip(&other).all(|(x, y)| (x.1.force - y.1.force).abs() < 1e-11), "{case}");
         }
         for a in 0..2 {
