@@ -6,7 +6,6 @@
 
 use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
 use super::jumps::{ForceJumps, Interval};
-use super::march::LinearizedRun;
 use crate::error::Result;
 use crate::friction::contact::{FrictionProblem, MAX_FRICTION_ERROR_RATIO, VELOCITY_ROUNDING_RATIO};
 use crate::friction::law::{FrictionLaw, Phase, Pulse as FrictionPulse, PulseDerivatives};
@@ -72,6 +71,31 @@ pub(super) struct BodyState {
     /// True if the body is at rest in this pulse and in the previous one, so that its mean output is constant.
     is_resting: bool,
     pulse: FrictionPulse,
+}
+
+/// Motion and friction of each body in each interval of each pulse of a run.
+pub(super) struct ContactStates {
+    states: Vec<BodyState>,
+    /// Index of the first state of each pulse, and the number of states.
+    starts: Vec<usize>,
+}
+
+impl ContactStates {
+    /// States of a run without pulses.
+    pub(super) fn empty() -> Self {
+        Self { states: Vec::new(), starts: vec![0] }
+    }
+
+    /// Append a pulse.
+    pub(super) fn push(&mut self, states: &[BodyState]) {
+        self.states.extend_from_slice(states);
+        self.starts.push(self.states.len());
+    }
+
+    /// States of a pulse, interval by interval.
+    fn of_pulse(&self, pulse: usize) -> &[BodyState] {
+        &self.states[self.starts[pulse]..self.starts[pulse + 1]]
+    }
 }
 
 /// Derivatives of the bodies with respect to a parameter.
@@ -201,11 +225,11 @@ impl ContactOperators {
     }
 
     /// Motion of each body, from its contact states pulse by pulse.
-    pub(super) fn motions(&self, forcing: &ForcingTerms, run: &LinearizedRun) -> Vec<BodyMotion> {
+    pub(super) fn motions(&self, forcing: &ForcingTerms, contacts: &ContactStates) -> Vec<BodyMotion> {
         let of = |(body, start): (usize, &(f64, f64))| {
             let mut motion = BodyMotion { force: Vec::new(), velocity: vec![start.1], phases: Vec::new() };
-            for pulse in 0..run.pulses() {
-                let states = || run.contacts_of(pulse).iter().skip(body).step_by(self.count());
+            for pulse in 0..contacts.starts.len() - 1 {
+                let states = || contacts.of_pulse(pulse).iter().skip(body).step_by(self.count());
                 motion.force.push(states().map(|state| state.length * state.pulse.force).sum());
                 if let Some(last) = states().next_back() {
                     motion.velocity.push(last.pulse.end);
@@ -322,7 +346,7 @@ impl ContactOperators {
     /// A singular matrix.
     pub(super) fn responses(
         &self,
-        run: &LinearizedRun,
+        contacts: &ContactStates,
         jumps: &ForceJumps,
         gains: &[f64],
         inverses: &[f64],
@@ -333,7 +357,7 @@ impl ContactOperators {
         let (zeros, no_gains, no_laws) = (vec![0.0; n], vec![0.0; n * n], vec![[0.0; 3]; n]);
         let (mut unit, mut matrix, mut work) = (zeros.clone(), no_gains.clone(), DerivativeWorkspace::default());
         for (pulse, inverse) in inverses.chunks(states * states).enumerate() {
-            let at = run.contacts_of(pulse);
+            let at = contacts.of_pulse(pulse);
             let moves_freely =
                 |state: usize| !at.iter().zip(&self.outputs).any(|(at, &output)| at.is_resting && output == state);
             let first = out.channels.len();
@@ -377,14 +401,13 @@ impl ContactOperators {
     /// of outputs and velocities. `intervals` holds the intervals of the pulse and their derivatives.
     pub(super) fn add_friction_derivatives(
         &self,
-        pulse: usize,
-        at: &[BodyState],
+        (contacts, responses, pulse): (&ContactStates, &ContactResponses, usize),
         (intervals, changes): (&[Interval], &[Interval]),
-        responses: &ContactResponses,
         derivatives: &BodyDerivatives,
         motion: &mut MotionDerivatives,
         x: &mut [f64],
     ) {
+        let at = contacts.of_pulse(pulse);
         let (states, n, count) = (self.states, self.count(), x.len());
         let MotionDerivatives { outputs, velocities, ends, work } = motion;
         for (a, end) in ends.iter_mut().enumerate() {
@@ -414,8 +437,14 @@ impl ContactOperators {
     }
 
     /// For each body at rest, replace the derivative of its output by the derivative in the last pulse.
-    pub(super) fn fix_resting_outputs(&self, at: &[BodyState], motion: &MotionDerivatives, free: &mut [f64]) {
-        for (a, _) in at.iter().take(self.count()).enumerate().filter(|(_, at)| at.is_resting) {
+    pub(super) fn fix_resting_outputs(
+        &self,
+        contacts: &ContactStates,
+        pulse: usize,
+        motion: &MotionDerivatives,
+        free: &mut [f64],
+    ) {
+        for (a, _) in contacts.of_pulse(pulse).iter().take(self.count()).enumerate().filter(|(_, at)| at.is_resting) {
             free[self.outputs[a]] = motion.outputs[a];
         }
     }
@@ -481,12 +510,12 @@ impl ContactSolver<'_> {
             }
             self.solve_intervals(&free, intervals);
             (miss, size) = (0.0, 0.0);
-            for a in 0..n {
+            for (a, free) in free.iter().enumerate() {
                 let states = self.contacts.iter().skip(a).step_by(n);
                 let force: f64 = states.map(|state| state.length * state.pulse.force).sum();
                 let own = contact.problem.own(a);
                 miss = f64::max(miss, (force - self.forces[a]).abs() * own);
-                size = size.max(self.velocities[a].abs() + free[a].abs() + contact.problem.breakaway(a) * own);
+                size = size.max(self.velocities[a].abs() + free.abs() + contact.problem.breakaway(a) * own);
                 self.forces[a] = force;
             }
             if self.contacts.iter().any(|state| state.pulse.end.is_nan()) {
@@ -522,11 +551,11 @@ impl ContactSolver<'_> {
         for Interval { length, forces: pushes } in intervals {
             rates.clear();
             frictionless.clear();
-            for a in 0..n {
-                let pushed: f64 = (0..n).map(|b| problem.gain(a, b) * pushes[b]).sum();
-                rates.push(free[a] + pushed - self.velocities[a]);
+            for (a, (&free, &start)) in free.iter().zip(&self.velocities).enumerate() {
+                let end = free + (0..n).map(|b| problem.gain(a, b) * pushes[b]).sum::<f64>();
+                rates.push(end - start);
                 // Exactly `free` for a whole pulse.
-                frictionless.push(length * (free[a] + pushed) + (velocities[a] - length * self.velocities[a]));
+                frictionless.push(length * end + (velocities[a] - length * start));
             }
             problem.solve(*length, (velocities, frictionless), &self.rounding, forces, at);
             for (a, &(free_velocity, pulse)) in at.iter().enumerate() {

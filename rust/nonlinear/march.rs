@@ -9,7 +9,7 @@
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
 use super::contact::{
-    BodyDerivatives, BodyMotion, BodyState, ContactOperators, ContactResponses, MotionDerivatives, PulseEquations,
+    BodyDerivatives, BodyMotion, ContactOperators, ContactResponses, ContactStates, MotionDerivatives, PulseEquations,
 };
 use super::convolution::{average_neighbors, product, ConvolutionKernel, OnlineConvolution, MAX_FEEDTHROUGH_ORDER};
 use super::initial_state::{derivative_powers, power_term_means, EndVelocityForcing, Link};
@@ -105,22 +105,7 @@ pub(super) struct LinearizedRun {
     slopes: Vec<f64>,
     /// Inverse of the linearized equations of each pulse.
     inverses: Vec<f64>,
-    /// Motion and friction of each body in each interval of each pulse.
-    contacts: Vec<BodyState>,
-    /// Index of the first contact of each pulse, and the number of contacts.
-    contact_starts: Vec<usize>,
-}
-
-impl LinearizedRun {
-    /// Contacts of a pulse, interval by interval.
-    pub(super) fn contacts_of(&self, pulse: usize) -> &[BodyState] {
-        &self.contacts[self.contact_starts[pulse]..self.contact_starts[pulse + 1]]
-    }
-
-    /// Number of simulated pulses.
-    pub(super) fn pulses(&self) -> usize {
-        self.contact_starts.len() - 1
-    }
+    contacts: ContactStates,
 }
 
 /// Pulse at which a simulation ends early, and the reason.
@@ -344,7 +329,7 @@ impl Operators {
 
     /// Motion of each body with friction in the simulation.
     pub(super) fn body_motions(&self, forcing: &ForcingTerms, run: &LinearizedRun) -> Vec<BodyMotion> {
-        self.contact.as_ref().map_or_else(Vec::new, |contact| contact.motions(forcing, run))
+        self.contact.as_ref().map_or_else(Vec::new, |contact| contact.motions(forcing, &run.contacts))
     }
 
     /// Simulation with a forcing of the state channels.
@@ -357,8 +342,7 @@ impl Operators {
             sources: vec![Vec::with_capacity(self.m); count],
             slopes: Vec::with_capacity(self.m * self.values() * width),
             inverses: Vec::with_capacity(self.m * states * states),
-            contacts: Vec::new(),
-            contact_starts: vec![0],
+            contacts: ContactStates::empty(),
         };
         let mut lanes: Vec<OnlineConvolution<'_>> =
             self.lanes.iter().map(|lane| OnlineConvolution::new(&self.kernels[lane.kernel])).collect();
@@ -397,9 +381,8 @@ impl Operators {
             run.slopes.extend_from_slice(&pulse.slopes);
             run.inverses.extend_from_slice(&pulse.inverse);
             if let Some(motion) = &mut motion {
-                run.contacts.extend_from_slice(motion.advance(&pulse.z));
+                run.contacts.push(motion.advance(&pulse.z));
             }
-            run.contact_starts.push(run.contacts.len());
             for (lane, convolution) in self.lanes.iter().zip(&mut lanes) {
                 let of = |part: &Contribution| part.weight * pulse.source(part.source);
                 convolution.push(lane.contributions.iter().map(of).sum());
@@ -695,7 +678,7 @@ impl<'a> FrozenProducts<'a> {
     fn linearize_contacts(&mut self) -> Result<()> {
         if let (Some(contact), None) = (&self.operators.contact, &self.contacts) {
             let Operators { jumps, gains, .. } = self.operators;
-            self.contacts = Some(contact.responses(self.run, jumps, gains, &self.run.inverses)?);
+            self.contacts = Some(contact.responses(&self.run.contacts, jumps, gains, &self.run.inverses)?);
         }
         Ok(())
     }
@@ -846,15 +829,15 @@ impl Operators {
                 }
             }
             if let Some((contact, motion, _)) = &bodies {
-                contact.fix_resting_outputs(run.contacts_of(k), motion, &mut free);
+                contact.fix_resting_outputs(&run.contacts, k, motion, &mut free);
             }
             for a in 0..states {
                 x[a] = (0..states).map(|b| inverse[a * states + b] * free[b]).sum();
             }
             if let (Some((contact, motion, bodies)), Some(responses)) = (&mut bodies, responses) {
                 let intervals = (&*self.jumps.intervals(k), &*self.jumps.interval_derivatives(k, derivatives));
-                let at = run.contacts_of(k);
-                contact.add_friction_derivatives(k, at, intervals, responses, bodies, motion, &mut x);
+                let at = (&run.contacts, responses, k);
+                contact.add_friction_derivatives(at, intervals, bodies, motion, &mut x);
             }
             for q in 0..terms {
                 x[states + q] += (0..states).map(|b| slopes[q * width + b] * x[b]).sum::<f64>();
