@@ -50,7 +50,7 @@ fn a_block_slides_from_the_jump_of_its_force_on() -> Result<(), Error> {
     let drive = record(h, 12, &[&[(0.0, 0.9), (3.4, 3.0), (7.25, 0.0)], &[]])?;
     let motion = block().run(&drive, &[vec![]])?.bodies.swap_remove(0);
     assert_eq!(motion.phases[2], Phase::Stick);
-    let speed = |pulses: f64| 2.0 * h * (pulses - 3.4).max(0.0).min(3.85) - h * (pulses - 7.25).max(0.0);
+    let speed = |pulses: f64| 2.0 * h * (pulses - 3.4).clamp(0.0, 3.85) - h * (pulses - 7.25).max(0.0);
     for (k, velocity) in motion.velocity.iter().enumerate() {
         assert!((velocity - speed(k as f64)).abs() < 1e-12, "{k} {velocity} {}", speed(k as f64));
     }
