@@ -352,17 +352,23 @@ def panel_gain(result):
     return c["b"] / c["q"]
 
 
+#: Findings that say that a gain assumes a start, or that the structure lacks dynamics.
+GAIN_CODES = {"rest_assumed", "start_not_told", "lag_fits", "dynamics_missing"}
+
+
 def panel_table(seeds):
-    """Gains off by over 20 % without a word of it, by structure, plant and start, and whether intervals hold."""
-    wrong, covered = {}, []
+    """Gains off by over 20 %, by structure, plant and start; how many without a finding; whether intervals hold."""
+    wrong, silent, covered = {}, 0, []
     for name, words, right in PANEL:
         for start, kind, seed in itertools.product(STARTS, INPUTS, seeds):
             found = ftlm.identify(panel_record(name, kind, start, seed), ftlm.equation(words))
-            off = abs(panel_gain(found) / 2.0 - 1.0) > 0.2 and "rest_assumed" not in codes(found)
+            is_off = abs(panel_gain(found) / 2.0 - 1.0) > 0.2
+            silent += is_off and not GAIN_CODES & set(codes(found))
+            off = is_off and not {"rest_assumed", "start_not_told"} & set(codes(found))
             wrong.setdefault(("right" if right else "one lag too few", name, start), []).append(off)
             if right and name != "fractional":
                 covered += [found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in TRUTHS[name].items()]
-    return wrong, covered
+    return wrong, silent, covered
 
 
 @pytest.mark.parametrize("cut", [0, 150, 151, 152])
@@ -460,16 +466,28 @@ def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     assert "start_not_told" not in codes(given)
 
 
+@pytest.mark.parametrize("name", ["two lags", "fractional and a lag"])
+@pytest.mark.parametrize("seed", [311, 312])
+def test_a_history_that_no_past_input_explains_is_rejected(name, seed):
+    # With one lag too few, nine free powers of t fitted the response to the step: gains were 7e8, 6e8, 0.59 and 0.47.
+    found = ftlm.identify(panel_record(name, "step", "motion", seed), ftlm.equation(FRACTIONAL))
+    assert found.settings["initial"].startswith("caputo")
+    assert panel_gain(found) == pytest.approx(2.0, rel=0.2 if name == "fractional and a lag" else 0.5)
+    assert "lag_fits" in codes(found)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_gains_of_a_panel_of_first_rows():
     # Seeds that no threshold was chosen on.
-    wrong, covered = panel_table((211, 212))
+    wrong, silent, covered = panel_table((211, 212))
     for (which, name, start), off in wrong.items():
         print(f"{which:<16} {name:<21} {start:<7} {sum(off):>2} of {len(off)} gains off by over 20 %")
     share = {w: np.mean([v for key, off in wrong.items() if key[0] == w for v in off]) for w, _, _ in wrong}
     print(share, f"{100 * np.mean(covered):.0f} % of {len(covered)} intervals hold the truth")
     assert share["right"] <= 0.02
+    # Of 180, where a gain is off the findings name the assumption or the missing dynamics.
+    assert silent <= 2
     # 23 of 90: a quarter within chance.
     off = [v for key, off in wrong.items() if key[0] == "one lag too few" for v in off]
     assert beta.ppf(0.025, sum(off), len(off) - sum(off) + 1) <= 0.25

@@ -24,17 +24,20 @@ from ftlm.estimation.output_error import (
     start_from_values,
 )
 from ftlm.findings import Finding, make_finding
+from ftlm.model.model import Model
 from ftlm.simulation.initial_conditions import (
     START_SETTINGS,
     common_initial_conditions,
     has_memory,
     history,
     needs_history,
+    output_residuals,
     resolve_common_initial_conditions,
     resolve_start,
     start_score,
 )
-from ftlm.simulation.output_samples import initial_exponents, is_in_motion
+from ftlm.simulation.output_samples import initial_exponents, is_in_motion, measured_samples
+from ftlm.simulation.step_refinement import simulate_refined
 from ftlm.structure.equation import Term
 from ftlm.structure.order import Order
 from ftlm.structure.structure import History, Initial, Structure, offset_exponents
@@ -73,6 +76,8 @@ MAX_SCREENING_EVALUATIONS = 12
 SCREENING_LIKELIHOOD_TOLERANCE = 0.01
 #: Share of the residuals of a screening that a fit to the end could leave, if the screening converged and if not.
 CONVERGED_RESIDUAL_SHARE, SCREENING_RESIDUAL_SHARE = 0.9, 0.5
+#: Change on halving the step, relative to the largest value, of simulations that judge a history.
+HISTORY_SIMULATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -339,6 +344,10 @@ def fit_with_initial_conditions(
         multistart = None if alone else run_multistart(runs, request, threads, progress)
         many = fit_initial_terms(start, refine=False, multistart=multistart)
         simplified = _simplify_initial_terms(many, runs, structure, refine=False)
+        if simplified is many and not alone:
+            without = _fit_without_implausible_history(many, runs, structure, lambda: fit_initial_terms("caputo"))
+            if without is not None:
+                return without
         request = replace(structure, initial=simplified.initial)
         fine = fit_output_error(runs, request, near=simplified, loss=loss, multistart=multistart)
         unstable = fine.unstable_optimum or simplified.unstable_optimum or many.unstable_optimum
@@ -399,6 +408,35 @@ def _simplify_initial_terms(joint: JointFit, runs: Sequence[Run], structure: Str
         )
         or joint
     )
+
+
+def _fit_without_implausible_history(
+    joint: JointFit, runs: Sequence[Run], structure: Structure, fit_caputo: Callable[[], JointFit]
+) -> JointFit | None:
+    """Return the fit with Caputo initial terms if past inputs do not explain the history of a fit, otherwise None.
+
+    The free powers of t of a history can fit dynamics that the structure lacks. Under the prior on past inputs, by
+    which models are compared with runs, such a history leaves larger residuals than Caputo's terms do.
+    """
+    problem = FreeProblem.of(structure)
+    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
+    model = Model(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs))
+    rows: dict[str, list[Floats]] = {o: [] for o in structure.outputs}
+    for run in runs:
+        simulated = simulate_refined(model, run, None, tolerance=HISTORY_SIMULATION_TOLERANCE)
+        measured = measured_samples(model, run, simulated.refinement)
+        for output, samples, own in zip(structure.outputs, measured, simulated.outputs, strict=True):
+            rows[output].append(output_residuals(samples, own))
+    residuals, free = [np.concatenate(row) for row in rows.values()], _pooled_residuals(joint)
+    if not all(np.all(np.isfinite(drop_missing(row))) for row in residuals):
+        return None
+    if start_score(residuals, 0, residuals) - start_score(free, 0, residuals) < START_SETTINGS.history_margin:
+        return None
+    try:
+        few = fit_caputo()
+    except FtlmError:
+        return None
+    return few if start_score(_pooled_residuals(few), 0, residuals) < start_score(residuals, 0, residuals) else None
 
 
 def refit_if_accepted(
