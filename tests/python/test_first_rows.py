@@ -161,7 +161,8 @@ def test_a_level_is_known_to_models_comparisons_and_files(tmp_path):
     assert found.comparison.simulated["y"][0] == pytest.approx(by_hand, abs=1e-6)
     # simulate() is the answer of the equations, from rest.
     assert again.simulate(run_of(u, y))["y"] == pytest.approx(by_hand - level, abs=1e-6)
-    assert f"level of y in run (estimated on that run, for it alone): {level:.6g}" in str(found)
+    assert found.parameters["level_y"].value == level
+    assert any(line.split()[:2] == ["level_y", f"{level:.6g}"] for line in str(found).splitlines())
     page = found.report(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "level" in page
 

@@ -8,6 +8,7 @@ from math import gamma
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.signal import lfilter, lsim
 from typer.testing import CliRunner
 
@@ -536,3 +537,113 @@ def test_a_free_run_that_diverges_has_no_offset_and_says_so():
     assert not np.isfinite(comparison.output_error["y"].nr)
     assert comparison.offsets == ({"y": {}},)
     assert "offset in the equation of y in ramp: not estimated, since the simulation diverges" in str(comparison)
+
+
+def recorded(u: np.ndarray, y: np.ndarray, step: float, name: str = "run", **inputs: np.ndarray) -> ftlm.Run:
+    """A run of one output and any inputs."""
+    units = {"y": "m", "u": "V"}
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u, **inputs}, outputs={"y": y}, units=units, name=name)
+
+
+def check_against_input_of_ones(found: ftlm.Identification, same: ftlm.Identification, pairs: dict[str, str]) -> None:
+    """A constant has the value and the standard error of the coefficient of an input of ones."""
+    for name, coefficient in pairs.items():
+        parameter, reference = found.parameters[name], same.parameters[coefficient]
+        assert parameter.standard_error == pytest.approx(reference.standard_error, rel=0.01)
+        assert abs(parameter.value - reference.value) < 0.05 * reference.standard_error
+        assert parameter.interval == pytest.approx(reference.interval, abs=0.1 * reference.standard_error)
+
+
+def test_a_constant_is_a_parameter_with_the_standard_error_of_linear_regression(tmp_path):
+    # D y = b u + c from rest is y = b ∫u + c t, linear in both.
+    g, h = np.random.default_rng(11), 0.01
+    u = np.repeat(g.choice([-1.0, 0.6], 48), 25)
+    time, area = h * np.arange(u.size), h * np.concatenate([[0.0], np.cumsum(u)[:-1]])
+    y = 2.0 * area - 0.6 * time + 0.01 * g.standard_normal(u.size)
+    regressors = np.stack([area, time], axis=1)
+    _, squares, *_ = np.linalg.lstsq(regressors, y, rcond=None)
+    error = np.sqrt(np.linalg.inv(regressors.T @ regressors)[1, 1] * squares[0] / (u.size - 2))
+    result = ftlm.identify(recorded(u, y, h), ftlm.equation("D y = b u", offset="constant"))
+    parameter = result.parameters["constant_y"]
+    assert parameter.value == result.comparison.offsets[0]["y"]["constant"]
+    assert parameter.standard_error == pytest.approx(error, rel=0.02)
+    assert (parameter.unit, parameter.fixed) == ("s^-1 m", False)
+    assert result.to_frame().loc["constant_y", "standard_error"] == parameter.standard_error
+    assert [line for line in result.summary().splitlines() if line.startswith("  constant_y ")]
+    page = result.report(tmp_path / "page.html").read_text()
+    assert "<i>constant_y</i>" in page
+    assert "estimated on its run, for it alone" in page
+
+
+def test_a_constant_of_each_run_has_the_standard_error_of_an_input_of_ones():
+    runs, with_ones = [], []
+    for k, constant in enumerate((0.6, -0.4)):
+        g = np.random.default_rng(k)
+        u = np.repeat(g.choice([-1.0, 1.0], 48), 25)
+        y = lfilter([0.0, 1 - np.exp(-0.005)], [1.0, -np.exp(-0.005)], 4.0 * u + 2.0 * constant)
+        y = y + lfilter([0.03], [1.0, -0.9], 0.1 * g.standard_normal(u.size))
+        runs.append(recorded(u, y, 0.01, f"run {k}"))
+        ones = {n: np.ones(u.size) * (j == k) for j, n in enumerate(("first", "second"))}
+        with_ones.append(recorded(u, y, 0.01, f"run {k}", **ones))
+    found = ftlm.identify(runs, ftlm.equation("D y = a y + b u", offset="constant", initial="rest"))
+    words = "D y = a y + b u + c first + d second"
+    same = ftlm.identify(with_ones, ftlm.equation(words, initial="rest"), offset="none")
+    check_against_input_of_ones(found, same, {"constant_y[run 0]": "c", "constant_y[run 1]": "d"})
+
+
+def test_a_constant_of_a_nonlinear_equation_has_the_standard_error_of_an_input_of_ones():
+    g, h, state, y = np.random.default_rng(3), 0.02, 0.0, []
+    u = np.repeat(g.uniform(-2.0, 3.0, 40), 20)
+    for value in u:
+        y.append(state)
+        for _ in range(20):
+            state += 0.05 * h * (-(state**3) + value - 0.5)
+    run = recorded(u, np.array(y) + 0.01 * g.standard_normal(u.size), h)
+    same = recorded(u, run["y"], h, ones=np.ones(u.size))
+    found = ftlm.identify(run, ftlm.equation("D y = -k y^3 + b u", offset="constant", initial="rest"))
+    check_against_input_of_ones(
+        found,
+        ftlm.identify(same, ftlm.equation("D y = -k y^3 + b u + c ones", initial="rest"), offset="none"),
+        {"constant_y": "c"},
+    )
+
+
+def test_a_ramp_has_the_standard_error_of_an_input_of_time():
+    run = fractional_run(4, 0.3, ramp=0.2)
+    time = run.step * np.arange(run.length)
+    same = recorded(run["u"], run["y"], run.step, ones=np.ones(time.size), time=time)
+    words = "D^0.8 y = -a y + b u"
+    found = ftlm.identify(run, ftlm.equation(words, offset="ramp", initial="rest"))
+    reference = ftlm.identify(same, ftlm.equation(f"{words} + c ones + r time", initial="rest"), offset="none")
+    for name, coefficient in (("constant_y", "c"), ("ramp_y", "r")):
+        assert found.parameters[name].standard_error == pytest.approx(
+            reference.parameters[coefficient].standard_error, rel=0.02
+        )
+
+
+def test_a_level_is_a_parameter_with_the_standard_error_of_least_squares():
+    g = np.random.default_rng(8)
+    u = np.where(np.arange(240) < 30, 0.0, 5.0)
+
+    def simulated(p):
+        pole = np.exp(-0.5 / p[1])
+        return p[2] + lfilter([0.0, 1 - pole], [1.0, -pole], p[0] * u)
+
+    y = simulated([1.2, 10.0, 20.0]) + 0.05 * g.standard_normal(u.size)
+    found = least_squares(lambda p: simulated(p) - y, [1.0, 9.0, 19.0])
+    spread = np.linalg.inv(found.jac.T @ found.jac) * 2 * found.cost / (u.size - 3)
+    result = ftlm.identify(recorded(u, y, 0.5), ftlm.equation("D y = a y + b u"))
+    level = result.parameters["level_y"]
+    assert level.value == pytest.approx(found.x[2], abs=0.3 * np.sqrt(spread[2, 2]))
+    assert level.standard_error == pytest.approx(np.sqrt(spread[2, 2]), rel=0.03)
+    assert level.unit == "m"
+
+
+def test_a_constant_without_a_covariance_has_no_standard_error():
+    structure = ftlm.equation("D^0.8 y = -a y + b u", offset="constant", initial="rest")
+    result = ftlm.identify(fractional_run(2, 0.5), structure, method="least-squares")
+    parameter = result.parameters["constant_y"]
+    assert np.isfinite(parameter.value)
+    assert np.isnan(parameter.standard_error)
+    line = next(line for line in result.summary().splitlines() if "constant_y" in line)
+    assert "±" not in line

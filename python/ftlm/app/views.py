@@ -188,7 +188,7 @@ def model_summary(fitted_model: FittedModel) -> dict[str, Any]:
     figures += comparison_charts(
         result.comparison, units=result.model.units, label="estimation", points=MAX_CHART_POINTS
     )
-    tables = [parameter_table(result.model, result.joint), *behavior_tables(result.model)]
+    tables = [parameter_table(result.model, result.joint, result.offsets), *behavior_tables(result.model)]
     choice = fitted_model.choice
     return {
         "title": title_of(result.model),

@@ -45,6 +45,7 @@ from ftlm.estimation.nuisance_parameters import (
     fits_better,
     has_colored_residuals,
     has_white_residuals,
+    offset_errors,
     offset_test,
     output_sensitivities,
     refit_if_accepted,
@@ -654,11 +655,20 @@ def assess_fit(fit: Fit) -> Identification:
         criteria,
         fit.task,
         fit.errors,
+        _offset_errors(fit, comparison),
     )
     against = tuple(f.to_file() for f in unique(result_findings(result)))
     if not against:
         return result
     return replace(result, model=replace(model, estimate=msgspec.structs.replace(estimate, against=against)))
+
+
+def _offset_errors(fit: Fit, comparison: Comparison) -> tuple[dict[str, dict[str, float]], ...]:
+    """Return the standard errors of the offsets of each run; empty for a fit without a covariance of this kind."""
+    joint = fit.joint
+    if joint is None or has_loop_noise_model(fit.settings) or not np.isfinite(np.diag(joint.covariance)).any():
+        return ()
+    return offset_errors(joint, fit.task.structure, fit.task.runs, comparison.offsets)
 
 
 def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:

@@ -28,6 +28,7 @@ from ftlm.model.model import Model
 from ftlm.simulation.initial_conditions import (
     START_SETTINGS,
     common_initial_conditions,
+    deviations,
     has_memory,
     history,
     needs_history,
@@ -220,6 +221,71 @@ def offset_test(
         for (a, b), w, s in zip(places, weights, sizes, strict=True)
     )
     return OffsetTest(statistic, count, float(along @ along) / total, size)
+
+
+def offset_errors(
+    joint: JointFit, structure: Structure, runs: Sequence[Run], offsets: Sequence[Mapping[str, Mapping[str, float]]]
+) -> tuple[dict[str, dict[str, float]], ...]:
+    """Return the standard errors of the offsets of each run, by output and kind; empty if not computable.
+
+    The offsets are projected out of the Jacobian of a joint fit, so its covariance excludes them. Here the covariance
+    has a row for each offset: the response to an input of ones (for a ramp, to the time), or the ones of a level.
+    """
+    listed = [(k, o, kind) for k, run in enumerate(offsets) for o, own in run.items() for kind in own]
+    if not listed or len(offsets) != len(runs):
+        return ()
+    values, has_level = joint.values_by_name, structure.offset == "level"
+    terms: dict[str, list[Term]] = {o: [] for o in structure.outputs}
+    reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
+    prefix = "one"
+    while any(name.startswith(prefix) for name in reserved_names):
+        prefix += "_"
+    names = [] if has_level else [f"{prefix}_{kind}_{k}_{output}" for k, output, kind in listed]
+    for name, (k, output, kind) in zip(names, listed, strict=False):
+        values[name] = offsets[k][output][kind]
+        terms[output].append(Term(f"{prefix}_{kind}_{k}", Order(), name))
+    whole = []
+    for k, run in enumerate(runs):
+        if has_level:
+            whole.append(deviations(run, structure, {o: own["level"] for o, own in offsets[k].items() if own})[0])
+            continue
+        shapes = {"constant": np.ones(run.length), "ramp": run.step * np.arange(run.length, dtype=float)}
+        own_inputs = {f"{prefix}_{kind}_{j}": shapes[kind] * float(k == j) for j, _, kind in listed}
+        whole.append(run.with_outputs(own_inputs))
+    initial = joint.initial if has_level else without_offset_equivalents(joint.initial, structure, values)
+    equations = tuple(replace(e, terms=(*e.terms, *terms[e.output])) for e in structure.equations)
+    problem = FreeProblem.of(replace(structure, equations=equations, offset="none", initial=initial))
+    weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
+    grid = Objective(problem, whole, weights, max(joint.refinement, 1), robust_weights=joint.robust_weights)
+    try:
+        point = grid.minimize(start_from_values(problem, values), 1, plain=True)
+        rows = np.asarray(point.outcome["jacobian"])
+        if has_level:
+            rows = np.vstack([rows, *_level_responses(grid, point, listed)])
+            point = replace(point, outcome={**point.outcome, "jacobian": rows})
+        spread = np.diag(covariance(point, grid))
+    except FtlmError:
+        return ()
+    places = range(len(rows) - len(listed), len(rows)) if has_level else [problem.names.index(n) for n in names]
+    errors: tuple[dict[str, dict[str, float]], ...] = tuple({o: {} for o in run} for run in offsets)
+    for (k, output, kind), place in zip(listed, places, strict=True):
+        errors[k][output][kind] = math.sqrt(spread[place])
+    return errors
+
+
+def _level_responses(grid: Objective, point: Iterate, listed: Sequence[tuple[int, str, str]]) -> list[Floats]:
+    """Return the weighted responses to the levels of outputs in runs, without their projection on the initial terms."""
+    shares, blocks = grid.residual_weights, _residual_blocks(grid)
+    bases, columns = _initial_responses(point, blocks, shares.size), []
+    for k, output, _ in listed:
+        place = grid.problem.structure.outputs.index(output)
+        own = slice(*blocks[k][place])
+        column = np.zeros(shares.size)
+        column[own] = grid.weights[place] * shares[own]
+        for basis in bases * 2:
+            column -= basis @ projections(basis, column)
+        columns.append(column)
+    return columns
 
 
 def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[Run]) -> dict[str, list[Floats]]:

@@ -18,7 +18,7 @@ from ftlm.estimation.objective import propagated_errors
 from ftlm.estimation.output_error import JointFit, ProfileInterval
 from ftlm.findings import Finding, texts
 from ftlm.model.model import Model
-from ftlm.model.parameter_estimates import Parameter, parameter_estimates, parameter_frame
+from ftlm.model.parameter_estimates import Parameter, offset_estimates, parameter_estimates, parameter_frame
 from ftlm.order_search.options import OrderGrid, restrict_order_grid
 from ftlm.order_search.result import SearchResult
 from ftlm.structure.structure import Structure
@@ -203,6 +203,8 @@ class Identification:
         Estimation runs and structure.
     coefficient_errors
         Standard errors of coefficients, and of searched orders, for methods without a joint covariance.
+    offset_errors
+        Standard errors of ``comparison.offsets``, in the same form; empty for methods without a joint covariance.
     """
 
     model: Model
@@ -216,6 +218,7 @@ class Identification:
     information: InformationCriteria | None = None
     task: Task | None = field(default=None, repr=False)
     coefficient_errors: Mapping[str, float] = field(default_factory=dict)
+    offset_errors: tuple[dict[str, dict[str, float]], ...] = field(default=())
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -267,13 +270,20 @@ class Identification:
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Orders, coefficients, delays and limits by name, with standard errors, intervals and units."""
+        """Orders, coefficients, delays, limits and offsets by name, with standard errors, intervals and units."""
         model = self.model
         coefficients = model.coefficients if self.task is None else self.task.structure.coefficient_names
         free = {*model.orders, *coefficients, *self.standard_errors}
         values_by_name = {f"delay_{n}": v for n, v in self.delays.items()} | self.limits
         values = self._values | {n: v for n, v in values_by_name.items() if n not in self._values}
-        return parameter_estimates(model, values, errors=self.standard_errors, intervals=self.intervals, free=free)
+        own = parameter_estimates(model, values, errors=self.standard_errors, intervals=self.intervals, free=free)
+        return {**own, **self.offsets}
+
+    @property
+    def offsets(self) -> dict[str, Parameter]:
+        """Constants, ramps and levels by name; each belongs to one estimation run."""
+        names = [name for name, _, _ in self.comparison.per_run]
+        return offset_estimates(self.model, names, self.comparison.offsets, self.offset_errors)
 
     @property
     def _values(self) -> dict[str, float]:
@@ -467,6 +477,7 @@ class Identification:
             **attributes(self, ("orders", "coefficients", "delays", *limits, "standard_errors", "intervals")),
             "profiled": list(self.profiles),
             **self.comparison.to_dict(),
+            **attributes(self, ["offset_errors"] if self.offset_errors else []),
             **attributes(self, ("residuals", "information", "searches")),
             "choice": None if self.joint is None else self.joint.origin_text,
             **attributes(self, ("findings", "warnings")),

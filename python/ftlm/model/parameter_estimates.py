@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ from ftlm.data.units import coefficient_unit, nonlinear_coefficient_unit
 from ftlm.model.model import Model
 from ftlm.structure.circuit import Circuit
 from ftlm.utils.files import to_frame
+from ftlm.utils.statistics import NORMAL_95
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,8 @@ class Parameter:
     Parameters
     ----------
     name
-        Name in the equation; ``delay_u``, ``sat_u`` and ``dead_u`` for the delay, saturation and dead zone of input u.
+        Name in the equation; ``delay_u``, ``sat_u`` and ``dead_u`` for the delay, saturation and dead zone of input u;
+        ``constant_y``, ``ramp_y`` and ``level_y`` for the offset of output y, with ``[run]`` if there are several runs.
     value
         Estimate, or the given value of a fixed parameter.
     standard_error
@@ -79,6 +81,31 @@ def parameter_estimates(
         n: Parameter(n, v, errors.get(n, math.nan), intervals.get(n, none), units.get(n, ""), n not in free)
         for n, v in values.items()
     }
+
+
+def offset_estimates(
+    model: Model,
+    runs: Sequence[str],
+    offsets: Sequence[Mapping[str, Mapping[str, float]]],
+    errors: Sequence[Mapping[str, Mapping[str, float]]],
+) -> dict[str, Parameter]:
+    """Return the offsets of each run as parameters by name.
+
+    `offsets` and their standard errors have a mapping output -> kind -> value for each run; `errors` may be empty.
+    """
+    orders = {e.output: e.order.constant for e in model.equations}
+    out = {}
+    for k, run in enumerate(offsets):
+        for output, values in run.items():
+            own = model.units.get(output, "")
+            rates = {"constant": orders[output], "ramp": orders[output] + 1.0, "level": 0.0}
+            for kind, value in values.items():
+                name = f"{kind}_{output}{f'[{runs[k]}]' if len(offsets) > 1 else ''}"
+                error = errors[k][output][kind] if errors else math.nan
+                unit = f"s^-{rates[kind]:g} {own}" if own and rates[kind] else own
+                half = NORMAL_95 * error
+                out[name] = Parameter(name, value, error, (value - half, value + half), unit)
+    return out
 
 
 def parameter_frame(parameters: Iterable[Parameter], reference_values: Mapping[str, float]) -> Any:

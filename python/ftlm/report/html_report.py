@@ -33,6 +33,7 @@ from ftlm.findings import (
     unique,
 )
 from ftlm.model.model import Model
+from ftlm.model.parameter_estimates import Parameter
 from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
 from ftlm.order_search.result import SearchResult, search_summary, search_top
 from ftlm.order_search.search import landscape
@@ -234,7 +235,7 @@ def identification_page(
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
     bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
-    sections = first_sections(model, findings, compared, bool(others), result.joint, runs, bands)
+    sections = first_sections(model, findings, compared, bool(others), result.joint, runs, bands, result.offsets)
     details = [residual_section(tests, result.information, compared, model.units)]
     details += correlation_sections(result.joint)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
@@ -270,11 +271,12 @@ def first_sections(
     joint: JointFit | None,
     runs: Sequence[Run] = (),
     bands: Sequence[Mapping[str, Band]] = (),
+    offsets: Mapping[str, Parameter] | None = None,
 ) -> list[Section]:
     """Return the first sections of a page: fit on validation runs, equations, warnings, and collapsed details.
 
     Without validation runs, the fit on the estimation runs is shown. `bands` are confidence bands of the simulated
-    outputs on the validation runs.
+    outputs on the validation runs. `offsets` are those of the estimation runs.
     """
     units = model.units
     words = [
@@ -306,7 +308,7 @@ def first_sections(
         heading = "Validation: measured and simulated" if new else "Measured and simulated"
         sections.append(Section(heading, left_out if charts > PAGE_CHARTS else (), figures=first[:PAGE_CHARTS]))
     sections += [
-        Section("Equations", equations, tables=[parameter_table(model, joint)]),
+        Section("Equations", equations, tables=[parameter_table(model, joint, offsets)]),
         Section("Warnings", words[1:] if warned else words, findings_shown, more=rest),
     ]
     if figures := behavior_figures(model):
@@ -555,7 +557,7 @@ def identification_html(result: Identification) -> str:
     parts = [verdict_html(verdict(result))]
     parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
     parts += [table.to_html() for table in behavior_tables(model)]
-    parts.append(parameter_table(model, result.joint).to_html())
+    parts.append(parameter_table(model, result.joint, result.offsets).to_html())
     # One run is enough to see; a report has all.
     figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
     parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # made of escaped parts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -74,11 +75,13 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
 
 def parameter_lines(result: Identification) -> list[str]:
     """Return orders and coefficients with standard errors, units and nominal values, one line each."""
-    errors, reference = result.standard_errors, result.model.structure.reference
+    offsets, reference = result.offsets, result.model.structure.reference
     rows = []
     for name, p in result.parameters.items():
-        spread = f"± {format_bound(p.standard_error)}" if name in errors else "fixed" if p.fixed else ""
+        has_error = not math.isnan(p.standard_error)
+        spread = f"± {format_bound(p.standard_error)}" if has_error else "fixed" if p.fixed else ""
         tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
+        tail = "(estimated on this run, for it alone)" if name in offsets else tail
         if name in reference:
             tail = f"{tail}  (stated {reference[name]:.6g})".strip()
         rows.append((name, f"{p.value:.6g}", spread, p.unit, tail))
@@ -88,7 +91,7 @@ def parameter_lines(result: Identification) -> list[str]:
     lines = [f"  {n:<{a}}  {v:>{b}} {s:<{c}}  {f'{u:<{d}}  ' if d else ''}{tail}".rstrip() for n, v, s, u, tail in rows]
     note = "± is one standard error; 95 % intervals are ± 1.96 of these"
     note += ", in brackets by profile likelihood" if result.profiles else ""
-    return [*lines, f"  ({note})"] if errors else lines
+    return [*lines, f"  ({note})"] if any(row[2].startswith("±") for row in rows) else lines
 
 
 def behavior_lines(model: Model) -> list[str]:
@@ -169,11 +172,10 @@ def _residuals(result: Identification) -> list[str]:
 
 
 def _starts(result: Identification) -> list[str]:
-    """Return text lines on output levels, and on runs with nonzero initial conditions."""
+    """Return text lines on offsets that are not identifiable, and on runs with nonzero initial conditions."""
     comparison = result.comparison
-    visible = {o for o in result.output_error if _offset(o, comparison) is not None}
-    has_hidden_offset = any(o not in visible or "level" in run[o] for run in comparison.offsets for o in run)
-    lines = describe_offsets(comparison) if has_hidden_offset else []
+    hidden = tuple({o: values for o, values in run.items() if not values} for run in comparison.offsets)
+    lines = describe_offsets(replace(comparison, offsets=hidden))
     moving = "" if comparison.offsets else describe_initial_terms(comparison)
     if moving and not any(f.code == "runs_split" for f in result.findings):
         lines += wrap_text(f"nonzero initial conditions, initial terms estimated (their number): {moving}")

@@ -11,7 +11,7 @@ from msgspec import UNSET
 
 from ftlm.estimation.output_error import JointFit
 from ftlm.model.model import Model
-from ftlm.model.parameter_estimates import parameter_units
+from ftlm.model.parameter_estimates import Parameter, parameter_units
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.expression import Expression
 from ftlm.structure.input_nonlinearity import (
@@ -213,7 +213,9 @@ def derivative_html(order: Order, signal: str) -> Markup:
     return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
 
 
-def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
+def parameter_table(
+    model: Model, joint: JointFit | None = None, offsets: Mapping[str, Parameter] | None = None
+) -> Table:
     """Return a table of orders and coefficients with their terms, standard errors and nominal values.
 
     Parameters
@@ -222,6 +224,8 @@ def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
         Model. Its ``estimate`` is used if `joint` is None.
     joint
         Output-error fit of the model with its standard errors.
+    offsets
+        Offsets of the estimation runs by name; see :attr:`ftlm.Identification.offsets`.
     """
     reference = model.structure.reference
     units = parameter_units(model)
@@ -286,6 +290,10 @@ def parameter_table(model: Model, joint: JointFit | None = None) -> Table:
         row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in names and n not in inputs
     ]
     rows += [row(n, v, None, place) for n, (place, v) in inputs.items()]
+    for name, p in (offsets or {}).items():
+        has_error = not math.isnan(p.standard_error)
+        cells: list[Cell] = [p.standard_error, *p.interval] if has_error else [None, None, None]
+        rows.append([symbol_html(name), p.value, *cells, None, unit_html(p.unit), "estimated on its run, for it alone"])
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
     if has_errors:
         note = "Intervals assume a right model. A coefficient without one is fixed or given by the law."

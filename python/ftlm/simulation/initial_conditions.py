@@ -6,7 +6,7 @@ An initial term is a power of t in the integrated equation.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -249,8 +249,12 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
     return replace(structure, initial=initial, offset=offset)
 
 
-def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
+def deviations(
+    run: Run, structure: Structure, output_levels: Mapping[str, float] | None = None
+) -> tuple[Run, dict[str, float]]:
     """Return a run minus its levels before the first sample, and the levels of its outputs by name.
+
+    `output_levels` are estimated levels of outputs, which replace those of the first samples.
 
     The level of an input is its value in the quiet samples. It is not subtracted from an input with a saturation or a
     dead zone.
@@ -259,6 +263,7 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
     limited = {limit.signal for limit in structure.limits}
     outputs = [n for n in structure.signals if n in run.outputs]
     levels = {n: float(drop_missing(run[n])[0]) for n in outputs} if evidence is None else evidence.levels
+    levels = {**levels, **(output_levels or {})}
     inputs = {} if evidence is None else {n: v for n, v in evidence.inputs.items() if n not in limited}
     levels_nonzero = {n: v for n, v in {**levels, **inputs}.items() if v != 0.0}
     if not levels_nonzero:
@@ -268,7 +273,7 @@ def deviations(run: Run, structure: Structure) -> tuple[Run, dict[str, float]]:
     own = None if read is None else {n: read.data[n] - v for n, v in levels_nonzero.items()}
     shifted = run.with_samples(samples, own)
     if run.unmasked_run is not None:
-        shifted = shifted.with_unmasked_run(deviations(run.unmasked_run, structure)[0])
+        shifted = shifted.with_unmasked_run(deviations(run.unmasked_run, structure, output_levels)[0])
     return shifted, levels
 
 
