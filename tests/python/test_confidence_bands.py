@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.analysis.frequency_response import parameter_vector, with_parameter_vector
+from ftlm.analysis.frequency_response import linear_part, parameter_vector, response_deviation, with_parameter_vector
 from ftlm.plot.comparison_charts import confidence_bands
+from ftlm.report.html_report import model_page
 
 
 def run(seed, samples=300):
@@ -59,3 +60,58 @@ def test_the_page_shows_unseen_runs_with_their_band_first(found, tmp_path):
     alone = found.report(tmp_path / "alone.html").read_text(encoding="utf-8")
     assert "Validation: measured and simulated" not in alone
     assert "95 % confidence band of the simulation" not in alone
+
+
+def rubbing_run(seed, words="D^2 y = -1.5 D y + 4 u - 1.2*sign(D y)"):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-2.0, 2.0, 25), 20)
+    clean = ftlm.Model(ftlm.equation(words)).simulate(
+        ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u})
+    )
+    return clean.with_outputs({"y": clean["y"] + 0.01 * rng.standard_normal(u.size)})
+
+
+@pytest.fixture(scope="module")
+def rubbing():
+    return ftlm.identify(rubbing_run(1), ftlm.equation("D^2 y = -b D y + k u - fc*sign(D y)"))
+
+
+def test_band_of_a_model_with_friction_is_the_spread_of_drawn_models(rubbing):
+    other, rng = rubbing_run(2), np.random.default_rng(3)
+    low, high = confidence_bands(rubbing.model, other, rubbing.model.compare(other))["y"]
+    names = [n for n in rubbing.joint.names if n in ("b", "k", "fc")]
+    assert names == rubbing.joint.names
+    drawn = rng.multivariate_normal(rubbing.joint.values, rubbing.covariance, size=200)
+    structure = rubbing.task.structure
+    simulated = [
+        ftlm.Model(structure.with_coefficients(dict(zip(names, v, strict=True)))).compare(other).simulated["y"][0]
+        for v in drawn.tolist()
+    ]
+    expected = 1.96 * np.std(simulated, axis=0)
+    moved = expected > 0.1 * expected.max()
+    ratio = ((high - low) / 2)[moved] / expected[moved]
+    assert 0.85 < np.median(ratio) < 1.15
+
+
+def test_the_page_of_a_model_with_friction_has_a_band_and_the_response_of_its_linear_part(rubbing, tmp_path):
+    text = rubbing.report(tmp_path / "r.html", validation=rubbing_run(2)).read_text(encoding="utf-8")
+    assert text.count("95 % confidence band of the simulation") == 1
+    part = text[text.index("Frequency response</h2>") :]
+    assert "without friction" in part
+    assert "<svg" in part[: part.index("Settings</h2>")]
+    # The linear part responds like an equation without friction, with the same covariance of its parameters.
+    b, k = (rubbing.coefficients[n] for n in ("b", "k"))
+    omega = np.array([0.5, 5.0])
+    part_model = linear_part(rubbing.model)
+    assert np.allclose(part_model.frequency_response(omega)[0, 0], k / ((1j * omega) ** 2 + b * 1j * omega))
+    gain, _ = response_deviation(part_model, omega)
+    rows = [rubbing.joint.names.index(n) for n in ("b", "k")]
+    slopes = np.stack([-b / (omega**2 + b**2), np.full(2, 1 / k)])
+    variance = np.einsum("iw,ij,jw->w", slopes, rubbing.covariance[np.ix_(rows, rows)], slopes)
+    assert gain[0, 0] == pytest.approx(np.sqrt(variance), rel=1e-3)
+
+
+def test_the_page_of_a_nonlinear_model_has_no_empty_section(tmp_path):
+    model = ftlm.Model(ftlm.equation("D y = -2 y^3 + 3 u"))
+    text = model_page(model, tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Frequency response</h2>" not in text

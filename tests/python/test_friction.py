@@ -392,6 +392,10 @@ def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
         assert abs(found.coefficients[name] - truth) < 4.0 * error + 0.004
     constants = [o["y"]["constant"] for o in found.comparison.offsets]
     np.testing.assert_allclose(constants, [0.15, -0.1], atol=0.02)
+    for run, truth in zip(runs, (0.15, -0.1), strict=True):
+        own = found.parameters[f"constant_y[{run.name}]"]
+        assert 0.0 < own.standard_error < 0.02
+        assert abs(own.value - truth) < 4.0 * own.standard_error
     assert found.fit["y"] > 98.5
     assert np.isnan(found.equation_error["y"].fit)
     page = found.report(tmp_path / "cart.html").read_text()

@@ -8,7 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
+import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.data.run import Run
@@ -16,7 +18,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.simulation.discretization import check_linear
 from ftlm.simulation.simulate import simulate
-from ftlm.structure.equation import Equation, Term
+from ftlm.structure.equation import Equation, Friction, Term
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_LABELS
 from ftlm.structure.order import Order
 from ftlm.utils.arguments import check_arguments
@@ -320,11 +322,12 @@ def covariance_of(model: Model) -> Floats | None:
 def parameter_vector(model: Model) -> Floats:
     """Return all orders and coefficients of a model as a vector, equation by equation.
 
-    For each equation it has alpha, then order and coefficient of each term.
+    For each equation it has alpha, then order and coefficient of each term, then the parameters of its friction.
     """
     numbers: list[float] = []
     for item in model.equations:
         numbers += [item.order.constant, *(v for t in item.terms for v in (t.order.constant, float(t.fixed or 0.0)))]
+        numbers += [] if item.friction is None else item.friction.numbers
     return np.array(numbers)
 
 
@@ -338,7 +341,10 @@ def with_parameter_vector(model: Model, numbers: Floats) -> Model:
         terms = [
             replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor) for t in item.terms
         ]
-        equations.append(_replace_unchecked(item, alpha, tuple(terms)))
+        friction = (
+            None if item.friction is None else item.friction.with_numbers([next(at) for _ in item.friction.numbers])
+        )
+        equations.append(_replace_unchecked(item, alpha, tuple(terms), friction))
     return replace(model, structure=replace(model.structure, equations=tuple(equations)))
 
 
@@ -354,14 +360,33 @@ def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Ite
         yield k, step, with_parameter_vector(model, values + shift), with_parameter_vector(model, values - shift)
 
 
-def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
-    """Return an equation with other orders and terms, without range checks.
+def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...], friction: Friction | None) -> Equation:
+    """Return an equation with other orders, terms and friction, without range checks.
 
     Numerical derivatives at a limit of the range need orders beyond the limit.
     """
     new = copy.copy(item)
-    vars(new).update(order=order, terms=terms)
+    vars(new).update(order=order, terms=terms, coulomb=UNSET if friction is None else friction)
     return new
+
+
+def linear_part(model: Model) -> Model:
+    """Return the model without friction, saturations and dead zones, with the covariance of the other parameters.
+
+    It is the exact model of deviations while every output slides in one direction and no input is limited.
+    """
+    structure, keep = model.structure, list[bool]()
+    for item in model.equations:
+        keep += [True] * (1 + 2 * len(item.terms))
+        keep += [False] * (0 if item.friction is None else len(item.friction.numbers))
+    equations = tuple(replace(e, coulomb=UNSET) for e in structure.equations)
+    matrix, estimate = covariance_of(model), model.estimate
+    if matrix is not None and estimate is not None:
+        rows = tuple(tuple(row) for row in matrix[np.ix_(keep, keep)].tolist())
+        estimate = msgspec.structs.replace(estimate, covariance=rows)
+    return replace(
+        model, structure=replace(structure, equations=equations, input_nonlinearities=UNSET), estimate=estimate
+    )
 
 
 @check_arguments

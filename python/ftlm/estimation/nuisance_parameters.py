@@ -252,7 +252,9 @@ def offset_errors(
         shapes = {"constant": np.ones(run.length), "ramp": run.step * np.arange(run.length, dtype=float)}
         own_inputs = {f"{prefix}_{kind}_{j}": shapes[kind] * float(k == j) for j, _, kind in listed}
         whole.append(run.with_outputs(own_inputs))
-    initial = joint.initial if has_level else without_offset_equivalents(joint.initial, structure, values)
+    initial = joint.initial
+    if structure.is_linear and not has_level:
+        initial = without_offset_equivalents(initial, structure, values)
     equations = tuple(replace(e, terms=(*e.terms, *terms[e.output])) for e in structure.equations)
     problem = FreeProblem.of(replace(structure, equations=equations, offset="none", initial=initial))
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]

@@ -335,11 +335,11 @@ def confidence_bands(model: Model, run: Run, comparison: Comparison) -> dict[str
     Returns
     -------
     dict
-        (lower, upper) edge of the band by output. Empty for a model without covariance or with friction, and if a
-        simulation with a changed parameter fails.
+        (lower, upper) edge of the band by output. Empty for a model without covariance, and if a simulation with a
+        changed parameter fails.
     """
     spread = covariance_of(model)
-    if spread is None or model.structure.has_friction:
+    if spread is None:
         return {}
     errors, values = np.sqrt(np.diag(spread)), parameter_vector(model)
     if not np.all(np.isfinite(spread)):

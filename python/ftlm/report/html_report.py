@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
+from ftlm.analysis.frequency_response import linear_part
 from ftlm.analysis.poles import modes, steady_states
 from ftlm.data.run import Run, as_runs
 from ftlm.errors import FtlmError
@@ -239,7 +240,7 @@ def identification_page(
     details = [residual_section(tests, result.information, compared, model.units)]
     details += correlation_sections(result.joint)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
-    details.append(frequency_section(model, steps))
+    details += frequency_sections(model, steps)
     details += _search_sections(result)
     titled = ((f"Initial terms of the simulations, {label}", c) for label, c in compared)
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
@@ -381,27 +382,33 @@ def residual_section(
     return Section("Residuals", words, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
 
 
-def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Section:
-    """Return a section with Bode charts over the frequency range of runs.
+def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> list[Section]:
+    """Return a section with Bode charts over the frequency range of runs; [] for a model with non-linear terms.
 
     `steps` are the (sampling interval, duration) pairs of the runs [s].
     """
-    structure, words = model.structure, ""
-    if structure.has_friction:
-        words = "A body that may stick has none: its answer is not in proportion to what drives it."
-    elif structure.has_nonlinear_terms:
-        words = "A non-linear model has none: see that of its linear model about a point, model.linearized(at=…)."
-    elif structure.limits:
-        words = "A model whose inputs saturate or have a dead zone has none: its answer is not in proportion to them."
-    if words:
-        return Section("Frequency response", words)
-    omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
+    structure = model.structure
+    if structure.has_nonlinear_terms:
+        return []
     words = "Exact response of all equations together at the fractional orders, without approximation."
+    effects = ["friction"] if structure.has_friction else []
+    effects += list(dict.fromkeys(INPUT_EFFECT_LABELS[limit.law] for limit in structure.limits))
+    if effects:
+        model = linear_part(model)
+        needed = ["every output keeps its direction of motion"] if structure.has_friction else []
+        if any(e.friction is not None and e.friction.stribeck is not None for e in structure.equations):
+            needed.append("moves faster than Stribeck's speed")
+        needed += ["the inputs stay in their proportional range"] if structure.limits else []
+        words = (
+            f"Exact response of the linear part of the model, without {' and '.join(effects)}. Small deviations "
+            f"respond in this way while {' and '.join(needed)}."
+        )
+    omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     if model.estimate is None or model.estimate.covariance is None:
         has_errors = model.estimate is None or None not in model.estimate.standard_errors.values()
         lacking = "This estimator gives no covariance" if has_errors else "The runs do not identify all parameters"
         words += f" {lacking}, so there are no bands."
-    return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
+    return [Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)]
 
 
 def _search_sections(result: Identification) -> list[Section]:
@@ -611,7 +618,7 @@ def model_page(
     details = []
     if tests := tests_on(model, others):
         details.append(residual_section(tests, None, compared, model.units))
-    details.append(frequency_section(model, [(r.step, r.duration) for r in others]))
+    details += frequency_sections(model, [(r.step, r.duration) for r in others])
     about: list[list[Cell]] = [
         ["structure", model.structure.name],
         ["coupling in simulations", model.structure.coupling],

@@ -224,6 +224,18 @@ class Friction:
             pairs += [(more.name, more.coefficient), (more.speed_name, more.speed)]
         return {name: float(value) for name, value in pairs if name is not None}
 
+    @property
+    def numbers(self) -> list[float]:
+        """Values of a friction without free parameters: coefficient, then coefficient and speed of a Stribeck term."""
+        more = self.stribeck
+        return [float(v) for v in (self.coefficient, *(() if more is None else (more.coefficient, more.speed)))]
+
+    def with_numbers(self, values: Sequence[float]) -> Friction:
+        """Return the friction with other values, in the sequence of :attr:`numbers`."""
+        coefficient, *near = values
+        more = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=near[0], speed=near[1])
+        return replace(self, coefficient=coefficient, more=more)
+
     def with_coefficients(self, values: Mapping[str, float]) -> Friction:
         """Return the friction with some free parameters fixed to values; the others stay free."""
         fixed = _fix_parameter(self, values)
