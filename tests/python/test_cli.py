@@ -26,6 +26,7 @@ from ftlm.app.server import DEFAULT_PORT
 from ftlm.cli import framework
 from ftlm.cli.framework import broken_line, print_text
 from ftlm.cli.main import COMMAND_HELP, CommandTable, app
+from ftlm.order_search.search import score_profiles
 from ftlm.utils.formatting import EscapedStream, escape_standard_streams
 from measured import DATA, needs_data
 
@@ -664,3 +665,50 @@ def test_a_word_that_is_no_choice_is_refused_with_the_nearest_one(folder: Path, 
     found = run_command(*[word.replace("x.csv", "square.csv") for word in words], cwd=folder)
     assert found.returncode == 2
     assert text in " ".join(found.stderr.split())
+
+
+def test_search_writes_a_report_of_its_table_profiles_and_validation(tmp_path: Path) -> None:
+    plant = ftlm.Model(ftlm.equation("D^0.8 y = -0.7 y + 1.4 u"))
+    for k in range(2):
+        g = np.random.default_rng(k)
+        u = np.repeat(g.choice([-1.0, 1.0], 20), 15)
+        clean = plant.simulate(ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0 * u}))
+        columns = np.c_[0.05 * np.arange(u.size), u, clean["y"] + 0.01 * g.standard_normal(u.size)]
+        np.savetxt(tmp_path / f"{k}.csv", columns, delimiter=",", header="t,u,y", comments="")
+    words = ("0.csv", "--structure", "D^alpha y = a y + b u", "--order-grid", "alpha=0.6:1:0.02", "--top", "4")
+    plain = run_command("search", *words, cwd=tmp_path)
+    found = run_command("search", *words, "--report", "s.html", "--validation", "1.csv", cwd=tmp_path)
+    assert found.returncode == 0, found.stderr
+    assert found.stdout.startswith(plain.stdout)
+    fit = re.search(r"validation on 1: fit y ([\d.]+) %; WITH CARE: ", found.stdout)
+    assert fit is not None
+    assert float(fit[1]) > 95.0
+    page = (tmp_path / "s.html").read_text()
+    assert f"Fit on validation data (1): y {float(fit[1]):.2f}" in page
+    part = page[page.index("Order search</h2>") :]
+    assert "Best 4 of 21 candidates" in part
+    assert "Score over α" in part
+    document = json.loads(run_command("search", *words, "--validation", "1.csv", "--json", cwd=tmp_path).stdout)
+    assert document["validation"]["output_error"]["y"]["fit"] == pytest.approx(float(fit[1]), abs=0.01)
+    again = run_command("search", *words, "--report", "s.html", cwd=tmp_path)
+    assert again.returncode != 0
+    assert "--force" in again.stderr
+
+
+def test_a_score_profile_has_the_scores_of_the_search_along_one_order(tmp_path: Path) -> None:
+    g = np.random.default_rng(3)
+    u = np.repeat(g.choice([-1.0, 1.0], 20), 15)
+    plant = ftlm.Model(ftlm.equation("D^0.8 y = -0.7 y + 1.4 u"))
+    run = plant.simulate(ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0 * u}))
+    run = run.with_outputs({"y": run["y"] + 0.01 * g.standard_normal(u.size)})
+    structure = ftlm.equation("D^alpha y = a D^beta y + b u")
+    grid = ftlm.OrderGrid(orders={"alpha": [0.7, 0.75, 0.8, 0.85], "beta": [0.0, 0.1, 0.2]})
+    search = ftlm.search_orders(run, structure, grid, top=12)
+    charts = score_profiles([run], structure, search, grid)
+    assert [chart.title for chart in charts] == ["Score over α", "Score over β"]
+    scores = {(r.orders["alpha"], r.orders["beta"]): r.score for r in search.table}
+    best = search.orders
+    (_, along), (_, marked) = charts[1].lines
+    assert along == pytest.approx([scores[best["alpha"], beta] for beta in grid.orders["beta"]], rel=1e-9)
+    assert np.nanmin(marked) == pytest.approx(search.score, rel=1e-9)
+    assert np.count_nonzero(np.isfinite(marked)) == 1

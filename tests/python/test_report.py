@@ -160,7 +160,7 @@ def test_charts_are_named_for_those_who_cannot_see_them(page):
     charts = re.findall(r'<svg class="chart [^>]*>', page)
     fits = 2 * 2  # outputs, runs
     residuals = 2 * 2 * 2  # outputs; itself and the current; runs
-    bode, maps = 2 * 2, 1
+    bode, maps = 2 * 2, 1 + 3  # a map, and a profile of each searched order
     inputs, series = 2, 2 * fits  # over time and histogram
     own = 1 + 2  # poles, steps
     assert len(charts) == 2 * (fits + inputs + residuals + series + bode + maps + own)  # wide and narrow

@@ -41,7 +41,7 @@ from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import Weights
 from ftlm.estimation.frequency_domain import identify_frequency as frequency_estimation
 from ftlm.estimation.methods import OutputError, method_with_options
-from ftlm.estimation.order_ranking import with_verdict
+from ftlm.estimation.order_ranking import identification_of_searches, with_verdict
 from ftlm.estimation.output_error import Loss
 from ftlm.io.load_frequency import load_frequency
 from ftlm.model.serialization import load_model
@@ -244,6 +244,10 @@ def search(
     weighting: MultiInnovationOptions,
     m: int | None = None,
     threads: int | None = None,
+    report: OptionalOutputFile = None,
+    validation: str | None = None,
+    validation_window: str | None = None,
+    force: bool = False,
     as_json: bool = False,
 ) -> None:
     """Search the orders of each equation, or of a joint under an order law, and count every outcome.
@@ -252,8 +256,15 @@ def search(
     ------
     coefficients
         Estimation method of the coefficients.
+
+    Output
+    ------
+    validation : FILE
+        Validate the best model on this run.
     """
-    runs = reading.runs(files, shape.structure(structure))
+    equation = shape.structure(structure)
+    runs = reading.runs(files, equation)
+    others = validation_runs(reading, validation, validation_window, equation)
     target = shape.structure_for_runs(structure, runs)
     parts = target.independent_groups() or {e.output: target.equation(e.output) for e in target.equations}
     every = grid.grid() or OrderGrid()
@@ -282,7 +293,21 @@ def search(
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 result = run_job(replace(job, progress=progress), store=open_store, number=number)
             results[name] = with_verdict(result, runs, parts[name], settings, restrict_grid(every, parts[name]), m=m)
-    show_by_output(results, as_json=as_json)
+    if report is None and not others:
+        show_by_output(results, as_json=as_json)
+        return
+    best = identification_of_searches(results, runs, target, settings, every, m=m)
+    checked = best.validate(others) if others else None
+    if as_json:
+        content = {name: result.to_dict() for name, result in results.items()}
+        show_json(content if checked is None else {**content, "validation": checked.to_dict()})
+    else:
+        show_by_output(results, as_json=False)
+    if checked is not None and not as_json:
+        fits = ", ".join(f"{o} {fit:.4g} %" for o, fit in checked.fit.items())
+        print_text(f"validation on {', '.join(r.name for r in others)}: fit {fits}; {checked.verdict}")
+    if report is not None:
+        best.report(report, validation=others or None, force=force)
 
 
 @command

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
@@ -16,7 +16,7 @@ from ftlm.data.sampling import drop_missing
 from ftlm.errors import FtlmError
 from ftlm.estimation.estimators import fit_at_best_orders
 from ftlm.estimation.identify import assess_fit
-from ftlm.estimation.result import Task
+from ftlm.estimation.result import Identification, Task
 from ftlm.estimation.verdict import MAX_ORDER_ERROR, verdict_from
 from ftlm.findings import Finding, make_finding, unique
 from ftlm.order_search.options import Coefficients, Criterion, Norm, OrderGrid, RowBasis, SearchSettings
@@ -159,12 +159,25 @@ def with_verdict(
     name = "stage" if structure.has_order_law else structure.outputs[0]
     first = replace(search, table=search.table[:1])
     try:
-        result = assess_fit(fit_at_best_orders(Task(tuple(runs), structure, order_grid), settings, m, {name: first}))
+        result = identification_of_searches({name: first}, runs, structure, settings, order_grid, m=m)
     except FtlmError as error:
         failed = make_finding("rank_not_judged", method=settings.coefficients, text=str(error))
         return replace(search, verdict=verdict_from([failed]), model_findings=(failed,))
     alike = [] if result.residuals is None else _alike_findings(search, result.residuals)
     return replace(search, verdict=result.verdict, model_findings=unique([*alike, *result.findings]))
+
+
+def identification_of_searches(
+    searches: Mapping[str, SearchResult],
+    runs: Sequence[Run],
+    structure: Structure,
+    settings: SearchSettings,
+    order_grid: OrderGrid | None = None,
+    *,
+    m: int | None = None,
+) -> Identification:
+    """Return the identification of all equations at the best orders of completed searches, for a report."""
+    return assess_fit(fit_at_best_orders(Task(tuple(runs), structure, order_grid), settings, m, searches))
 
 
 def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]:

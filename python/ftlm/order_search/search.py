@@ -50,7 +50,10 @@ from ftlm.simulation.nonlinear_columns import record_signals
 from ftlm.simulation.output_samples import simulate_samples
 from ftlm.structure.structure import Structure
 from ftlm.svg.charts import Landscape
+from ftlm.svg.figure import SMALL_WIDTH_PX
+from ftlm.svg.line_chart import LineChart
 from ftlm.utils.arguments import check_arguments
+from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats, check_threads
 
 #: Candidates of an order search that get a free run.
@@ -594,6 +597,38 @@ def landscape(
     values = np.array([r.score for r in table])
     scores[np.abs(y[:, None] - rows).argmin(axis=0), np.abs(x[:, None] - columns).argmin(axis=0)] = values
     return Landscape((names[0], names[1]), x, y, scores)
+
+
+def score_profiles(
+    runs: Sequence[Run], structure: Structure, search: SearchResult, order_grid: OrderGrid
+) -> list[LineChart]:
+    """Return a chart of the score over each order with several values in the grid; the others are those of rank 1."""
+    charts = []
+    best = search.orders
+    score = "error (45)" if search.settings["norm"] == "l1" else "RMSE"
+    for name, values in order_grid.values(structure).items():
+        if len(values) < 2:
+            continue
+        fixed = structure.with_orders({n: v for n, v in best.items() if n != name})
+        grid = OrderGrid(orders={name: list(values)})
+        rows = rank_orders(runs, fixed, grid, m=search.m, top=len(values), **search.settings).table
+        x, scores = np.array(values), np.full(len(values), math.nan)
+        for row in rows:
+            scores[np.abs(x - row.orders[name]).argmin()] = row.score
+        chosen = np.where(x == x[np.abs(x - best[name]).argmin()], scores, math.nan)
+        charts.append(
+            LineChart(
+                x,
+                [("score", scores), ("rank 1", chosen)],
+                title=f"Score over {symbol(name)}",
+                x_label=f"order {symbol(name)}",
+                y_label="score" if len(structure.equations) > 1 else score,
+                dots=("rank 1",),
+                caption="Other orders as in the best model." if len(best) > 1 else "",
+                width=SMALL_WIDTH_PX,
+            )
+        )
+    return charts
 
 
 #: Factors by which each axis of the order grid is subsampled, coarsest first.

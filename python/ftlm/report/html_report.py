@@ -35,9 +35,9 @@ from ftlm.findings import (
 )
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter
-from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS
+from ftlm.order_search.options import COMPARED_INNOVATION_LENGTHS, OrderGrid
 from ftlm.order_search.result import SearchResult, search_summary, search_top
-from ftlm.order_search.search import landscape
+from ftlm.order_search.search import landscape, score_profiles
 from ftlm.plot.comparison_charts import (
     Band,
     comparison_charts,
@@ -237,6 +237,7 @@ def identification_page(
     runs = [*(() if task is None else task.runs), *others]
     bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
     sections = first_sections(model, findings, compared, bool(others), result.joint, runs, bands, result.offsets)
+    sections += _order_search_sections(result)
     details = [residual_section(tests, result.information, compared, model.units)]
     details += correlation_sections(result.joint)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
@@ -412,7 +413,7 @@ def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> li
 
 
 def _search_sections(result: Identification) -> list[Section]:
-    """Return sections with the convergence of the multi-innovation recursion and the order search with score maps."""
+    """Return sections with the convergence of the multi-innovation recursion and the cost over two orders."""
     sections = []
     traces = _traces(result)
     if traces:
@@ -421,12 +422,6 @@ def _search_sections(result: Identification) -> list[Section]:
             "against the prior; all lines end where the closed form is."
         )
         sections.append(Section("Convergence of the recursion", words, figures=traces))
-    if result.searches:
-        tops = [search_top(name, search) for name, search in result.searches.items()]
-        maps = [] if result.task is None else _maps(result.task, result.searches)
-        sections.append(
-            Section("Order search", tables=[search_summary(result.searches), *tops], figures=maps, small=True)
-        )
     around = output_error_landscape(result)
     if around is not None:
         first, second = map(symbol, around.names)
@@ -439,12 +434,22 @@ def _search_sections(result: Identification) -> list[Section]:
     return sections
 
 
+def _order_search_sections(result: Identification) -> list[Section]:
+    """Return a section with the best rows of order searches, score profiles and maps; [] without a search."""
+    if not result.searches:
+        return []
+    tops = [search_top(name, search) for name, search in result.searches.items()]
+    maps = [] if result.task is None else _maps(result.task, result.searches)
+    return [Section("Order search", tables=[*tops, search_summary(result.searches)], figures=maps, small=True)]
+
+
 def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
-    """Return score maps of searches over two or more orders; for a single order the table is sufficient."""
+    """Return score profiles over each order, and score maps over two orders of searches with two or more."""
     maps: list[Figure] = []
     for name, search in searches.items():
         part = task.structure if name == "stage" else task.structure.equation(name)
-        own = task.part_order_grid(part)
+        own = task.part_order_grid(part) or OrderGrid()
+        maps += score_profiles(task.runs, part, search, own)
         if sum(len(v) > 1 for v in own.values(part).values()) >= 2:
             maps.append(landscape(task.runs, part, search, own))
     return maps

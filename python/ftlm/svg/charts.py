@@ -414,7 +414,7 @@ class Landscape(Figure):
     def caption(self) -> str:  # type: ignore[override]
         """Sentences on the location of the best score and on the meaning of the colors."""
         parts = [
-            f"Best: {self._best_orders()} (ring). Dark is good; colours are steps of the logarithm.",
+            f"Best: {self._best_orders()} (ring). Dark is good; colors are steps of the logarithm.",
             self.other_orders_note,
         ]
         if self.score != "score":
