@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from command_line import run_command
 from ftlm.data.units import SIGNAL_UNITS, parse_unit
 from ftlm.io.cell_parsing import split_unit
 from ftlm.io.column_roles import guess_roles, known_unit, signal_names
@@ -247,3 +248,31 @@ def test_several_inputs_drive_and_one_drives(tmp_path):
         cells = header.count(",")
         (tmp_path / "run.csv").write_text(header + "\n" + "".join(f"{k}{f',{k % 3}' * cells}\n" for k in range(9)))
         assert any(verb in a.words for a in ftlm.open_file(tmp_path / "run.csv").assumed)
+
+
+def test_a_written_columns_file_maps_columns_to_the_signals_of_a_structure(tmp_path):
+    g = np.random.default_rng(0)
+    u = np.repeat(g.uniform(-1.0, 1.0, 20), 30)
+    arm = ftlm.Model(ftlm.equation("D^2 p = 20 q - 2 D p + 5 i; D^2 q = -420 q - 3 D q + 2 D p - 5 i"))
+    run = arm.simulate(ftlm.Run.from_arrays(step=0.004, inputs={"i": u}, outputs={"p": 0 * u, "q": 0 * u}))
+    heads = "Time (s),Motor current (A),Hub angle (rad),Tip deflection (rad)"
+    np.savetxt(tmp_path / "bench.csv", np.c_[run.time, u, run["p"], run["q"]], delimiter=",", header=heads, comments="")
+    written = run_command("open", "bench.csv", "--write-columns", "bench.toml", cwd=tmp_path)
+    assert written.returncode == 0, written.stderr
+    identify = ("identify", "bench.csv", "--columns", "bench.toml", "--structure")
+    integers = {"alpha1": 2, "gamma1": 1, "beta2": 0, "mu2": 1}
+    orders = [w for n, v in integers.items() for w in ("--orders", f"{n}={v}")]
+    refused = run_command(*identify, "flexible-link:1", *orders, cwd=tmp_path)
+    assert refused.returncode == 3
+    for line in ('theta11 = "COLUMN", theta12 = "COLUMN" under [outputs]', 'I1 = "COLUMN" under [inputs]'):
+        assert line in refused.stderr
+    assert "-y theta11=COLUMN -y theta12=COLUMN -u I1=COLUMN" in refused.stderr
+    text = (tmp_path / "bench.toml").read_text()
+    for name, signal in (("Motor_current", "I1"), ("Hub_angle", "theta11"), ("Tip_deflection", "theta12")):
+        text = text.replace(f'"{name}" =', f"{signal} =")
+    (tmp_path / "bench.toml").write_text(text)
+    found = run_command(*identify, "flexible-link:1", *orders, "--json", cwd=tmp_path)
+    assert found.returncode == 0, found.stderr
+    assert json.loads(found.stdout)["output_error"]["theta11"]["fit"] > 99.0
+    link = run_command("identify", "bench.csv", "--columns", "bench.toml", "--structure", "arm:1", cwd=tmp_path)
+    assert link.returncode == 0, link.stderr

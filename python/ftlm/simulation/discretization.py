@@ -26,7 +26,7 @@ from ftlm.simulation.nonlinear_columns import append_columns, check_columns, non
 from ftlm.structure.equation import Equation, Term
 from ftlm.structure.order import MAX_IMPROPER_ORDER, ORDER_RESOLUTION, Order
 from ftlm.structure.structure import Initial, Offset, Structure, check_offset_resolved
-from ftlm.utils.parameters import choose_text, parameter, setting
+from ftlm.utils.parameters import Placeholder, choose_text, parameter, setting
 from ftlm.utils.validation import Floats, check_pulses, nearest
 
 #: Default number of block pulses, that of the paper, for runs with as many samples.
@@ -36,6 +36,8 @@ MAX_M = 1 << 24
 #: Largest relative excess of a negative delay over one sampling interval that is rounding.
 MAX_EARLY_ROUNDING = 1e-9
 COULOMB_PREFIX = "coulomb_"
+#: Column of a file in a line of a columns file.
+QUOTED_COLUMN = '"COLUMN"'
 #: Number of cached series of sensor filters: long ones, and those of at most this many pulses.
 CACHED_LONG_SERIES, SHORT_SERIES_PULSES, CACHED_SHORT_SERIES = 4, 1 << 13, 32
 #: Initial terms as the core takes them.
@@ -191,6 +193,32 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
     )
 
 
+def _missing_signals_text(run: Run, structure: Structure) -> str:
+    """Return the message on signals of a structure that a run lacks, with the options and lines that name them."""
+    lacking = [n for n in structure.signals if n not in run and not n.startswith(COULOMB_PREFIX)]
+    roles = {"outputs": [n for n in lacking if n in structure.outputs]}
+    roles["inputs"] = [n for n in lacking if n not in roles["outputs"]]
+    column = Placeholder("column")
+    options = [
+        choose_text(
+            parameter(role, dict.fromkeys(names, column)), " ".join(parameter(role, {n: column}) for n in names)
+        )
+        for role, names in roles.items()
+        if names
+    ]
+    lines = [
+        f"{', '.join(f'{n} = {QUOTED_COLUMN}' for n in names)} under [{role}]" for role, names in roles.items() if names
+    ]
+    what = f"signal {lacking[0]!r}{nearest(lacking[0], run.signals)}"
+    if len(lacking) > 1:
+        what = f"signals {', '.join(map(repr, lacking))}"
+    return (
+        f"run {run.name!r} has no {what}, which the model needs; it has {', '.join(run.signals)}: name the columns "
+        f"with {choose_text(' and ', ' ').join(options)}, or in a file for {parameter('columns')} with "
+        f"{' and '.join(lines)}"
+    )
+
+
 def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
     """Return a signal of a run as a channel object of the core."""
     channel: _core._Channel = {
@@ -209,10 +237,7 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
         rate = np.sign(np.diff(run[moving]))
         return {**channel, "samples": np.append(rate, rate[-1])}
     if name not in run:
-        raise DataError(
-            f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; it has "
-            f"{', '.join(run.signals)}: name the columns with {parameter('inputs')} and {parameter('outputs')}"
-        )
+        raise DataError(_missing_signals_text(run, structure))
     delay = structure.delay.get(name)
     if delay and name not in run.inputs:
         raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
