@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import re
 import sys
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,7 +49,7 @@ def draw(folder: Path) -> None:
         "unseen": unseen(),
     }
     drawn["next-experiment"] = next_experiment(folder)
-    for name, figure in (drawn | performance() | moves() | {"boxes": boxes()}).items():
+    for name, figure in (drawn | performance() | moves() | {"boxes": boxes()} | tutorials()).items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
 
@@ -268,6 +272,55 @@ def unseen() -> Figure:
         plot.plot(sine.time[thin], fit.simulated["theta12"][0][thin], style, linewidth=1, label=words)
     figure.legend(fontsize="small", loc="outside lower center", ncols=3)
     return figure
+
+
+def run_tutorial(name: str) -> dict[str, Any]:
+    """Run the first Python block of a tutorial in an empty folder, and return its variables by name."""
+    page = Path(__file__).parent / "tutorials" / f"{name}.md"
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    variables: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
+        exec(compile(blocks[0], page, "exec"), variables)
+    return variables
+
+
+def tutorials() -> dict[str, Figure]:
+    """Return a chart for each tutorial: validation data and the simulation of its model, or an impedance spectrum."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
+
+    drawn = {}
+
+    def axes(name: str, x: str, y: str) -> Axes:
+        drawn[f"tutorial-{name}"] = figure = Figure(figsize=(7, 2.6), layout="constrained")
+        return figure.add_subplot(xlabel=x, ylabel=y)
+
+    for name, run_name, output, label in (
+        ("motor", "sines", "w", "speed [rad/s]"),
+        ("heat", "tuesday", "T", "temperature [K]"),
+        ("flexible_arm", "nod", "tip", "tip [rad]"),
+        ("matlab", "test", "y", "y"),
+    ):
+        found = run_tutorial(name)
+        run = found[run_name]
+        models = {"free order": found["free"], "first order": found["first"]} if name == "heat" else {}
+        models = models or {"simulated": found["found"]}
+        plot = axes(name, "time [s]", label)
+        thin = slice(None, None, max(1, run.length // 600))
+        plot.plot(run.time[thin], run[output][thin], color="0.7", linewidth=3, label=f"measured, {run.name}")
+        for (words, result), style in zip(models.items(), ("C0", "C1"), strict=False):
+            check = result.validate(run)
+            text = f"{words}: {check.fit[output]:.1f} %"
+            plot.plot(run.time[thin], check.simulated[output][0][thin], style, linewidth=1, label=text)
+        drawn[f"tutorial-{name}"].legend(fontsize="small", loc="outside lower center", ncols=3)
+    found = run_tutorial("battery")
+    second, model = found["second"], found["found"].model
+    plot = axes("battery", "real part [mΩ]", "negative imaginary part [mΩ]")
+    measured, fitted = 1e3 * second.response, 1e3 * model.frequency_response(second.frequency)[0, 0]
+    plot.plot(measured.real, -measured.imag, "o", color="0.6", markersize=4, label=f"measured, {second.name}")
+    plot.plot(fitted.real, -fitted.imag, "C0", linewidth=1, label="model")
+    plot.set_aspect("equal")
+    drawn["tutorial-battery"].legend(fontsize="small", loc="outside right")
+    return drawn
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import ftlm
@@ -226,3 +227,24 @@ def test_the_catalogue_of_findings_is_the_packages_own():
     spec.loader.exec_module(module)
     # Otherwise: python docs/findings.py
     assert module.PAGE.read_text(encoding="utf-8") == module.page()
+
+
+def test_every_tutorial_shows_its_validation_data_and_the_simulation() -> None:
+    pytest.importorskip("matplotlib")
+    specification = importlib.util.spec_from_file_location("pictures", ROOT / "docs" / "pictures.py")
+    assert specification is not None
+    assert specification.loader is not None
+    pictures = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(pictures)
+    drawn = pictures.tutorials()
+    pages = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+    assert len(pages) == len(drawn)
+    for page in pages:
+        shown = re.findall(r"^```{image} ../_pictures/(.*)\.svg\n:alt: \S", page.read_text(), flags=re.MULTILINE)
+        assert shown == [f"tutorial-{page.stem}"]
+        measured, *models = drawn[shown[0]].axes[0].lines
+        assert models
+        assert measured.get_label().startswith("measured, ")
+        # The simulation of the first model follows the data.
+        spread = np.ptp(measured.get_ydata())
+        assert np.max(np.abs(models[0].get_ydata() - measured.get_ydata())) < 0.1 * spread
