@@ -1,5 +1,6 @@
 """Structures chosen by what they predict: the true one among those inside a richer one, and words where none can be."""
 
+import html
 import json
 import math
 import threading
@@ -35,6 +36,7 @@ from ftlm.structure_selection.stepwise import (
     format_duration,
     prescreen,
 )
+from ftlm.utils.formatting import number
 from ftlm.utils.resources import stop_flag
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
@@ -554,6 +556,16 @@ def test_the_page_and_the_figures(chosen, tmp_path):
     assert "insignificant" in page
     # What is chosen is a dot on the line, not a line of one point that nobody sees.
     assert "are not finite" not in page
+    # The model has the sections of its own report.
+    for head in ("Measured and simulated</h2>", "Equations</h2>", "The choice</h2>", "Residuals</h2>"):
+        assert head in page
+    assert page.index("Equations</h2>") < page.index("The choice</h2>") < page.index("Residuals</h2>")
+    for name, parameter in chosen.parameters.items():
+        if not parameter.fixed:
+            assert number(parameter.standard_error) in page, name
+    part = page[page.index("The choice</h2>") : page.index("Residuals</h2>")]
+    facts = [f for f in chosen.findings if f.level == "fact"]
+    assert all(html.escape(f.text[1:]) in part for f in facts)
     with pytest.raises(ftlm.DataError, match="exists"):
         chosen.report(tmp_path / "choice.html")
     data = json.loads(json.dumps(chosen.to_dict()))

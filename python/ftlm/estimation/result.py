@@ -460,9 +460,13 @@ class Identification:
             If a validation run lacks a signal of the model, the file exists and ``force`` is False, or the file cannot
             be written.
         """
+        return self._write_page(path, validation=validation, force=force)
+
+    def _write_page(self, path: str | os.PathLike[str], **content: Any) -> Path:
+        """Write a report with further content; see :func:`ftlm.report.identification_page`."""
         from ftlm.report.html_report import identification_page
 
-        return identification_page(self, path, validation=validation, force=force)
+        return identification_page(self, path, **content)
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame of the parameters: value, standard error, 95 % interval, unit, nominal value."""

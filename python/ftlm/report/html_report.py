@@ -208,6 +208,8 @@ def identification_page(
     *,
     validation: Run | Sequence[Run] | None = None,
     force: bool = False,
+    sections: Sequence[Section] = (),
+    validated: Comparison | None = None,
 ) -> Path:
     """Write the HTML report of one identification.
 
@@ -217,27 +219,32 @@ def identification_page(
         Result of :func:`ftlm.identify`.
     path, validation, force
         See :meth:`ftlm.Identification.report`.
+    sections
+        Sections on the choice of the structure, after the warnings.
+    validated
+        Comparison with validation runs in place of `validation`, if the runs are not available.
     """
     check_free(path, force=force)
     model = result.model
     others = [] if validation is None else as_runs(validation)
-    validated = [validate(result, run) for run in others]
+    comparisons = [validate(result, run) for run in others] or ([] if validated is None else [validated])
     findings = list(result.findings)
     undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
     if undefined:
         findings.append(make_finding("errors_undefined", parameter=", ".join(undefined)))
-    for run, comparison in zip(others, validated, strict=True):
+    for run, comparison in zip(others, comparisons, strict=False):
         findings += _on_validation([*comparison.findings, *data_notes(run)], run)
-    compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
+    compared = [("estimation", result.comparison), *(("validation", c) for c in comparisons)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
     tests += tests_on(model, others)
-    pooled = validate(result, others) if len(others) > 1 else validated[0] if validated else None
+    pooled = validate(result, others) if len(others) > 1 else comparisons[0] if comparisons else None
     judgement = verdict(result, pooled)
     task = result.task
     runs = [*(() if task is None else task.runs), *others]
-    bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]
-    sections = first_sections(model, findings, compared, bool(others), result.joint, runs, bands, result.offsets)
-    sections += _order_search_sections(result)
+    bands = [confidence_bands(model, run, c) for run, c in zip(others, comparisons, strict=False)]
+    first = first_sections(model, findings, compared, bool(comparisons), result.joint, runs, bands, result.offsets)
+    collapsed = [section for section in first if section.collapsed]
+    first = [*first[: len(first) - len(collapsed)], *sections, *_order_search_sections(result), *collapsed]
     details = [residual_section(tests, result.information, compared, model.units)]
     details += correlation_sections(result.joint)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
@@ -247,7 +254,7 @@ def identification_page(
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     details.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
-    return _write_model_page(path, model, judgement, compared, sections, details, force=force)
+    return _write_model_page(path, model, judgement, compared, first, details, force=force)
 
 
 def _write_model_page(

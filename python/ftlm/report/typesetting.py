@@ -27,6 +27,8 @@ from ftlm.utils.statistics import NORMAL_95
 
 #: Decimals of an order in an equation; the model file stores all digits.
 ORDER_DECIMALS = 4
+#: Text on the place of an offset, by kind.
+OFFSET_PLACES = {"constant": "c in the equation", "ramp": "ramp in the equation", "level": "level of the output"}
 THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # our constant
 _DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>{}</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _LIMITED_INPUT = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
@@ -293,7 +295,8 @@ def parameter_table(
     for name, p in (offsets or {}).items():
         has_error = not math.isnan(p.standard_error)
         cells: list[Cell] = [p.standard_error, *p.interval] if has_error else [None, None, None]
-        rows.append([symbol_html(name), p.value, *cells, None, unit_html(p.unit), "estimated on its run, for it alone"])
+        kind = OFFSET_PLACES[name.partition("_")[0]]
+        rows.append([symbol_html(name), p.value, *cells, None, unit_html(p.unit), f"{kind}, of its run alone"])
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
     if has_errors:
         note = "Intervals assume a right model. A coefficient without one is fixed or given by the law."

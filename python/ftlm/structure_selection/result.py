@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from ftlm.data.run import Run
 from ftlm.estimation.result import Identification
 from ftlm.estimation.verdict import Validation, Verdict
-from ftlm.findings import Finding, texts
+from ftlm.findings import LEVEL_DO_NOT_USE, LEVEL_WITH_CARE, Finding, texts
 from ftlm.model.model import Model
 from ftlm.model.parameter_estimates import Parameter
 from ftlm.structure.structure import Structure
 from ftlm.structure_selection.cross_validation import MIN_FIT_PERCENT, Trial
-from ftlm.svg.html_page import Page, ReportMixin, Section, Table
+from ftlm.svg.html_page import Section, Table
 from ftlm.svg.line_chart import LineChart
 from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, attributes, json_value
@@ -28,7 +30,7 @@ UNSTABLE_NOTE = " (grows without bound)"
 
 
 @dataclass(frozen=True)
-class Selection(ReportMixin):
+class Selection:
     """Result of a structure selection: validated candidates, the chosen one, and the reason.
 
     Parameters
@@ -175,19 +177,20 @@ class Selection(ReportMixin):
             caption=f"The best candidate with each number of parameters; the chosen one has {self.winner.parameters}.",
         )
 
-    def _page(self) -> Page:
-        sections = [
-            Section(
-                "The choice",
-                paragraphs=[self.reason, f"Validation data: {self.validation}. {self.fitted} candidates fitted."],
-                warnings=list(self.warnings),
-                # Fits of different outputs are not compared.
-                figures=[self.figure()] if len({t.structure.outputs for t in self.trials}) == 1 else [],
-            ),
-            Section("Candidates", tables=[self.table()]),
-            Section("The chosen structure on all runs", paragraphs=self.best.summary(self.validated).splitlines()),
-        ]
-        return Page("Selection of a structure", sections, self.winner.name)
+    def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+        """Write the choice and the model to an HTML file, as :meth:`ftlm.Identification.report` does."""
+        doubts = [f for f in self.findings if f.level in (LEVEL_WITH_CARE, LEVEL_DO_NOT_USE)]
+        facts = [f"{text[0].upper()}{text[1:]}." for text in texts(f for f in self.findings if f not in doubts)]
+        counts = f"Validation data: {self.validation}. {self.fitted} candidates fitted."
+        choice = Section(
+            "The choice",
+            paragraphs=[self.reason, *facts, counts],
+            warnings=list(texts(doubts)),
+            tables=[self.table()],
+            # Fits of different outputs are not compared.
+            figures=[self.figure()] if len({t.structure.outputs for t in self.trials}) == 1 else [],
+        )
+        return self.best._write_page(path, sections=[choice], validated=self.validated, force=force)
 
     def to_frame(self) -> Any:
         """Return the candidates as a pandas DataFrame, one row per candidate, by rank."""

@@ -578,7 +578,9 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
         near = min(others, key=lambda t: t.score)
         change = 100 * (math.exp(near.score - winner.score) - 1)
         side = "larger" if change >= 0 else "smaller"
-        text += f" With {near.parameters} parameters, validation residuals are {abs(change):.2g} % {side}."
+        text += (
+            f" With {near.parameters} parameters, validation residuals are {float(f'{abs(change):.2g}'):g} % {side}."
+        )
     return text + _failure_text(winner, ranked)
 
 

@@ -482,8 +482,8 @@ def _rectangle(x: float, y: float, width: float, height: str, colour: str) -> Ma
 
 
 def _label_indices(count: int, most: int) -> list[int]:
-    """Return the indices of the cells that get a label, including the first and the last."""
-    return sorted({round(k) for k in np.linspace(0, count - 1, most).tolist()})
+    """Return the indices of at most `most` cells that get a label: the first, and others at equal distances."""
+    return list(range(0, count, max(1, math.ceil((count - 1) / max(most - 1, 1)))))
 
 
 #: From -1 to 1, blue over light gray to vermilion; black text is readable in the middle.
