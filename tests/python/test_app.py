@@ -557,8 +557,7 @@ def test_a_model_is_shown_verdict_first(used):
     (model,) = used.desk.models.values()
     shown = view.model(model)
     order = [
-        shown.index(part)
-        for part in ('class="first', 'class="equation"', "fit of the free run", "<svg", "Download report")
+        shown.index(part) for part in ('class="first', 'class="equation"', "simulation fit", "<svg", "Download report")
     ]
     assert order == sorted(order)
     assert model.description["fits"][0]["validation"] > 90

@@ -565,7 +565,7 @@ def test_the_page_and_the_figures(chosen, tmp_path):
             assert number(parameter.standard_error) in page, name
     part = page[page.index("The choice</h2>") : page.index("Residuals</h2>")]
     facts = [f for f in chosen.findings if f.level == "fact"]
-    assert all(html.escape(f.text[1:]) in part for f in facts)
+    assert all(html.escape(f.text) in part for f in facts)
     with pytest.raises(ftlm.DataError, match="exists"):
         chosen.report(tmp_path / "choice.html")
     data = json.loads(json.dumps(chosen.to_dict()))

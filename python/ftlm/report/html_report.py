@@ -79,7 +79,7 @@ def verdict_box(judgement: Verdict, of: str = "") -> Markup:
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
         _LEVEL_CSS_CLASSES[judgement.level],
         f"{of}{judgement.level}" if of else judgement.level.capitalize(),
-        judgement.reason[0].upper() + judgement.reason[1:],
+        judgement.reason,
         remedy,
     )
 

@@ -192,7 +192,7 @@ def demo_text(demo: Demo) -> str:
         lines += [line for line in behavior_lines(best.model) if "mode" in line or "integrates" in line][:3]
         lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
     outputs = [output for stage in demo.stages.values() for output in stage.outputs]
-    lines.append(f"{'free run, fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
+    lines.append(f"{'simulation fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
     lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
     for label in SHOWN_MODELS:
         fits = [fit for stage in demo.stages.values() for fit in stage.candidates[label].fits]
@@ -211,7 +211,7 @@ def demo_details(demo: Demo) -> str:
     for number, stage in demo.stages.items():
         lines += [f"Stage {number}, square current (the shape of the paper's Table {3 + number})"]
         lines += [*table_text(paper_table(stage.candidates), 16, PAPER_TABLE_WIDTHS), ""]
-        lines += ["Fit of the free run in percent: on the square run, and on the sine run that no model has seen"]
+        lines += ["Fit of the simulation in percent: on the square run, and on the sine run that no model has seen"]
         lines += [*fits_text(stage.candidates), "", derivative_chart(stage.derived).caption, "", "Output error"]
         estimates = estimates_table(stage.candidates["output error"].result, demo.truth[number])
         lines += [*table_text(estimates, 8, ESTIMATES_WIDTHS), ""]
@@ -235,7 +235,7 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
         for stage in demo.stages.values()
         for chart in compared_bars(
             [(label, [(run, getattr(c, part)) for run, part in runs.items()]) for label, c in stage.candidates.items()],
-            title="Fit of the free run",
+            title="Fit of the simulation",
         )
     ]
     predictions = [

@@ -692,7 +692,7 @@ def reproduction_text(reproduction: Reproduction) -> str:
     for check in reproduction.checks:
         lines += [f"{check.verdict.upper()}: {check.claim}", f"    {check.brief}"]
     for stage in reproduction.stages.values():
-        lines += ["", f"Stage {stage.number}: fit of the free run in percent, driven as identified"]
+        lines += ["", f"Stage {stage.number}: fit of the simulation in percent, driven as identified"]
         lines += fits_text(stage.candidates)
         best = stage.candidates["output error"].model
         lines += [f"  {format_equation(e, best.structure.describe_inputs('.6g'))}" for e in best.equations]

@@ -180,7 +180,7 @@ class Selection:
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the choice and the model to an HTML file, as :meth:`ftlm.Identification.report` does."""
         doubts = [f for f in self.findings if f.level in (LEVEL_WITH_CARE, LEVEL_DO_NOT_USE)]
-        facts = [f"{text[0].upper()}{text[1:]}." for text in texts(f for f in self.findings if f not in doubts)]
+        facts = [f"{text}." for text in texts(f for f in self.findings if f not in doubts)]
         counts = f"Validation data: {self.validation}. {self.fitted} candidates fitted."
         choice = Section(
             "The choice",
