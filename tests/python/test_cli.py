@@ -244,6 +244,16 @@ BAD = [
     (("demo", "-o", "square.csv"), 3, "square.csv"),
     (("demo", "--noise", "-1", "-o", "quiet"), 2, "noise"),
     (("frobnicate",), 2, "frobnicate"),
+    (("validate", "x.json", "square.csv"), 2, "ftlm compare MODEL FILE"),
+    (("identify", "square.csv", *SEARCH[:2], "--step", "0,05"), 2, "'0,05' is not a number; write '0.05'"),
+    (("identify", "square.csv", *SEARCH[:2], "--m", "3.5"), 2, "'3.5' is not a whole number"),
+    (("identify", "square.csv", *SEARCH[:2], "--bounds", "a0=5"), 2, "write --bounds a0=LOW:HIGH"),
+    (
+        ("identify", "square.csv", *SEARCH, "--validation", "sine.csv", "--validation-window", "99:100"),
+        3,
+        "--validation-window: limit 99.0 s is out of range",
+    ),
+    (("identify", "square.csv", "--structure", "D y ="), 2, "found the end"),
 ]
 
 

@@ -35,7 +35,7 @@ from ftlm.cli.options import (
 from ftlm.cli.reading_options import ReadingOptions, given_fields, layout_options
 from ftlm.data.frequency_data import FrequencyData
 from ftlm.data.run import Run
-from ftlm.errors import ModelError
+from ftlm.errors import DataError, ModelError
 from ftlm.estimation import consistency as parts_of_runs
 from ftlm.estimation import identify as estimation
 from ftlm.estimation.frequency_domain import Weights
@@ -55,6 +55,7 @@ from ftlm.structure_selection import select as choice
 from ftlm.structure_selection.automatic import IntegerOrderForm
 from ftlm.structure_selection.result import Selection
 from ftlm.structure_selection.select import automatic_problems
+from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import duration_bounds, estimate_duration, output_error_cost
 from ftlm.utils.validation import check_threads
 
@@ -139,7 +140,11 @@ def validation_runs(
         return []
     if window is not None:
         interval(window, "--validation-window", "1.1:19.5")
-    return replace(reading, window=window).runs([file], equation)
+    try:
+        return replace(reading, window=window).runs([file], equation)
+    except DataError as error:
+        # The reader of a file knows its window by the option of the estimation runs.
+        raise DataError(str(error).replace(f"{parameter('window')}:", "--validation-window:")) from None
 
 
 @command

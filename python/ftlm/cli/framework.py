@@ -119,6 +119,16 @@ OPTION_PANELS = ("File", "Structure", "Method", "Output")
 OTHER_PANEL = "Options"
 
 
+def _number_message(details: Mapping[str, Any]) -> str:
+    """Return the message on a value of an option that is not a number, or out of its range."""
+    value, kind = details["input"], details["type"]
+    if kind not in ("float_parsing", "int_parsing"):
+        return f"{value!r} is out of range: {details['msg'].removeprefix('Input ')}."
+    what = "number" if kind == "float_parsing" else "whole number"
+    remedy = f"; write {value.replace(',', '.')!r}" if re.fullmatch(r"-?\d+,\d+", str(value)) else ""
+    return f"{value!r} is not a {what}{remedy}."
+
+
 class Command(TyperCommand):
     """Command with help in panels, which suggests correct options and choices."""
 
@@ -147,6 +157,8 @@ class Command(TyperCommand):
             if choice is not None:
                 choices = re.findall("'([^']*)'", choice[2])
                 error.message = f"{choice[1]!r} is not one of {join_names(choices)}{nearest(choice[1], choices)}."
+            elif callable(problems := getattr(error.__cause__, "errors", None)):
+                error.message = _number_message(problems()[0])
             raise
 
     def _chosen_method(self, args: Sequence[str]) -> str | None:

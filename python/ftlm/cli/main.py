@@ -75,6 +75,11 @@ class Program(TyperGroup):
             if len(args) == 1:
                 print(ctx.get_help())
                 raise typer.Exit
+        if args and args[0] == "validate":
+            ctx.fail(
+                "No such command 'validate'; ftlm compare MODEL FILE validates a saved model, and --validation FILE of "
+                "ftlm identify a new one."
+            )
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:

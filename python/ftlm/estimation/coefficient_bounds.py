@@ -13,7 +13,7 @@ from typing import TypeVar
 from ftlm.errors import ConvergenceError, ModelError
 from ftlm.findings import Finding, make_finding
 from ftlm.structure.structure import Structure
-from ftlm.utils.parameters import parameter
+from ftlm.utils.parameters import Placeholder, parameter
 from ftlm.utils.validation import check_known, join_names, real_number
 
 Bounds = Mapping[str, tuple[float, float]]
@@ -28,7 +28,10 @@ def check_intervals(bounds: object, *, finite: bool = False) -> None:
     for name, pair in bounds.items():
         ends = [real_number(f"bound of {name}", v) for v in pair] if isinstance(pair, (tuple, list)) else []
         if not (len(ends) == 2 and ends[0] < ends[1]) or (finite and not all(map(math.isfinite, ends))):
-            raise ModelError(f"bounds of {name} = {pair!r} are not an interval; write (low, high)")
+            raise ModelError(
+                f"bounds of {name} = {pair!r} are not an interval; write "
+                f"{parameter('bounds', {name: (Placeholder('low'), Placeholder('high'))})}"
+            )
 
 
 def check_bounds(structure: Structure, bounds: Bounds | None, start: object = None) -> tuple[Structure, Bounds]:

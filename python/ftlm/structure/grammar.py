@@ -210,6 +210,7 @@ class EquationParser:
 
     def _syntax_error(self, expectation: str) -> ModelError:
         kind, value, at = self._peek()
+        found = value if kind == "end" else repr(value)
         if kind == "symbol" and value in ",:'":
             return self._error(f"{value!r} at character {at + 1} has no meaning there")
         if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
@@ -218,7 +219,7 @@ class EquationParser:
                 f"rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
             )
         return self._error(
-            f"expected {expectation} at character {at + 1}, found {value!r}; "
+            f"expected {expectation} at character {at + 1}, found {found}; "
             "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
         )
 
