@@ -254,6 +254,10 @@ BAD = [
         "--validation-window: limit 99.0 s is out of range",
     ),
     (("identify", "square.csv", "--structure", "D y ="), 2, "found the end"),
+    (("identify", "square.csv", "--structure", "D Shaft angle = a y + b u"), 2, "write 'Shaft_angle' for one signal"),
+    (("identify", "square.csv", "--structure", "D^2 y = -b D y + k u - f*sgn(D y)"), 2, "did you mean 'sign'?"),
+    (("simulate", "model.jsn", "square.csv", "-o", "x.csv"), 3, "cannot be read: No such file or directory"),
+    (("compare", "columns.tml", "square.csv"), 3, "(did you mean 'columns.toml'?)"),
 ]
 
 

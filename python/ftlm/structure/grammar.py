@@ -48,6 +48,7 @@ from ftlm.structure.expression import (
 from ftlm.structure.input_nonlinearity import INPUT_EFFECT_ABBREVIATIONS, NonlinearityKind, Value
 from ftlm.structure.order import Order
 from ftlm.utils.parameters import parameter
+from ftlm.utils.validation import nearest
 
 IDENTIFIER_PATTERN = r"[^\W\d]\w*"
 #: Input non-linearities with a syntax in equation texts.
@@ -218,10 +219,13 @@ class EquationParser:
                 f"expected {expectation} at character {at + 1}, found {value!r}; D is the derivative in an equation: "
                 f"rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
             )
-        return self._error(
-            f"expected {expectation} at character {at + 1}, found {found}; "
-            "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
-        )
+        remedy = "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
+        before = self._peek(-1) if self._position else ("", "", 0)
+        if before[0] == kind == "name":
+            remedy = f"a name has no blanks: write {f'{before[1]}_{value}'!r} for one signal"
+        elif before[0] == "name" and value == "(":
+            remedy = f"{before[1]!r} is no function{nearest(before[1], FUNCTION_NAMES)}"
+        return self._error(f"expected {expectation} at character {at + 1}, found {found}; {remedy}")
 
     # ------------------------------------------------------------------------------------------------ equation
 

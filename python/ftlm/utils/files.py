@@ -159,6 +159,15 @@ MAX_NAME_CHARACTERS, MAX_SMALL_FILE_BYTES = 300, 1 << 20
 _READ_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 
 
+def nearest_file(path: Path) -> str:
+    """Return text such as " (did you mean …?)" with the file beside `path` of the most similar name, or ""."""
+    try:
+        beside = sorted(entry.name for entry in path.parent.iterdir())
+    except (OSError, ValueError):
+        return ""
+    return nearest(path.name, beside)
+
+
 def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_bytes: int) -> bytes:
     """Return the bytes of a regular file within a size limit; pipes and devices are rejected.
 
@@ -193,7 +202,8 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
             name if name.isprintable() and len(name) <= MAX_NAME_CHARACTERS else short_repr(name, MAX_NAME_CHARACTERS)
         )
         why = (error.strerror if isinstance(error, OSError) else None) or error
-        raise DataError(f"{what} {path_text} cannot be read: {why}; check the path") from error
+        hint = nearest_file(file) if isinstance(error, FileNotFoundError) else ""
+        raise DataError(f"{what} {path_text} cannot be read: {why}{hint}; check the path") from error
     if not stat.S_ISREG(state.st_mode):
         raise DataError(f"{file} is not a regular file; give {source}")
     raise DataError(f"{file} has {state.st_size} bytes, no {what} is larger than {max_bytes}; give {source}")
