@@ -216,7 +216,7 @@ class EquationParser:
             return self._error(f"{value!r} at character {at + 1} has no meaning there")
         if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
             return self._error(
-                f"expected {expectation} at character {at + 1}, found {value!r}; D is the derivative in an equation: "
+                f"expected {expectation} at character {at + 1}, found {found}; D is the derivative in an equation: "
                 f"rename a signal called D, such as by {parameter('outputs', {'y': 'D'})}"
             )
         remedy = "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
