@@ -163,7 +163,8 @@ def simulate(
     if not np.all(free.change <= tolerance):
         raise ConvergenceError(
             f"the response of {', '.join(model.outputs)} still changes by more than {tolerance:g} of its size at "
-            f"{own * free.refinement} pulses; raise tolerance or largest_m, or check that the model is stable"
+            f"{own * free.refinement} pulses; raise {parameter('tolerance')} or {parameter('max_m')}, or check that "
+            "the model is stable"
         )
     return Run.from_arrays(
         step=run.step,
