@@ -111,7 +111,7 @@ def test_a_fit_whose_only_parameter_is_on_its_bound_prints(run, spectrum):
     ("bounds", "options", "words"),
     [
         ({"B": (0, 1)}, {}, "bound of 'B' does not occur in the equation; known: a1, a0, b"),
-        ({"b": (2, 1)}, {}, r"bounds of b = \(2, 1\) are not an interval; write \(low, high\)"),
+        ({"b": (2, 1)}, {}, r"bounds of b = \(2, 1\) are not an interval; write bounds=\{'b': \(low, high\)\}"),
         ({"b": 3}, {}, "bounds of b = 3 are not an interval"),
         ({"b": (0, math.nan)}, {}, r"bounds of b = \(0, nan\) are not an interval"),
         ({"b": (0, 1)}, {"method": "multi-innovation"}, "bounds= is not used by method='multi-innovation'"),
