@@ -83,8 +83,8 @@ impl FrictionProblem {
 
     /// Solve a pulse, or a part of this length, that starts at the velocities `v` and would end at `p` without friction.
     ///
-    /// `length` is a fraction of the pulse, to which the gains are proportional. `at` receives the end velocity of each body without its own friction, and its pulse. `near` contains the initial
-    /// friction forces.
+    /// `length` is a fraction of the pulse, to which the gains are proportional. `near` contains the initial friction
+    /// forces. `at` receives the end velocity of each body without its own friction, and its pulse.
     pub fn solve(
         &self,
         length: f64,

@@ -96,22 +96,9 @@ impl ForceJumps {
         if jumps.is_empty() {
             return Cow::Borrowed(&self.whole);
         }
-        let (mut mean, mut levels) = (vec![0.0; self.whole[0].forces.len()], Vec::with_capacity(jumps.len() + 1));
-        let (mut level, mut last) = (mean.clone(), 0.0);
-        for jump in jumps {
-            levels.push(Interval { length: jump.share - last, forces: level.clone() });
-            last = jump.share;
-            for force in self.forces.iter().filter(|force| force.signal == jump.signal) {
-                let size = force.coefficient * jump.size;
-                level[force.body] += size;
-                mean[force.body] += size * (1.0 - jump.share);
-            }
-        }
-        levels.push(Interval { length: 1.0 - last, forces: level });
-        for interval in &mut levels {
-            interval.forces.iter_mut().zip(&mean).for_each(|(force, mean)| *force -= mean);
-        }
-        Cow::Owned(levels)
+        let size = |jump: &InputJump, force: &InputForce| force.coefficient * jump.size;
+        let mean = |jump: &InputJump, force: &InputForce| size(jump, force) * (1.0 - jump.share);
+        Cow::Owned(self.split(jumps, |jump| jump.share, 1.0, size, mean))
     }
 
     /// Derivatives of the intervals of a pulse with respect to a parameter.
@@ -120,25 +107,44 @@ impl ForceJumps {
         if jumps.is_empty() {
             return Cow::Borrowed(&self.constant);
         }
-        let (mut mean, mut levels) = (vec![0.0; self.whole[0].forces.len()], Vec::with_capacity(jumps.len() + 1));
-        let (mut level, mut last) = (mean.clone(), 0.0);
-        for jump in jumps {
+        let slope = |jump: &InputJump| {
             let input = derivatives.inputs.iter().find(|input| input.signal == jump.signal);
-            let slope = input.and_then(|input| input.jumps.get(jump.index));
-            let (share, size) = slope.map_or((0.0, 0.0), |slope| (slope.share, slope.after - slope.before));
-            levels.push(Interval { length: share - last, forces: level.clone() });
-            last = share;
+            input.and_then(|input| input.jumps.get(jump.index)).map_or((0.0, 0.0), |s| (s.share, s.after - s.before))
+        };
+        let size = |jump: &InputJump, force: &InputForce| {
+            derivatives.terms[force.at.0][force.at.1].0 * jump.size + force.coefficient * slope(jump).1
+        };
+        let mean = |jump: &InputJump, force: &InputForce| {
+            size(jump, force) * (1.0 - jump.share) - force.coefficient * jump.size * slope(jump).0
+        };
+        Cow::Owned(self.split(jumps, |jump| slope(jump).0, 0.0, size, mean))
+    }
+
+    /// Intervals between jumps at these places and the end of the pulse, or the derivatives of all of these.
+    ///
+    /// `size` is the change of a force at a jump, `mean` the contribution of this change to the mean of the force.
+    fn split(
+        &self,
+        jumps: &[InputJump],
+        place: impl Fn(&InputJump) -> f64,
+        end: f64,
+        size: impl Fn(&InputJump, &InputForce) -> f64,
+        mean: impl Fn(&InputJump, &InputForce) -> f64,
+    ) -> Vec<Interval> {
+        let (mut means, mut intervals) = (vec![0.0; self.whole[0].forces.len()], Vec::with_capacity(jumps.len() + 1));
+        let (mut level, mut last) = (means.clone(), 0.0);
+        for jump in jumps {
+            intervals.push(Interval { length: place(jump) - last, forces: level.clone() });
+            last = place(jump);
             for force in self.forces.iter().filter(|force| force.signal == jump.signal) {
-                let coefficient = derivatives.terms[force.at.0][force.at.1].0;
-                let change = coefficient * jump.size + force.coefficient * size;
-                level[force.body] += change;
-                mean[force.body] += change * (1.0 - jump.share) - force.coefficient * jump.size * share;
+                level[force.body] += size(jump, force);
+                means[force.body] += mean(jump, force);
             }
         }
-        levels.push(Interval { length: -last, forces: level });
-        for interval in &mut levels {
-            interval.forces.iter_mut().zip(&mean).for_each(|(force, mean)| *force -= mean);
+        intervals.push(Interval { length: end - last, forces: level });
+        for interval in &mut intervals {
+            interval.forces.iter_mut().zip(&means).for_each(|(force, mean)| *force -= mean);
         }
-        Cow::Owned(levels)
+        intervals
     }
 }

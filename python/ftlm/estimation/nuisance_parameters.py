@@ -486,25 +486,32 @@ def _fit_without_implausible_history(
     The free powers of t of a history can fit dynamics that the structure lacks. Under the prior on past inputs, by
     which models are compared with runs, such a history leaves larger residuals than Caputo's terms do.
     """
-    problem = FreeProblem.of(structure)
-    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
-    model = Model(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs))
-    rows: dict[str, list[Floats]] = {o: [] for o in structure.outputs}
-    for run in runs:
-        simulated = simulate_refined(model, run, None, tolerance=HISTORY_SIMULATION_TOLERANCE)
-        measured = measured_samples(model, run, simulated.refinement)
-        for output, samples, own in zip(structure.outputs, measured, simulated.outputs, strict=True):
-            rows[output].append(output_residuals(samples, own))
-    residuals, free = [np.concatenate(row) for row in rows.values()], _pooled_residuals(joint)
-    if not all(np.all(np.isfinite(drop_missing(row))) for row in residuals):
-        return None
-    if start_score(residuals, 0, residuals) - start_score(free, 0, residuals) < START_SETTINGS.history_margin:
-        return None
     try:
+        residuals = _simulation_residuals(Model(_fitted_structure(joint, structure)), runs)
+        if not all(np.all(np.isfinite(drop_missing(row))) for row in residuals):
+            return None
+        under_prior = start_score(residuals, 0, residuals)
+        if under_prior - start_score(_pooled_residuals(joint), 0, residuals) < START_SETTINGS.history_margin:
+            return None
         few = fit_caputo()
     except FtlmError:
         return None
-    return few if start_score(_pooled_residuals(few), 0, residuals) < start_score(residuals, 0, residuals) else None
+    return few if start_score(_pooled_residuals(few), 0, residuals) < under_prior else None
+
+
+def _simulation_residuals(model: Model, runs: Sequence[Run]) -> list[Floats]:
+    """Return the residuals of each output, concatenated over all runs, with the initial terms of a comparison."""
+    parts = []
+    for run in runs:
+        simulated = simulate_refined(model, run, None, tolerance=HISTORY_SIMULATION_TOLERANCE)
+        parts.append(output_residuals(measured_samples(model, run, simulated.refinement), simulated.outputs))
+    return list(np.concatenate(parts, axis=1))
+
+
+def _fitted_structure(joint: JointFit, structure: Structure) -> Structure:
+    """Return a structure with the orders, coefficients and input parameters of a joint fit."""
+    numbers = FreeProblem.of(structure).coefficients_by_name(list(joint.coefficients.values()))
+    return structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
 
 
 def refit_if_accepted(
@@ -586,6 +593,4 @@ def _fit_needs_history(few: JointFit, many: JointFit, runs: Sequence[Run], struc
 
 def _has_nonzero_start(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether the runs, at the parameters of a fit from rest, require nonzero initial conditions."""
-    problem = FreeProblem.of(structure)
-    numbers = problem.coefficients_by_name(list(joint.coefficients.values()))
-    return is_in_motion(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs), runs)
+    return is_in_motion(_fitted_structure(joint, structure), runs)
