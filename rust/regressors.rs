@@ -97,24 +97,29 @@ impl Record {
     /// Add the jumps of each signal within pulses. Dry friction needs them: a body at rest starts to slide at a jump.
     ///
     /// # Errors
-    /// [`Error::Length`] for another number of signals; [`Error::OutOfRange`] for a jump outside of the pulses, or one
-    /// that is not later than the previous jump of its signal.
+    /// [`Error::Length`] for another number of signals; [`Error::Structure`] for a jump outside of the pulses, at an
+    /// edge, or not later than the previous one of its signal; [`Error::NotFinite`].
     pub fn with_jumps(mut self, jumps: Vec<Vec<PulseJump>>) -> Result<Self> {
         check_length("jumps of signals", self.len(), jumps.len())?;
-        for row in &jumps {
-            let mut before = (0, 0.0);
+        for (signal, row) in jumps.iter().enumerate() {
+            let mut last = (0, 0.0);
             for jump in row {
-                let (place, share) = ((jump.pulse, jump.share), jump.share);
-                if jump.pulse >= self.m() || !(share > 0.0 && share < 1.0) || place <= before {
-                    return Err(Error::OutOfRange {
-                        name: format!("share of a pulse before a jump (pulse {} of {})", jump.pulse, self.m()),
-                        value: share,
-                        range: "(0, 1)".into(),
-                        remedy: "give the jumps of a signal within the pulses, in the sequence of time".into(),
-                    });
+                let PulseJump { pulse, share, .. } = *jump;
+                let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
+                if pulse >= self.m() {
+                    let what = format!("signal {signal} jumps in pulse {pulse} of {}", self.m());
+                    return refuse(what, "count pulses from 0");
+                }
+                if !(share > 0.0 && share < 1.0) {
+                    let what = format!("signal {signal} jumps after a share of {share} of pulse {pulse}");
+                    return refuse(what, "give jumps within pulses, with shares between 0 and 1");
+                }
+                if (pulse, share) <= last {
+                    let what = format!("a jump of signal {signal} in pulse {pulse} is not after the one before it");
+                    return refuse(what, "sort the jumps by time");
                 }
                 check_finite("values around a jump", &[jump.before, jump.after])?;
-                before = place;
+                last = (pulse, share);
             }
         }
         self.jumps = jumps;

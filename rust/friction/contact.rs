@@ -81,10 +81,12 @@ impl FrictionProblem {
         (0..self.count()).filter(|&b| b != body).map(|b| self.gain(body, b) * forces(b)).sum()
     }
 
-    /// Solve a pulse, or a part of this length, that starts at the velocities `v` and would end at `p` without friction.
+    /// Solve for the friction in a pulse, or in a part of it, that starts at the velocities `v` and would end at `p`
+    /// without friction.
     ///
-    /// `length` is a fraction of the pulse, to which the gains are proportional. `near` contains the initial friction
-    /// forces. `at` receives the end velocity of each body without its own friction, and its pulse.
+    /// `length` is the length of the part as a fraction of the pulse; the gains are proportional to it. A body stays at
+    /// rest if the force exceeds its friction by at most `rounding`, in units of velocity. The iteration starts at the
+    /// friction forces `near`. `at` receives the end velocity of each body without its own friction, and its pulse.
     pub fn solve(
         &self,
         length: f64,

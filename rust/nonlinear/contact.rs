@@ -62,7 +62,7 @@ pub struct BodyMotion {
 pub(super) struct BodyState {
     /// Length of the interval as a fraction of the pulse.
     length: f64,
-    /// Change of the velocity per pulse without any friction.
+    /// Change of the velocity that the forces of this interval would cause in a whole pulse without friction.
     rate: f64,
     /// Velocity at the start.
     start_velocity: f64,
@@ -102,23 +102,25 @@ impl ContactStates {
 pub(super) struct BodyDerivatives {
     /// Initial output and velocity of each body.
     pub(super) starts: Vec<(f64, f64)>,
-    /// Derivatives of the gains, row-major. A gain is the decrease of the velocity of a body at the end of a pulse per
-    /// unit of the friction force on a body in the pulse.
+    /// Derivatives of the gains (a, b), row-major: decrease of the velocity of body a at the end of a pulse per unit of
+    /// the friction force on body b.
     gains: Vec<f64>,
     /// Derivatives of fc, fs and vs of each body.
     laws: Vec<[f64; 3]>,
 }
 
-/// Derivatives of the motion in a pulse with respect to a parameter.
-struct PulseMotionDerivatives<'a> {
+/// Derivatives with respect to a parameter from which those of the friction forces of a pulse follow. Every field is a
+/// derivative.
+struct PulseInputDerivatives<'a> {
     /// Velocities at the start.
     starts: &'a [f64],
     /// Velocities at the end without friction.
     ends: &'a [f64],
-    /// Gains ([`BodyDerivatives`]).
+    /// Gains, as in [`BodyDerivatives`].
     gains: &'a [f64],
     /// Parameters fc, fs and vs of each body.
     laws: &'a [[f64; 3]],
+    /// Intervals of the pulse.
     intervals: &'a [Interval],
 }
 
@@ -133,11 +135,11 @@ struct DerivativeWorkspace {
     ends: Vec<f64>,
 }
 
-/// Derivatives of the motion of the bodies at the start of a pulse with respect to a parameter.
+/// Derivatives of outputs and velocities of the bodies with respect to a parameter, from pulse to pulse.
 pub(super) struct MotionDerivatives {
     outputs: Vec<f64>,
     velocities: Vec<f64>,
-    /// Velocities at the end of the pulse without friction.
+    /// Velocities at the end of the current pulse without friction.
     ends: Vec<f64>,
     work: DerivativeWorkspace,
 }
@@ -154,9 +156,9 @@ impl MotionDerivatives {
 pub(super) struct ContactResponses {
     /// Responses of each state channel to each mean friction force, by pulse and body.
     channels: Vec<f64>,
-    /// Derivatives of the mean friction forces with respect to those that the state channels alone would cause, by
-    /// pulse, row-major.
-    solutions: Vec<f64>,
+    /// Matrix of each pulse, row-major, that turns changes of the mean friction forces without their feedback through
+    /// the state channels into changes with it.
+    feedback: Vec<f64>,
 }
 
 /// Solver of the friction forces of all bodies, pulse by pulse.
@@ -292,34 +294,34 @@ impl ContactOperators {
         Ok(BodyDerivatives { starts, gains: (0..n * n).map(of).collect(), laws })
     }
 
-    /// Compute the derivatives of the mean friction forces of a pulse with these intervals.
+    /// Write the derivatives of the mean friction forces of a pulse to `work.means`.
     fn force_derivatives(
         &self,
         at: &[BodyState],
         intervals: &[Interval],
-        moved: &PulseMotionDerivatives<'_>,
+        given: &PulseInputDerivatives<'_>,
         work: &mut DerivativeWorkspace,
     ) {
         let (n, problem) = (self.count(), &self.problem);
         let DerivativeWorkspace { velocities, means, slopes, forces, ends } = work;
         velocities.clear();
-        velocities.extend_from_slice(moved.starts);
+        velocities.extend_from_slice(given.starts);
         for row in [&mut *means, slopes, forces, ends] {
             row.clear();
             row.resize(n, 0.0);
         }
-        for ((states, interval), change) in at.chunks(n).zip(intervals).zip(moved.intervals) {
+        for ((states, interval), change) in at.chunks(n).zip(intervals).zip(given.intervals) {
             let length = interval.length;
-            let gain = |a: usize, b: usize| change.length * problem.gain(a, b) + length * moved.gains[a * n + b];
+            let gain = |a: usize, b: usize| change.length * problem.gain(a, b) + length * given.gains[a * n + b];
             for (a, state) in states.iter().enumerate() {
                 let pushed =
-                    |b: usize| moved.gains[a * n + b] * interval.forces[b] + problem.gain(a, b) * change.forces[b];
-                let rate = moved.ends[a] - moved.starts[a] + (0..n).map(pushed).sum::<f64>();
+                    |b: usize| given.gains[a * n + b] * interval.forces[b] + problem.gain(a, b) * change.forces[b];
+                let rate = given.ends[a] - given.starts[a] + (0..n).map(pushed).sum::<f64>();
                 let by_others = |b: usize| if a == b { 0.0 } else { gain(a, b) * states[b].pulse.force };
                 let free =
                     velocities[a] + change.length * state.rate + length * rate - (0..n).map(by_others).sum::<f64>();
                 let derivatives =
-                    PulseDerivatives { start: velocities[a], free, first: gain(a, a), law: moved.laws[a] };
+                    PulseDerivatives { start: velocities[a], free, first: gain(a, a), law: given.laws[a] };
                 let (law, own) = (problem.law(a), length * problem.own(a));
                 ends[a] = free - gain(a, a) * state.pulse.force;
                 forces[a] = law.slope(state.start_velocity, state.free_velocity, own, &state.pulse, &derivatives).0;
@@ -353,7 +355,7 @@ impl ContactOperators {
     ) -> Result<ContactResponses> {
         let (states, n) = (self.states, self.count());
         let count = gains.len() / states;
-        let mut out = ContactResponses { channels: Vec::new(), solutions: Vec::new() };
+        let mut out = ContactResponses { channels: Vec::new(), feedback: Vec::new() };
         let (zeros, no_gains, no_laws) = (vec![0.0; n], vec![0.0; n * n], vec![[0.0; 3]; n]);
         let (mut unit, mut matrix, mut work) = (zeros.clone(), no_gains.clone(), DerivativeWorkspace::default());
         for (pulse, inverse) in inverses.chunks(states * states).enumerate() {
@@ -373,14 +375,14 @@ impl ContactOperators {
             for c in 0..n {
                 unit.fill(0.0);
                 unit[c] = 1.0;
-                let moved = PulseMotionDerivatives {
+                let given = PulseInputDerivatives {
                     starts: &zeros,
                     ends: &unit,
                     gains: &no_gains,
                     laws: &no_laws,
                     intervals: &constant,
                 };
-                self.force_derivatives(at, &intervals, &moved, &mut work);
+                self.force_derivatives(at, &intervals, &given, &mut work);
                 for (a, slope) in work.means.iter().enumerate() {
                     for b in 0..n {
                         let by_channels = out.channels[first + b * states + self.velocities[c]];
@@ -389,16 +391,17 @@ impl ContactOperators {
                 }
             }
             if n == 1 {
-                out.solutions.push(1.0 / matrix[0]);
+                out.feedback.push(1.0 / matrix[0]);
             } else {
-                out.solutions.extend(small::inverse(&matrix, n)?);
+                out.feedback.extend(small::inverse(&matrix, n)?);
             }
         }
         Ok(out)
     }
 
     /// Add the derivatives of the friction forces of a pulse to the derivatives of the sources. Update the derivatives
-    /// of outputs and velocities. `intervals` holds the intervals of the pulse and their derivatives.
+    /// of outputs and velocities. `changes` are the derivatives of the intervals of the pulse, `x` those of the sources,
+    /// which are updated in place.
     pub(super) fn add_friction_derivatives(
         &self,
         (contacts, responses, pulse): (&ContactStates, &ContactResponses, usize),
@@ -416,15 +419,15 @@ impl ContactOperators {
             };
             *end = derivatives.starts[a].1 + x[self.velocities[a]] + at.iter().enumerate().map(through).sum::<f64>();
         }
-        let moved = PulseMotionDerivatives {
+        let given = PulseInputDerivatives {
             starts: velocities,
             ends,
             gains: &derivatives.gains,
             laws: &derivatives.laws,
             intervals: changes,
         };
-        self.force_derivatives(at, intervals, &moved, work);
-        let solution = &responses.solutions[pulse * n * n..(pulse + 1) * n * n];
+        self.force_derivatives(at, intervals, &given, work);
+        let solution = &responses.feedback[pulse * n * n..(pulse + 1) * n * n];
         let channels = &responses.channels[pulse * n * states..(pulse + 1) * n * states];
         for b in 0..n {
             let force: f64 = (0..n).map(|c| solution[b * n + c] * work.means[c]).sum();

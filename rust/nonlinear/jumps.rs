@@ -1,9 +1,9 @@
 //! Jumps of the forces on bodies with friction within a pulse.
 //!
 //! A zero-order hold behind a delay that is no whole number of pulses jumps within pulses. A body at rest stays there
-//! until the jump and slides after it, which the mean force of the pulse does not tell. The friction of such a pulse is
-//! therefore computed interval by interval between the jumps. Only terms c u of inputs u in the equations of bodies
-//! jump; derivatives and non-linear terms of inputs enter by their means.
+//! until the jump and slides after it, which the mean force of the pulse cannot show. The friction of such a pulse is
+//! therefore computed interval by interval between the jumps. Only terms c u of inputs u are treated
+//! this way. Inputs that are differentiated or in non-linear terms are replaced by their pulse means.
 
 use std::borrow::Cow;
 
@@ -32,11 +32,12 @@ struct InputJump {
     index: usize,
 }
 
-/// Coefficient of an input as a force on a body.
+/// Term c u of the equation of a body: input u acts on it with the force c u.
 #[derive(Debug, Clone, Copy)]
 struct InputForce {
     signal: usize,
     body: usize,
+    /// Index of the equation and of the term in it.
     at: (usize, usize),
     coefficient: f64,
 }
@@ -46,14 +47,14 @@ pub(super) struct ForceJumps {
     /// Jumps in the sequence of time.
     jumps: Vec<InputJump>,
     forces: Vec<InputForce>,
-    /// The only interval of a pulse without jumps.
+    /// Intervals of a pulse without jumps: one of length 1.
     whole: [Interval; 1],
-    /// Derivative of this interval.
-    constant: [Interval; 1],
+    /// Derivatives of these intervals, which are zero.
+    whole_derivative: [Interval; 1],
 }
 
 impl ForceJumps {
-    /// Jumps of the inputs of a record on the bodies of a system.
+    /// Collect the jumps of those inputs of a record that act as forces on bodies.
     pub(super) fn new(system: &NonlinearSystem, record: &Record) -> Self {
         let mut forces = Vec::new();
         for (body, &(i, _)) in system.frictions.iter().enumerate() {
@@ -81,7 +82,7 @@ impl ForceJumps {
         jumps.sort_by(|a, b| a.pulse.cmp(&b.pulse).then(a.share.total_cmp(&b.share)));
         let bodies = system.frictions.len();
         let interval = |length: f64| [Interval { length, forces: vec![0.0; bodies] }];
-        Self { jumps, forces, whole: interval(1.0), constant: interval(0.0) }
+        Self { jumps, forces, whole: interval(1.0), whole_derivative: interval(0.0) }
     }
 
     fn of_pulse(&self, pulse: usize) -> &[InputJump] {
@@ -105,7 +106,7 @@ impl ForceJumps {
     pub(super) fn interval_derivatives(&self, pulse: usize, derivatives: &SystemDerivatives) -> Cow<'_, [Interval]> {
         let jumps = self.of_pulse(pulse);
         if jumps.is_empty() {
-            return Cow::Borrowed(&self.constant);
+            return Cow::Borrowed(&self.whole_derivative);
         }
         let slope = |jump: &InputJump| {
             let input = derivatives.inputs.iter().find(|input| input.signal == jump.signal);
@@ -120,9 +121,11 @@ impl ForceJumps {
         Cow::Owned(self.split(jumps, |jump| slope(jump).0, 0.0, size, mean))
     }
 
-    /// Intervals between jumps at these places and the end of the pulse, or the derivatives of all of these.
+    /// Intervals of a pulse with these jumps. If the functions return derivatives, the result is the derivatives of the
+    /// intervals.
     ///
-    /// `size` is the change of a force at a jump, `mean` the contribution of this change to the mean of the force.
+    /// `place` is the position of a jump, `end` that of the end of the pulse. `size` is the step of a force at a jump,
+    /// `mean` the contribution of this step to the mean of the force.
     fn split(
         &self,
         jumps: &[InputJump],

@@ -160,8 +160,8 @@ impl<'a> NonuniformSignal<'a> {
         (self.intersample == Intersample::Hold).then(|| (self.times.to_vec(), sizes))
     }
 
-    /// Jumps of a zero-order-hold signal within `m` pulses of this width \[s\], without jumps at pulse edges. A linear
-    /// signal has none.
+    /// Jumps of a zero-order-hold signal within `m` pulses of width `step` \[s\], without jumps at pulse edges. A signal
+    /// that is linear between samples has none.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::float_cmp)]
     pub fn pulse_jumps(&self, m: usize, step: f64) -> Vec<PulseJump> {

@@ -572,7 +572,7 @@ def test_a_constant_is_a_parameter_with_the_standard_error_of_linear_regression(
     assert [line for line in result.summary().splitlines() if line.startswith("  constant_y ")]
     page = result.report(tmp_path / "page.html").read_text()
     assert "<i>constant_y</i>" in page
-    assert "c in the equation, of its run alone" in page
+    assert "constant of the equation, for this run only" in page
 
 
 def test_a_constant_of_each_run_has_the_standard_error_of_an_input_of_ones():

@@ -108,7 +108,10 @@ fn jumps_that_are_not_within_pulses_are_refused() -> Result<(), Error> {
         vec![jump(2, 0.5), jump(1, 0.7)],
         vec![PulseJump { after: f64::INFINITY, ..jump(1, 0.5) }],
     ] {
-        assert!(plain.clone().with_jumps(vec![Vec::new(), wrong]).is_err());
+        assert!(matches!(
+            plain.clone().with_jumps(vec![Vec::new(), wrong]),
+            Err(Error::Structure { .. } | Error::NotFinite { .. })
+        ));
     }
     assert!(plain.clone().with_jumps(vec![vec![jump(1, 0.5)]]).is_err());
     assert_eq!(plain.with_jumps(vec![vec![jump(1, 0.2), jump(1, 0.5)], Vec::new()])?.jumps(0).len(), 2);

@@ -373,7 +373,8 @@ def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...], fr
 def linear_part(model: Model) -> Model:
     """Return the model without friction, saturations and dead zones, with the covariance of the other parameters.
 
-    It is the exact model of deviations while every output slides in one direction and no input is limited.
+    It describes small deviations while no body reverses or sticks, speeds stay well above a Stribeck speed, and inputs
+    stay between dead zone and saturation.
     """
     structure, keep = model.structure, list[bool]()
     for item in model.equations:

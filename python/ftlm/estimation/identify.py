@@ -664,7 +664,7 @@ def assess_fit(fit: Fit) -> Identification:
 
 
 def _offset_errors(fit: Fit, comparison: Comparison) -> tuple[dict[str, dict[str, float]], ...]:
-    """Return the standard errors of the offsets of each run; empty for a fit without a covariance of this kind."""
+    """Return the standard errors of the offsets of each run; empty unless the fit is joint and has a covariance."""
     joint = fit.joint
     if joint is None or has_loop_noise_model(fit.settings) or not np.isfinite(np.diag(joint.covariance)).any():
         return ()

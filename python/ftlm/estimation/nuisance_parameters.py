@@ -228,8 +228,8 @@ def offset_errors(
 ) -> tuple[dict[str, dict[str, float]], ...]:
     """Return the standard errors of the offsets of each run, by output and kind; empty if not computable.
 
-    The offsets are projected out of the Jacobian of a joint fit, so its covariance excludes them. Here the covariance
-    has a row for each offset: the response to an input of ones (for a ramp, to the time), or the ones of a level.
+    A joint fit eliminates the offsets, so its covariance lacks them. Here the Jacobian has a row for each: the response
+    to a constant input of 1 (for a ramp, to the time), or, for a level, ones in the output.
     """
     listed = [(k, o, kind) for k, run in enumerate(offsets) for o, own in run.items() for kind in own]
     if not listed or len(offsets) != len(runs):
@@ -276,7 +276,7 @@ def offset_errors(
 
 
 def _level_responses(grid: Objective, point: Iterate, listed: Sequence[tuple[int, str, str]]) -> list[Floats]:
-    """Return the weighted responses to the levels of outputs in runs, without their projection on the initial terms."""
+    """Return the derivatives of the weighted residuals with respect to levels, orthogonal to the initial terms."""
     shares, blocks = grid.residual_weights, _residual_blocks(grid)
     bases, columns = _initial_responses(point, blocks, shares.size), []
     for k, output, _ in listed:
@@ -481,10 +481,10 @@ def _simplify_initial_terms(joint: JointFit, runs: Sequence[Run], structure: Str
 def _fit_without_implausible_history(
     joint: JointFit, runs: Sequence[Run], structure: Structure, fit_caputo: Callable[[], JointFit]
 ) -> JointFit | None:
-    """Return the fit with Caputo initial terms if past inputs do not explain the history of a fit, otherwise None.
+    """Return the fit with Caputo initial terms if no plausible past input causes the fitted history, otherwise None.
 
-    The free powers of t of a history can fit dynamics that the structure lacks. Under the prior on past inputs, by
-    which models are compared with runs, such a history leaves larger residuals than Caputo's terms do.
+    The free powers of t of a history can fit dynamics that the structure lacks. Under the prior on past inputs that
+    :func:`ftlm.compare` uses, such a history leaves larger residuals than Caputo's terms do.
     """
     try:
         residuals = _simulation_residuals(Model(_fitted_structure(joint, structure)), runs)
@@ -500,7 +500,7 @@ def _fit_without_implausible_history(
 
 
 def _simulation_residuals(model: Model, runs: Sequence[Run]) -> list[Floats]:
-    """Return the residuals of each output, concatenated over all runs, with the initial terms of a comparison."""
+    """Return the residuals of each output over all runs, simulated with initial terms estimated as in `compare`."""
     parts = []
     for run in runs:
         simulated = simulate_refined(model, run, None, tolerance=HISTORY_SIMULATION_TOLERANCE)

@@ -24,7 +24,7 @@ from ftlm.io.dialect import SHEET_OPTIONS, TEXT_OPTIONS, Assumption, Layout
 from ftlm.io.isolated_reader import HDF5_FORMAT, binary_format_of, read_isolated
 from ftlm.io.table import Column, FileTable, Pool, date_order_assumption
 from ftlm.utils.arguments import check_arguments
-from ftlm.utils.files import PACKAGE_LOGGER, nearest_file, read_toml
+from ftlm.utils.files import PACKAGE_LOGGER, nearest_file_hint, read_toml
 from ftlm.utils.parameters import NAMED_COLUMNS, parameter
 from ftlm.utils.validation import CSV_TIME, as_mapping, is_run_name, join_names, names_to_columns, nearest
 
@@ -369,7 +369,7 @@ def _size(path: Path) -> int:
     try:
         status = path.stat()
     except FileNotFoundError:
-        raise DataError(f"{str(path)!r} does not exist{nearest_file(path)}; check the path") from None
+        raise DataError(f"{str(path)!r} does not exist{nearest_file_hint(path)}; check the path") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{str(path)!r} cannot be opened ({error}); check the path and its permissions") from None
     if not stat.S_ISREG(status.st_mode):

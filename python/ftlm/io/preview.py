@@ -154,7 +154,7 @@ class OpenedFile:
         if self.problem:
             raise DataError(f"{self.path} is not a run yet, so there are no columns to write: {self.problem}")
         options = {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items() if k in COLUMN_KEYS}
-        lines = ["# Left of = stands the name of a signal, which can be changed to that in an equation or a structure."]
+        lines = ["# Left of = is the signal name; change it to the name in your equation or structure."]
         lines += [f"{key} = {_toml(value)}" for key, value in options.items() if not isinstance(value, dict)]
         for table, values in ((k, v) for k, v in options.items() if isinstance(v, dict)):
             lines += ["", f"[{table}]", *(f"{_toml(str(k))} = {_toml(v)}" for k, v in values.items())]

@@ -602,10 +602,10 @@ def landscape(
 def score_profiles(
     runs: Sequence[Run], structure: Structure, search: SearchResult, order_grid: OrderGrid
 ) -> list[LineChart]:
-    """Return a chart of the score over each order with several values in the grid; the others are those of rank 1."""
+    """Return a chart for each order with several grid values: its score, with the other orders at those of rank 1."""
     charts = []
     best = search.orders
-    score = "error (45)" if search.settings["norm"] == "l1" else "RMSE"
+    score = "sum of absolute errors" if search.settings["norm"] == "l1" else "RMSE"
     for name, values in order_grid.values(structure).items():
         if len(values) < 2:
             continue

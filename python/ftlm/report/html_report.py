@@ -406,7 +406,7 @@ def frequency_sections(model: Model, steps: Sequence[tuple[float, float]]) -> li
         needed = ["every output keeps its direction of motion"] if structure.has_friction else []
         if any(e.friction is not None and e.friction.stribeck is not None for e in structure.equations):
             needed.append("moves faster than Stribeck's speed")
-        needed += ["the inputs stay in their proportional range"] if structure.limits else []
+        needed += ["the inputs stay between dead zone and saturation"] if structure.limits else []
         words = (
             f"Exact response of the linear part of the model, without {' and '.join(effects)}. Small deviations "
             f"respond in this way while {' and '.join(needed)}."

@@ -81,7 +81,7 @@ def parameter_lines(result: Identification) -> list[str]:
         has_error = not math.isnan(p.standard_error)
         spread = f"± {format_bound(p.standard_error)}" if has_error else "fixed" if p.fixed else ""
         tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
-        tail = "(estimated on this run, for it alone)" if name in offsets else tail
+        tail = "(offset of one run, not part of the model)" if name in offsets else tail
         if name in reference:
             tail = f"{tail}  (stated {reference[name]:.6g})".strip()
         rows.append((name, f"{p.value:.6g}", spread, p.unit, tail))

@@ -28,7 +28,7 @@ from ftlm.utils.statistics import NORMAL_95
 #: Decimals of an order in an equation; the model file stores all digits.
 ORDER_DECIMALS = 4
 #: Text on the place of an offset, by kind.
-OFFSET_PLACES = {"constant": "c in the equation", "ramp": "ramp in the equation", "level": "level of the output"}
+OFFSET_PLACES = {"constant": "constant of the equation", "ramp": "ramp of the equation", "level": "level of the output"}
 THIN_SPACE = Markup('<mspace width="0.17em"></mspace>')  # our constant
 _DELAYED_TIME = Markup("<mrow><mo>(</mo><mi>t</mi><mo>{}</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _LIMITED_INPUT = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
@@ -296,7 +296,7 @@ def parameter_table(
         has_error = not math.isnan(p.standard_error)
         cells: list[Cell] = [p.standard_error, *p.interval] if has_error else [None, None, None]
         kind = OFFSET_PLACES[name.partition("_")[0]]
-        rows.append([symbol_html(name), p.value, *cells, None, unit_html(p.unit), f"{kind}, of its run alone"])
+        rows.append([symbol_html(name), p.value, *cells, None, unit_html(p.unit), f"{kind}, for this run only"])
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
     if has_errors:
         note = "Intervals assume a right model. A coefficient without one is fixed or given by the law."

@@ -36,7 +36,7 @@ MAX_M = 1 << 24
 #: Largest relative excess of a negative delay over one sampling interval that is rounding.
 MAX_EARLY_ROUNDING = 1e-9
 COULOMB_PREFIX = "coulomb_"
-#: Column of a file in a line of a columns file.
+#: Placeholder for the column in a line of a columns file.
 QUOTED_COLUMN = '"COLUMN"'
 #: Number of cached series of sensor filters: long ones, and those of at most this many pulses.
 CACHED_LONG_SERIES, SHORT_SERIES_PULSES, CACHED_SHORT_SERIES = 4, 1 << 13, 32
@@ -194,7 +194,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
 
 
 def _missing_signals_text(run: Run, structure: Structure) -> str:
-    """Return the message on signals of a structure that a run lacks, with the options and lines that name them."""
+    """Return the message on signals that a run lacks, with options and lines of a columns file that supply them."""
     lacking = [n for n in structure.signals if n not in run and not n.startswith(COULOMB_PREFIX)]
     roles = {"outputs": [n for n in lacking if n in structure.outputs]}
     roles["inputs"] = [n for n in lacking if n not in roles["outputs"]]

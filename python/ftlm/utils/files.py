@@ -159,7 +159,7 @@ MAX_NAME_CHARACTERS, MAX_SMALL_FILE_BYTES = 300, 1 << 20
 _READ_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 
 
-def nearest_file(path: Path) -> str:
+def nearest_file_hint(path: Path) -> str:
     """Return text such as " (did you mean …?)" with the file beside `path` of the most similar name, or ""."""
     try:
         beside = sorted(entry.name for entry in path.parent.iterdir())
@@ -202,7 +202,7 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
             name if name.isprintable() and len(name) <= MAX_NAME_CHARACTERS else short_repr(name, MAX_NAME_CHARACTERS)
         )
         why = (error.strerror if isinstance(error, OSError) else None) or error
-        hint = nearest_file(file) if isinstance(error, FileNotFoundError) else ""
+        hint = nearest_file_hint(file) if isinstance(error, FileNotFoundError) else ""
         raise DataError(f"{what} {path_text} cannot be read: {why}{hint}; check the path") from error
     if not stat.S_ISREG(state.st_mode):
         raise DataError(f"{file} is not a regular file; give {source}")

@@ -387,10 +387,11 @@ impl InputLaw {
         })
     }
 
-    /// Jumps of a zero-order hold within pulses behind the non-linearity, and their derivatives with respect to the
-    /// parameter: of the share, of the value before and of the value after.
+    /// Jumps of a zero-order hold within pulses after the non-linearity acted. The second of each pair has the
+    /// derivatives of the share and of both values with respect to the parameter.
     ///
-    /// `jumps` are those before the non-linearity. A delay moves the jumps at the pulse edges only.
+    /// A limit acts on both values of each of `jumps`. For a delay, `jumps` is ignored: the input is taken to jump at
+    /// pulse edges, and the delay moves these jumps into the pulses. `before` is the input before the record.
     ///
     /// # Errors
     /// As [`InputLaw::apply`].
