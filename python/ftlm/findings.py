@@ -12,7 +12,9 @@ from typing import Any
 
 import msgspec
 
+from ftlm.errors import ModelError
 from ftlm.utils.parameters import choose_text, parameter
+from ftlm.utils.validation import short_repr
 
 #: Severity levels: the model must not be used, must be used with care, has a property worth knowing, or its data have a
 #: note on how they were read.
@@ -169,8 +171,11 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         ``"validation"`` for a run that the model was not identified from.
     numbers
         Numbers and texts by name, which are inserted into the sentence.
-    written
-        Sentence that is stored in a model file, for versions of ftlm that do not know the code.
+
+    Raises
+    ------
+    ModelError
+        If the catalogue has no such code.
     """
 
     code: str
@@ -181,14 +186,15 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     method: str = ""
     role: str = ""
     numbers: dict[str, float | int | str] = {}
-    written: str = ""
+
+    def __post_init__(self) -> None:
+        if self.code not in finding_catalogue().kinds:
+            raise ModelError(f"there is no finding {short_repr(self.code)}; give one of the catalogue")
 
     @property
     def kind(self) -> FindingKind:
-        """Entry of the code in the catalogue; a code that this version does not know has the level "with care"."""
-        return finding_catalogue().kinds.get(self.code) or FindingKind(
-            "other", LEVEL_WITH_CARE, "{written}", "{written}"
-        )
+        """Entry of the code in the catalogue."""
+        return finding_catalogue().kinds[self.code]
 
     @property
     def topic(self) -> Topic:
@@ -235,7 +241,7 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         return self._render("; ".join(part for part in (topic.remedy, topic.alternative) if part))
 
     def _render(self, template: str) -> str:
-        words: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "written", "signal")}
+        words: dict[str, Any] = {n: getattr(self, n) for n in (*SUBJECT_FIELDS, "signal")}
         words |= {**self.numbers, "ask": _Reference(), "choose": _Choice()}
         try:
             if "{remedy}" in template:
@@ -243,12 +249,11 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
             return _Sentence().vformat(template, (), words)
         except (KeyError, ValueError, TypeError):
             # A file may lack a number of the sentence.
-            return self.written or self.code
+            return self.code
 
     def to_file(self) -> Finding:
-        """Return the finding as a file stores it: with its sentence, and nonfinite numbers as text."""
-        numbers = {n: _storable(v) for n, v in self.numbers.items()}
-        return msgspec.structs.replace(self, numbers=numbers, written=self.text)
+        """Return the finding as a file stores it, with nonfinite numbers as text."""
+        return msgspec.structs.replace(self, numbers={n: _storable(v) for n, v in self.numbers.items()})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as a dictionary for JSON."""

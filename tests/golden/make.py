@@ -55,7 +55,7 @@ def main():
         "orders": found.model.orders,
         "table": whole.to_dict()["table"],
         "candidates": whole.candidates,
-        "pruned": whole.exclusion_counts,
+        "exclusion_counts": whole.exclusion_counts,
     }
     (folder / "expected.json").write_text(json.dumps(expected, indent=1) + "\n", encoding="utf-8")
     under_a_law(folder, given)

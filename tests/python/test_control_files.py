@@ -123,10 +123,10 @@ def broken_files():
     yield json.dumps(good).encode(), "missing required field"
     yield json.dumps(good | {"controller": pid | {"kp": "1"}}).encode(), "Expected `float`"
     yield json.dumps(good | {"controller": pid | {"type": "bang"}}).encode(), "Invalid value 'bang'"
-    yield json.dumps(good | {"controller": pid, "schema": 2}).encode(), "upgrade ftlm"
+    yield json.dumps(good | {"controller": pid, "schema": 2}).encode(), "read it with the version that wrote it, or"
     yield (
         json.dumps(good | {"controller": {"type": "mpc"}, "schema": 2, "written_by": "ftlm 9"}).encode(),
-        "a controller of a later version of ftlm, .ftlm 9.: it has schema 2, and .* reads up to 1; upgrade",
+        "a controller of schema 2, written by .ftlm 9., and ftlm .* reads schema 1; read it with the version",
     )
     yield json.dumps(good | {"controller": pid | {"rate": -1.0}}).encode(), "damaged: rate"
     yield json.dumps(good | {"controller": pid | {"order": 10**6}}).encode(), "damaged: order"

@@ -138,7 +138,7 @@ def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
     """R4: any number of threads, any stretch of rounds, in any order."""
     job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, pruning=False)
     work = job.equation_problem()
-    count, ends, _ = work.plan()
+    count, ends = work.plan()
     assert count == 19_295
     assert ends == [1, 3, 5]
     ready = work.build_evaluator()
@@ -327,7 +327,7 @@ def test_a_half_done_stretch_of_another_visiting_order_is_done_again(run, whole,
     """Its candidates would be followed twice or never: the table is that of an uninterrupted search all the same."""
     path = tmp_path / "half.ftlm"
     path.write_bytes(whole)
-    _, (wave, *_), _ = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_problem().plan()
+    _, (wave, *_) = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_problem().plan()
     found = read_store(path).sections[0].frames[0].part
     # A row that would win, were it believed.
     rows = ((found[0][0][0], 0.0, *found[0][0][2:]),)
@@ -723,41 +723,14 @@ def test_another_search_is_refused_and_leaves_the_store(run, whole, tmp_path, ch
     assert path.read_bytes() == whole
 
 
-def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_where_not(
-    run, whole, expected, tmp_path, monkeypatch
-):
-    finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
-    finished.write_bytes(whole)
-    half.write_bytes(whole)
-    keep(half, 2)
-    begun = half.read_bytes()
-    monkeypatch.setattr("ftlm.order_search.checkpoint.ALGORITHM_VERSION", 8)
-    assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
-    assert finished.read_bytes() == whole
-    with pytest.raises(ftlm.DataError, match=r"use algorithm 7; this version's is 8: finish the search with that"):
-        ftlm.resume_search(half)
-    assert half.read_bytes() == begun
-
-
-def test_only_what_another_algorithm_does_otherwise_is_refused_half_done(run, tmp_path, monkeypatch):
-    """Algorithm 5 ranks free runs otherwise than 4, and squared equation errors of a small lattice as all before it."""
-    free, squares = {"pruning": True}, {"pruning": True, "criterion": "equation-error", "norm": "l2"}
-    for name, options in {"free": free, "squares": squares}.items():
-        finished, half = tmp_path / f"{name}.ftlm", tmp_path / f"half-{name}.ftlm"
-        expected = bytes_of(search(run, finished, **options))
-        held = read_store(finished)
-        with monkeypatch.context() as patch:
-            patch.setattr("ftlm.order_search.checkpoint.ALGORITHM_VERSION", 4)
-            Store(half, held.requests).close()
-        if name == "free":
-            begun = half.read_bytes()
-            with pytest.raises(ftlm.DataError, match=r"rounds use algorithm 4"):
-                search(run, half, **options)
-            assert half.read_bytes() == begun
-        else:
-            assert bytes_of(search(run, half, **options)) == expected
-            assert read_store(half).algorithm == 4
-            assert ftlm.search_status(half)["y"].complete
+def test_a_store_of_another_algorithm_is_refused_and_kept(run, whole, tmp_path, monkeypatch):
+    path = tmp_path / "finished.ftlm"
+    path.write_bytes(whole)
+    monkeypatch.setattr("ftlm.order_search.checkpoint.ALGORITHM_VERSION", 2)
+    for call in (lambda: search(run, path), lambda: ftlm.resume_search(path), lambda: ftlm.search_status(path)):
+        with pytest.raises(ftlm.DataError, match=r"with algorithm 1, .* has algorithm 2; start the search again in an"):
+            call()
+    assert path.read_bytes() == whole
 
 
 def test_a_second_writer_is_refused_and_readers_are_not(run, whole, expected, tmp_path):
@@ -895,7 +868,6 @@ def test_a_read_only_folder_is_an_error_and_leaves_the_store_whole(run, whole, e
     ("content", "message"),
     [
         (b"t,y\n0,1\n", "is not an ftlm search store"),
-        (b"ftlm search store 1\n" + bytes(800), "is a store of an earlier format; finish it with the version of ftlm"),
         (b"", "ends before its first record"),
         (b"SQLite format 3\0" + bytes(4080), "is not an ftlm search store"),
     ],

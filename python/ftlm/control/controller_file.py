@@ -191,7 +191,6 @@ def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
         If the file cannot be read, or is not a controller file of this version.
     """
     read = CONTROLLER_FORMAT.read(path)
-    CONTROLLER_FORMAT.check_schema(path, read, CONTROLLER_SCHEMA)
     try:
         return read.controller.controller()
     except (FtlmError, ValueError) as error:

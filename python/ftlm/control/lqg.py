@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -235,8 +234,8 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
             raise ModelError(f"noise of {short_repr(name)} does not belong to a measured output{near}")
-    free = msgspec.UNSET if model.estimate is None else model.estimate.free
-    noise_of_fit = {} if free is msgspec.UNSET else dict(free.noise)
+    free = None if model.estimate is None else model.estimate.free
+    noise_of_fit = {} if free is None else dict(free.noise)
     out = []
     for name in measured:
         value = (noise or {}).get(name, noise_of_fit.get(name))

@@ -9,7 +9,6 @@ from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
-from msgspec import UNSET
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm import _core
@@ -642,7 +641,7 @@ def _model(
         values=dict(values_by_name),
         standard_errors={n: e if math.isfinite(e) else None for n, e in standard.items()},
         covariance=spread,
-        findings=tuple(f.to_file() for f in findings) or UNSET,
+        findings=tuple(f.to_file() for f in findings),
     )
     return Model(structure, orders, units, None, {"identified from": "frequency response"}, estimate)
 

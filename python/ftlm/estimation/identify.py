@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
 
 from ftlm.arm.flexible_link import FLEXIBLE_LINK
 from ftlm.data.run import Run, Runs, as_runs
@@ -779,9 +778,9 @@ def _estimate(
         covariance=fit.covariance,
         fit={n: finite(f) for n, f in comparison.fit.items()},
         information={} if criteria is None else {n: finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
-        findings=tuple(f.to_file() for f in findings) or UNSET,
-        intervals=profiles or UNSET,
-        free=UNSET if joint is None else parameter_set(joint, fit.task.structure),
+        findings=tuple(f.to_file() for f in findings),
+        intervals=profiles,
+        free=None if joint is None else parameter_set(joint, fit.task.structure),
     )
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from msgspec import UnsetType
 
 from ftlm import _core
 from ftlm.data.run import Run
@@ -422,7 +421,7 @@ def parameter_set_of(model: Model) -> FitParameters:
         If the model was not estimated by output error, or its file does not list the free parameters.
     """
     free = None if model.estimate is None else model.estimate.free
-    if free is None or isinstance(free, UnsetType):
+    if free is None:
         how = "was not identified" if model.estimate is None else f"is of method {model.estimate.method!r}"
         raise ModelError(
             f"this model {how}, or its file does not list the free parameters, whose covariance an input design needs; "

@@ -10,7 +10,6 @@ from statistics import median
 from typing import Any
 
 from markupsafe import Markup
-from msgspec import UNSET
 from msgspec.structs import replace
 
 from ftlm.analysis.poles import modes
@@ -194,8 +193,8 @@ def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Return the verdict on a model read from a file, from its stored findings and comparisons with runs."""
     estimate = model.estimate
-    plant = estimate is not None and any(f.code in UNSTABLE_PLANT_CODES for f in estimate.findings or ())
-    unstable = plant and estimate is not None and estimate.piece_duration is UNSET
+    plant = estimate is not None and any(f.code in UNSTABLE_PLANT_CODES for f in estimate.findings)
+    unstable = plant and estimate is not None and estimate.piece_duration is None
     own = [] if unstable else [*_unstable_poles(model)]
     validation = () if unstable else validation
     if estimate is None:
@@ -215,14 +214,12 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 
 def saved_findings(estimate: Estimate) -> list[Finding]:
     """Return the findings against a model from its file, those recorded at the fit first."""
-    findings = [] if estimate.against is UNSET else list(estimate.against)
+    findings = list(estimate.against)
     unidentifiable = [n for n, e in estimate.standard_errors.items() if e is None]
     if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in findings):
         findings.append(
             make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
         )
-    if estimate.warnings:
-        findings.append(make_finding("sentences_alone"))
     return findings
 
 

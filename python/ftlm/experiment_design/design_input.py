@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from msgspec import UNSET
 
 from ftlm.analysis.frequency_response import check_no_input_nonlinearity
 from ftlm.analysis.poles import modes, stability
@@ -376,7 +375,7 @@ def _check_slew(bounds: Bounds, step: float, rows: int) -> None:
 
 def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, ...]:
     """Return a finding if the model lacks dynamics, or if the noise of its fit is not white."""
-    findings = () if model.estimate is None or model.estimate.findings is UNSET else model.estimate.findings
+    findings = () if model.estimate is None else model.estimate.findings
     missing = [f for f in findings if f.code in LEFT_OUT_CODES]
     doubt = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
     if doubt is not None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from msgspec import UNSET, UnsetType
 from numpy.typing import ArrayLike
 
 from ftlm.data.run import Run
@@ -73,20 +72,18 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Fit of the simulation to these runs in percent, by output.
     information
         Information criteria, if available.
-    warnings
-        Warnings in files of earlier versions, which are printed and do not affect the verdict.
     intervals
         95 % profile-likelihood intervals (low, high) by name, with None for an unbounded side. Parameters that are not
-        listed have Wald intervals of ± 1.96 standard errors. Unset if there are none.
+        listed have Wald intervals of ± 1.96 standard errors.
     free
-        Free parameters of the output-error fit, with their covariance. Unset for other methods.
+        Free parameters of the output-error fit, with their covariance. None for other methods.
     findings
-        Findings about data, fit and model. Unset if there are none.
+        Findings about data, fit and model.
     against
-        Findings against the model at its identification, from which its verdict follows. Unset if there are none.
+        Findings against the model at its identification, from which its verdict follows.
     piece_duration
         Shortest duration [s] of the pieces, with separate initial values, into which the runs of an unstable plant were
-        split. Comparisons split other runs in the same way. Unset if whole runs were simulated.
+        split. Comparisons split other runs in the same way. None if whole runs were simulated.
     """
 
     method: str
@@ -96,18 +93,11 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     covariance: tuple[tuple[float, ...], ...] | None = None
     fit: dict[str, float | None] = {}
     information: dict[str, float | None] = {}
-    warnings: tuple[str, ...] = ()
-    intervals: dict[str, tuple[float | None, float | None]] | UnsetType = UNSET
-    free: FitParameters | UnsetType = UNSET
-    findings: tuple[Finding, ...] | UnsetType = UNSET
-    against: tuple[Finding, ...] | UnsetType = UNSET
-    piece_duration: float | UnsetType = UNSET
-
-    @property
-    def known_findings(self) -> tuple[Finding, ...]:
-        """Findings, including warnings of earlier versions as notes."""
-        old = tuple(Finding("earlier_sentence", numbers={"text": text}) for text in self.warnings)
-        return old if self.findings is UNSET else (*old, *self.findings)
+    intervals: dict[str, tuple[float | None, float | None]] = {}
+    free: FitParameters | None = None
+    findings: tuple[Finding, ...] = ()
+    against: tuple[Finding, ...] = ()
+    piece_duration: float | None = None
 
 
 @check_arguments

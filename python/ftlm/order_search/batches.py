@@ -109,14 +109,9 @@ class EquationProblem(SearchProblem["_core._Found"]):
         """Return the core's evaluator, which all rounds share."""
         return _core.OrderSearch(*self.core())
 
-    def plan(self, algorithm: int | None = None) -> tuple[int, list[int], int]:
-        """Return (number of candidates, end of each batch, version of the algorithm).
-
-        `algorithm` is an earlier version, whose batches a checkpoint file may have.
-        """
-        return _core.search_plan(
-            self.orders, self.inputs, self.initial, self.settings.core_arguments(self.threads), algorithm
-        )
+    def plan(self) -> tuple[int, list[int]]:
+        """Return (number of candidates, end of each batch)."""
+        return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core_arguments(self.threads))
 
     @property
     def samples(self) -> int:
@@ -346,8 +341,6 @@ Save = Callable[[int, int, Checkpoint | None], None]
 class SearchState(ABC, Generic[Frame, Table]):
     """State of an order search in progress: number of evaluated candidates, total number, and current batch."""
 
-    #: Whether a search begun by an earlier version can be resumed.
-    can_resume = True
     #: Whether the core reports progress of local evaluation itself.
     core_reports_progress = False
 
@@ -404,10 +397,9 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
     core_reports_progress = True
     work: EquationProblem
 
-    def __init__(self, work: EquationProblem, algorithm: int | None = None) -> None:
+    def __init__(self, work: EquationProblem) -> None:
         super().__init__(work, Throughput())
-        self.total, self._ends, present = work.plan(algorithm)
-        self.can_resume = algorithm is None or algorithm >= present
+        self.total, self._ends = work.plan()
         self._parts: list[Part] = []
         self._seed: list[tuple[int, float]] = []
 
@@ -578,7 +570,7 @@ def search_equation(work: EquationProblem, execution: Execution) -> _core._Found
     store = execution.store
     if store is None and execution.executor is None:
         return work.search(execution.progress)
-    return _run_batches(EquationSearchState(work, None if store is None else store.contents.algorithm), execution)
+    return _run_batches(EquationSearchState(work), execution)
 
 
 def search_coupled(work: CoupledProblem, execution: Execution) -> _core._FoundStage:
@@ -604,8 +596,6 @@ def _run_batches(state: SearchState[Frame, Table], execution: Execution) -> Tabl
         for stored_frame in _stored_frames(section, first, end):
             state.add_block(stored_frame)
         blocks = list(_pending_blocks(section, first, end))
-        if blocks and store is not None and not state.can_resume:
-            raise store.outdated_error()
         if executor is None:
             pieces = state.evaluate_locally(blocks, progress, save)
         else:

@@ -27,15 +27,8 @@ from ftlm.structure.structure import Structure, check_initial
 from ftlm.utils.checkpoint_file import RECORD_ENCODER, CheckpointFile, decode_array
 from ftlm.utils.parameters import parameter
 
-#: Version of the search algorithm. Rounds of different versions must not be joined.
-ALGORITHM_VERSION = 7
-#: Earlier versions whose partial searches can be resumed if the rounds of the search are the same in both versions.
-#: Version 2 excludes boxes on grids of 2²⁵ candidates or more, with longer rounds. Version 3 has sharper boxes, also
-#: for squared equation errors. Version 4 has tighter bounds of simulations from 2¹⁸ candidates on. Version 5 bounds
-#: simulations by coefficients that cancel, and constructs boxes by the coefficients of all of their candidates. Version
-#: 6 applies these bounds to multi-innovation. Version 7 bounds unstable candidates by their first samples, from 2¹⁸
-#: candidates on.
-RESUMABLE_ALGORITHMS = (1, 2, 3, 4, 5, 6)
+#: Version of the search algorithm. Rounds of two versions cannot be joined, so files of other versions are refused.
+ALGORITHM_VERSION = 1
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
 #: Counts: candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.
@@ -119,7 +112,7 @@ class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
     ``failures`` is None if unchanged.
 
     If the block was restarted, its earlier records are invalid. ``order`` is the digest of the sequence in which
-    candidates are evaluated; 0 in files of older versions.
+    candidates are evaluated; 0 before the first one.
     """
 
     search: Natural
@@ -262,7 +255,6 @@ class Contents:
     requests: tuple[Request, ...]
     sections: list[Section]
     version: str
-    algorithm: int
     #: Description of corrupt data with the number of its record; None for an intact file.
     corruption: str | None
 
@@ -302,8 +294,11 @@ def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corrupt
 def _contents_of_requests(frame: Requests | Frame, corruption: str | None) -> Contents:
     if not isinstance(frame, Requests) or not frame.requests:
         raise ModelError("the first record holds no request")
+    if frame.algorithm != ALGORITHM_VERSION:
+        writer = f"ftlm {frame.version} with algorithm {frame.algorithm}"
+        raise ModelError(f"it was written by {writer}, and this version has algorithm {ALGORITHM_VERSION}")
     sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
-    return Contents(frame.requests, sections, frame.version, frame.algorithm, corruption)
+    return Contents(frame.requests, sections, frame.version, corruption)
 
 
 #: Maximum time between two writes, each flushed to disk. Less than a second of work is lost on a crash.
@@ -372,19 +367,7 @@ class Store:
                     "another file"
                 )
 
-    def outdated_error(self) -> DataError:
-        """Return the error for a search that another version of ftlm began and this version cannot resume."""
-        content = self.contents
-        return DataError(
-            f"store {self.path} is of ftlm {content.version}, whose rounds use algorithm {content.algorithm}; this "
-            f"version's is {ALGORITHM_VERSION}: finish the search with that version, or start it again in another file"
-        )
-
     def _append(self, added: Sequence[Frame]) -> None:
-        contents = self.contents
-        if contents.algorithm not in (ALGORITHM_VERSION, *RESUMABLE_ALGORITHMS):
-            # A finished search is only read, whatever made it.
-            raise self.outdated_error()
         self._file.append([RECORD_ENCODER.encode(frame) for frame in added])
         self._last = time.monotonic()
         for frame in added:

@@ -614,7 +614,7 @@ def model_page(
     check_free(path, force=force)
     others = [] if validation is None else as_runs(validation)
     estimate = model.estimate
-    findings = [] if estimate is None else list(estimate.known_findings)
+    findings = [] if estimate is None else list(estimate.findings)
     validated = [compare(model, run) for run in others]
     for run, comparison in zip(others, validated, strict=True):
         findings_there = [*comparison.findings, *data_notes(run)]

@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup
-from msgspec import UNSET
 
 from ftlm.estimation.output_error import JointFit
 from ftlm.model.model import Model
@@ -239,10 +238,9 @@ def parameter_table(
         profiles = {n: (p.low, p.high) for n, p in joint.profiles.items()}
     elif model.estimate is not None:
         errors, extra = model.estimate.standard_errors, model.estimate.values
-        saved = {} if model.estimate.intervals is UNSET else model.estimate.intervals
         profiles = {
             n: (-math.inf if low is None else low, math.inf if high is None else high)
-            for n, (low, high) in saved.items()
+            for n, (low, high) in model.estimate.intervals.items()
         }
     has_errors = any(e is not None for e in errors.values())
 

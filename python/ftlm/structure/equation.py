@@ -45,7 +45,7 @@ class Term:
     coefficient: str | float
     factor: float = 1.0
     name: str | None = None
-    # Omitted when unset, so that digests and files of older equations do not change.
+    # Omitted from digests and files when unset.
     expression: Expression | UnsetType = UNSET
 
     @property
@@ -187,7 +187,7 @@ class Friction:
     coefficient: str | float
     factor: float = -1.0
     name: str | None = None
-    # Omitted when unset, so that digests and files of older equations do not change.
+    # Omitted from digests and files when unset.
     more: Stribeck | UnsetType = UNSET
 
     @property
@@ -284,7 +284,7 @@ class Equation:
     output: str
     order: Order
     terms: tuple[Term, ...]
-    # Omitted when unset, so that digests and files of older equations do not change.
+    # Omitted from digests and files when unset.
     coulomb: Friction | UnsetType = UNSET
 
     def __post_init__(self) -> None:

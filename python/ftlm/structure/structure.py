@@ -163,7 +163,7 @@ class Structure:
     name: str = "equation"
     hints: Hints | UnsetType = field(default=UNSET, repr=False, compare=False)
     offset: Offset = "none"
-    # Omitted when unset, so that digests and files of older structures do not change.
+    # Omitted from digests and files when unset.
     input_nonlinearities: tuple[InputNonlinearity, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ from ftlm.utils.checkpoint_file import DIGEST_BYTES, RECORD_ENCODER, CheckpointF
 Result = TypeVar("Result")
 Expected = TypeVar("Expected")
 #: Version of fit and validation. Results of different versions must not be combined.
-ALGORITHM_VERSION = 3
+ALGORITHM_VERSION = 1
 #: Errors of a candidate's fit. Any other error is a defect.
 ErrorName: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
 CANDIDATE_ERRORS: dict[ErrorName, type[FtlmError]] = {

@@ -180,12 +180,6 @@ class CheckpointFile:
             return DataError(f"{self.path} cannot be used: {error}; start the {self.kind} again in another file")
         if code != sqlite3.SQLITE_NOTADB:
             return DataError(f"store {self.path} cannot be {verb}: {error}; choose another file")
-        with contextlib.suppress(OSError), self.path.open("rb") as stream:
-            if stream.read(32).startswith((b"ftlm search store 1\n", b"ftlm selection store 1\n")):
-                return DataError(
-                    f"{self.path} is a store of an earlier format; finish it with the version of ftlm that created "
-                    f"it, or start the {self.kind} again in another file"
-                )
         return self._foreign_error()
 
     def read(self) -> tuple[list[bytes], str | None]:

@@ -260,7 +260,7 @@ T = TypeVar("T", bound=SchemaRecord)
 
 
 class FileHeader(msgspec.Struct):
-    """Header of every document, which this version can read even in files of later versions."""
+    """Header of every document, which can be read in files of any version."""
 
     format: str
     schema: int
@@ -279,14 +279,14 @@ class JsonFormat(Generic[T]):
         Remedy in error messages: the kind of file to pass.
     kind
         Type of the content.
-    latest_schema
-        Latest schema that this version reads.
+    schema
+        Schema that this version reads and writes.
     """
 
     what: str
     source: str
     kind: type[T]
-    latest_schema: int
+    schema: int
 
     def read(self, path: str | os.PathLike[str]) -> T:
         """Return the content of a file.
@@ -294,49 +294,29 @@ class JsonFormat(Generic[T]):
         Raises
         ------
         DataError
-            If the file cannot be read, is too large, has another format, or is of a later version.
+            If the file cannot be read, is too large, or has another format or schema.
         """
         content = read_small_file(path, self.what, self.source, MAX_SMALL_FILE_BYTES)
         file = Path(path)
+        self._check_schema(file, content)
         try:
             return msgspec.json.decode(content, type=self.kind)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            self._check_later(file, content)
             raise DataError(
                 f"{file} is not an ftlm {self.what}: {error_text(error, MAX_NAME_CHARACTERS)}; give {self.source}"
             ) from error
 
-    def _check_later(self, file: Path, content: bytes) -> None:
-        """Raise DataError if a file that cannot be decoded comes from a later version."""
+    def _check_schema(self, file: Path, content: bytes) -> None:
+        """Raise DataError if a file of this format has another schema."""
         try:
             head = msgspec.json.decode(content, type=FileHeader)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return
-        if head.format == f"ftlm-{self.what}" and head.schema > self.latest_schema:
-            raise self._newer_version_error(file, head.schema, head.written_by)
-
-    def _newer_version_error(self, path: str | os.PathLike[str], schema: int, writer: str = "") -> DataError:
-        by = f", {short_repr(writer, MAX_NAME_CHARACTERS)}" if writer else ""
-        return DataError(
-            f"{path} is a {self.what} of a later version of ftlm{by}: it has schema {short_repr(schema)}, and this "
-            f"version, {__version__}, reads up to {self.latest_schema}; upgrade ftlm"
-        )
-
-    def check_schema(self, path: str | os.PathLike[str], read: SchemaRecord, of: int) -> None:
-        """Raise DataError if the schema number is later than this version reads, or higher than the content requires.
-
-        `of` is the smallest schema number that can represent the content.
-
-        Raises
-        ------
-        DataError
-            In these cases.
-        """
-        if read.schema > self.latest_schema:
-            raise self._newer_version_error(path, read.schema, getattr(read, "written_by", ""))
-        if not 1 <= read.schema <= of:
+        if head.format == f"ftlm-{self.what}" and head.schema != self.schema:
+            by = f" by {short_repr(head.written_by, MAX_NAME_CHARACTERS)}" if head.written_by else ""
             raise DataError(
-                f"{path} states schema {read.schema}, but its content needs schema {of}; give {self.source}"
+                f"{file} is a {self.what} of schema {short_repr(head.schema)}, written{by}, and ftlm {__version__} "
+                f"reads schema {self.schema}; read it with the version that wrote it, or write it again"
             )
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from msgspec import UNSET
 from numpy.typing import ArrayLike
 
 from ftlm import _core
@@ -296,8 +295,8 @@ def simulate_runs(model: Model, runs: Sequence[Run]) -> list[OutputSamples]:
     The time step is refined until converged. A model that was identified from pieces of runs is simulated in such
     pieces, each with its own initial terms.
     """
-    duration = UNSET if model.estimate is None else model.estimate.piece_duration
-    return [_simulate_pieces(model, [run] if duration is UNSET else run.split(duration)) for run in runs]
+    duration = None if model.estimate is None else model.estimate.piece_duration
+    return [_simulate_pieces(model, [run] if duration is None else run.split(duration)) for run in runs]
 
 
 def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:

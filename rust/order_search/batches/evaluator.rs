@@ -24,7 +24,7 @@ use crate::order_search::candidate_index::CandidateIndex;
 use crate::order_search::control::{mismatch_error, BatchPosition, Checkpoint, Control};
 use crate::order_search::grid::independent::OrderGrid;
 use crate::order_search::grid::traversal::low_discrepancy_order;
-use crate::order_search::options::{Criterion, Estimator, Options};
+use crate::order_search::options::Options;
 use crate::order_search::result::{Counts, Outcome, Part, Row, TopRows};
 use crate::parallel::pool;
 use crate::regressors::Record;
@@ -211,8 +211,7 @@ impl<'a> BatchEvaluator<'a> {
     ) -> Result<Part> {
         let CandidateIndex { lattice, options, .. } = &self.catalogue;
         let count = lattice.count();
-        let (all, length) =
-            (batch_count(count, options), batch_size(count, options, algorithm_version(count, options)));
+        let (all, length) = (batch_count(count, options), batch_size(count, options));
         let is_first = from.is_none();
         let from = from.unwrap_or_else(|| Checkpoint {
             place: BatchPosition::start(first),
@@ -316,52 +315,30 @@ const MIN_CLOSE_BOUND_CANDIDATES: u64 = 1 << 18;
 /// Maximum number of candidates with refined coefficients that are evaluated without an initial sample: one batch.
 pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 
-/// Version of the algorithm that divides and evaluates a search over this many candidates.
-#[must_use]
-pub fn algorithm_version(candidates: u64, options: &Options) -> u64 {
-    let bounded =
-        options.criterion == Criterion::OutputError || (candidates >= MIN_BOX_CANDIDATES && !options.refines());
-    if uses_close_bounds(candidates, options) {
-        7
-    } else if options.pruning && bounded && matches!(options.estimator, Estimator::MultiInnovation(_)) {
-        6
-    } else if options.pruning && bounded {
-        5
-    } else {
-        1
-    }
-}
-
 /// Whether a search over this many candidates uses close bounds.
 pub(super) fn uses_close_bounds(candidates: u64, options: &Options) -> bool {
     candidates >= MIN_CLOSE_BOUND_CANDIDATES && options.ranks_by_simulation()
 }
 
-/// Number of candidates per batch of a search, for this version of the algorithm.
-pub(super) fn batch_size(candidates: u64, options: &Options, algorithm: u64) -> u64 {
+/// Number of candidates per batch of a search.
+pub(super) fn batch_size(candidates: u64, options: &Options) -> u64 {
     if options.refines() || !options.pruning {
         BATCH_SIZE_SIMULATED
-    } else if options.ranks_by_gram_matrix() && algorithm < 3 {
-        BATCH_SIZE_GRAM
-    } else if algorithm < 2 || candidates < MIN_BOX_CANDIDATES {
-        BATCH_SIZE_BOUNDED
-    } else {
+    } else if candidates >= MIN_BOX_CANDIDATES {
         (candidates / (MIN_BOX_CANDIDATES / BATCH_SIZE_BOUNDED))
             .next_power_of_two()
             .clamp(BATCH_SIZE_BOUNDED, MAX_BATCH_SIZE)
+    } else if options.ranks_by_gram_matrix() {
+        BATCH_SIZE_GRAM
+    } else {
+        BATCH_SIZE_BOUNDED
     }
 }
 
 /// Number of batches of a search over this many candidates.
 #[must_use]
 pub fn batch_count(candidates: u64, options: &Options) -> u64 {
-    batch_count_by_version(algorithm_version(candidates, options), candidates, options)
-}
-
-/// Number of batches for an earlier version of the algorithm, whose completed batches must be read.
-#[must_use]
-pub fn batch_count_by_version(algorithm: u64, candidates: u64, options: &Options) -> u64 {
-    candidates.div_ceil(batch_size(candidates, options, algorithm))
+    candidates.div_ceil(batch_size(candidates, options))
 }
 
 /// End of each generation for this number of batches: 1, 3, 7, …

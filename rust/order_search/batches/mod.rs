@@ -5,4 +5,4 @@ mod evaluator;
 mod incumbent;
 mod vector_generation;
 
-pub use evaluator::{algorithm_version, batch_count, batch_count_by_version, generation_ends, search, BatchEvaluator};
+pub use evaluator::{batch_count, generation_ends, search, BatchEvaluator};

@@ -103,8 +103,7 @@ impl OrderTable {
     }
 }
 
-/// Return the plan of a search: number of candidates, index after the last batch of each generation, and version of the
-/// present algorithm.
+/// Return the plan of a search: number of candidates, and index after the last batch of each generation.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_plan(
@@ -113,14 +112,11 @@ pub fn search_plan(
     inputs: List<bool>,
     terms: InitialArg,
     settings: SettingsArg,
-    algorithm: Option<u64>,
-) -> PyResult<(u64, Vec<u64>, u64)> {
+) -> PyResult<(u64, Vec<u64>)> {
     let options = settings.options(terms)?;
     run_detached(py, || {
         let count = orders.lattice(&inputs)?.count();
-        let present = batches::algorithm_version(count, &options);
-        let all = batches::batch_count_by_version(algorithm.unwrap_or(present).min(present), count, &options);
-        Ok((count, batches::generation_ends(all), present))
+        Ok((count, batches::generation_ends(batches::batch_count(count, &options))))
     })
 }
 
