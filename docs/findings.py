@@ -21,11 +21,11 @@ stand for values. `docs/findings.py` writes this page from the catalogue.
 
 #: Cases whose level was changed: the level before, the code that it has today, and the reason.
 CHANGED_LEVELS = (
-    ("do not use", "free_run_grows", "a pole on the right by more than 2.33 standard errors"),
-    ("do not use", "growth_not_told", "a pole on the right, by less: 20 of 40 true integrators had one"),
+    ("do not use", "simulation_unbounded", "a pole on the right by more than 2.33 standard errors"),
+    ("do not use", "instability_not_significant", "a pole on the right, by less: 20 of 40 true integrators had one"),
     ("do not use", "plant_unstable", "pieces of the run show that the plant itself is unstable"),
-    ("do not use", "not_told_apart", "an infinite standard error"),
-    ("do not use", "numbers_correlated", "a correlation alone, which intervals include already"),
+    ("do not use", "not_separately_identifiable", "an infinite standard error"),
+    ("do not use", "parameters_correlated", "a correlation alone, which intervals include already"),
     ("do not use", "explains_little", "residuals that follow an input or are not white"),
     ("do not use", "buried_in_noise", "white residuals: the noise is larger than the signal, and nothing is missing"),
     (
@@ -45,16 +45,20 @@ CHANGED_LEVELS = (
     ("with care", "signal_constant", "no input acts: a machine at rest does not have a dead channel"),
     ("with care", "loop_found", "feedback that biases a parameter by a standard error"),
     ("with care", "loop_harmless", "feedback that biases no parameter by as much"),
-    ("with care", "loop_not_told", "commands and sweeps, for which the test is inconclusive: 223 of 370 records"),
+    (
+        "with care",
+        "feedback_inconclusive",
+        "commands and sweeps, for which the test is inconclusive: 223 of 370 records",
+    ),
     ("with care", "intervals_rough", "a property of the intervals, not a fault of the model"),
     ("with care", "constant_instead_of_past", "both describe the run; one needs fewer parameters"),
-    ("with care", "looked_like_rest", "a history was estimated, because the residuals require it"),
+    ("with care", "rest_rejected", "a history was estimated, because the residuals require it"),
     ("fact", "simulated_from_rest", "a comparison that leaves motion out is wrong at its start"),
     ("fact", "rest_assumed", "a constant input: the gain is that of an assumption"),
-    ("fact", "prior_pulls", "coefficients of an order search that its prior changes"),
+    ("fact", "prior_shifts_estimate", "coefficients of an order search that its prior changes"),
     ("none", "second_optimum", "another optimum as good, with other parameters"),
-    ("none", "noise_decides", "an order search in which noise decides the ranks"),
-    ("none", "start_not_told", "two initial conditions explain a run, with two gains"),
+    ("none", "ranking_not_significant", "an order search in which noise decides the ranks"),
+    ("none", "initial_state_not_identifiable", "two initial conditions explain a run, with two gains"),
     (
         "none",
         "other_intersample_fits",

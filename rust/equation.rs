@@ -515,7 +515,7 @@ impl Filter {
 
 /// Maximum number n of equations for which the check is done. It examines all 2^n sets of columns, so larger systems
 /// are not checked.
-const MOST_EQUATIONS: usize = 16;
+const MAX_EQUATIONS: usize = 16;
 
 /// Leading term of a polynomial entry: order, coefficient, and sum of the absolute values added to that coefficient.
 type Leading = Option<(f64, f64, f64)>;
@@ -549,7 +549,7 @@ fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading 
 /// ```
 pub fn check_regular(equations: &[Equation]) -> Result<()> {
     let n = equations.len();
-    if !(2..=MOST_EQUATIONS).contains(&n) {
+    if !(2..=MAX_EQUATIONS).contains(&n) {
         return Ok(());
     }
     let entry = |i: usize, j: usize| -> Leading {

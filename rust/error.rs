@@ -288,23 +288,23 @@ pub fn check_step(step: f64) -> Result<()> {
     }
 }
 
-/// Most points of a series or a record: a gigabyte a signal, a hundred times the longest runs, and far below 2³¹, where
-/// the tables of prime divisors end. A larger number is a mistake that would exhaust memory.
-pub const MOST_POINTS: usize = 1 << 27;
+/// Maximum number of points of a series or a record: a gigabyte a signal, a hundred times the longest runs, and far
+/// below 2³¹, where the tables of prime divisors end. A larger number is a mistake that would exhaust memory.
+pub const MAX_POINTS: usize = 1 << 27;
 
-/// Return an error for more points than [`MOST_POINTS`].
+/// Return an error for more points than [`MAX_POINTS`].
 ///
 /// # Errors
 /// [`Error::OutOfRange`].
 pub fn check_points(name: &str, m: usize) -> Result<()> {
-    if m <= MOST_POINTS {
+    if m <= MAX_POINTS {
         return Ok(());
     }
     #[allow(clippy::cast_precision_loss)]
     Err(Error::OutOfRange {
         name: name.to_owned(),
         value: m as f64,
-        range: format!("[0, {MOST_POINTS}]"),
+        range: format!("[0, {MAX_POINTS}]"),
         remedy: "use a number of points between 1 and that of the record".into(),
     })
 }
@@ -321,21 +321,21 @@ pub fn check_memory(what: impl FnOnce() -> String, bytes: usize, limit: usize) -
 }
 
 /// Maximum number of rows of a dense matrix, which then takes two gigabytes. Dense matrices serve study only.
-pub const LARGEST_DENSE: usize = 1 << 14;
+pub const MAX_DENSE_ROWS: usize = 1 << 14;
 
-/// Return an error for a dense matrix without rows or with more than [`LARGEST_DENSE`].
+/// Return an error for a dense matrix without rows or with more than [`MAX_DENSE_ROWS`].
 ///
 /// # Errors
 /// [`Error::OutOfRange`].
 pub fn check_dense(m: usize) -> Result<()> {
-    if (1..=LARGEST_DENSE).contains(&m) {
+    if (1..=MAX_DENSE_ROWS).contains(&m) {
         return Ok(());
     }
     #[allow(clippy::cast_precision_loss)]
     Err(Error::OutOfRange {
         name: "m".into(),
         value: m as f64,
-        range: format!("[1, {LARGEST_DENSE}]"),
+        range: format!("[1, {MAX_DENSE_ROWS}]"),
         remedy: "apply the operator as a series, since dense matrices of this size are too large".into(),
     })
 }

@@ -45,7 +45,7 @@ const DELAY_TOLERANCE: f64 = 1e-9;
 /// Number of rows that are computed together between two checks for a stop request.
 const BLOCK_ROWS: usize = 1 << 10;
 /// Magnitude below which a state is set to 0 at the next block, because arithmetic below 1e−308 is slow.
-const SMALLEST_STATE: f64 = 1e-290;
+const MIN_STATE: f64 = 1e-290;
 /// Number of Taylor terms of φ₂(A) for ‖A‖ ≤ 1/2.
 const TAYLOR_TERMS: i32 = 15;
 
@@ -427,7 +427,7 @@ impl Recursion<'_> {
             for (samples, gains) in out.chunks_exact_mut(rows).zip(self.read.chunks_exact(n.max(1))) {
                 add_outputs(n, gains, &history, &mut samples[begin..begin + count]);
             }
-            state.iter_mut().filter(|x| x.abs() < SMALLEST_STATE).for_each(|x| *x = 0.0);
+            state.iter_mut().filter(|x| x.abs() < MIN_STATE).for_each(|x| *x = 0.0);
         }
         Ok(out)
     }

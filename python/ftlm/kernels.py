@@ -317,7 +317,7 @@ def errors(measured: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
         return np.stack([np.sum(residuals, axis=-1), rmse, ratio, 100.0 * (1.0 - ratio)], axis=-1)
 
 
-#: Smallest eigenvalue of the correlation matrix of a candidate's columns; below it they are dependent within rounding.
+#: Minimum eigenvalue of the correlation matrix of a candidate's columns; below it they are dependent within rounding.
 MIN_CORRELATION_EIGENVALUE = 1e-12
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 BAR_DELAY_S = 1.0
 #: Work that takes longer [s] is announced with its estimated duration.
 ANNOUNCEMENT_THRESHOLD_S = 2.0
-#: Smallest width of a bar and of its label, and terminal width from which the count of candidates is shown [columns].
+#: Minimum width of a bar and of its label, and terminal width from which the count of candidates is shown [columns].
 MIN_BAR_COLUMNS, MIN_LABEL_COLUMNS, WIDE_TERMINAL_COLUMNS = 10, 12, 100
 
 

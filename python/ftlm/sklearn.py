@@ -24,7 +24,7 @@ except ImportError:
     raise ModelError("scikit-learn is not installed; pip install 'ftlm[sklearn]'") from None
 
 
-#: Largest deviation of a step of a data frame's index from the median step, relative to it.
+#: Maximum deviation of a step of a data frame's index from the median step, relative to it.
 MAX_INDEX_JITTER_SHARE = 0.02
 
 

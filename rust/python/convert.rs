@@ -15,7 +15,7 @@ use crate::expression::{DerivedSignal, Expression, Instruction};
 use crate::regressors::Record;
 
 /// Maximum number of values of a two-dimensional array: eight gigabytes.
-const MOST_VALUES: usize = 1 << 30;
+const MAX_VALUES: usize = 1 << 30;
 
 /// Record as (step, signals as rows, series of the sensor filter or None).
 #[derive(FromPyObject)]
@@ -73,9 +73,9 @@ pub fn check_size(array: &PyReadonlyArray2<'_, f64>) -> PyResult<()> {
     let [rows, columns] = [array.shape()[0], array.shape()[1]];
     check_points("rows of an array", rows)?;
     check_points("columns of an array", columns)?;
-    if rows.saturating_mul(columns) > MOST_VALUES {
+    if rows.saturating_mul(columns) > MAX_VALUES {
         let what = format!("an array of {rows} rows and {columns} columns");
-        return Err(Error::Structure { what, remedy: format!("give at most {MOST_VALUES} values at once") }.into());
+        return Err(Error::Structure { what, remedy: format!("give at most {MAX_VALUES} values at once") }.into());
     }
     Ok(())
 }
@@ -170,7 +170,7 @@ pub fn columns(array: &PyReadonlyArray2<'_, f64>) -> usize {
 
 /// Maximum number of items of a sequence that is neither a list nor a tuple. Lists and tuples are already in memory and
 /// need no limit.
-const MOST_ITEMS: usize = 1 << 24;
+const MAX_ITEMS: usize = 1 << 24;
 
 /// Vector from any Python sequence.
 #[derive(IntoPyObject)]
@@ -199,9 +199,9 @@ impl<'py, T: FromPyObjectOwned<'py>> FromPyObject<'_, 'py> for List<T> {
             return Err(PyTypeError::new_err(format!("{} is not a sequence", object.get_type().name()?)));
         }
         let length = object.len()?;
-        if length > MOST_ITEMS {
+        if length > MAX_ITEMS {
             let what = format!("a sequence of {length} items");
-            return Err(Error::Structure { what, remedy: format!("give a list, or at most {MOST_ITEMS}") }.into());
+            return Err(Error::Structure { what, remedy: format!("give a list, or at most {MAX_ITEMS}") }.into());
         }
         let mut items = Vec::new();
         for next in object.try_iter()? {

@@ -27,7 +27,7 @@ const FRICTION_SWEEPS: usize = 60;
 const RATE_ROUNDING_RATIO: f64 = 1e-12;
 
 /// Maximum number of substeps per sample. A sample with more would take seconds.
-const MOST_SUBSTEPS: f64 = 1e6;
+const MAX_SUBSTEPS: f64 = 1e6;
 
 /// Number of signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
 pub const SIGNAL_COUNT: usize = 6;
@@ -101,8 +101,8 @@ impl Arm {
             return Err(outside("horizon", horizon, "[0, ∞) s"));
         }
         let parts = (step / longest_substep - 1e-9).ceil().max(1.0);
-        if parts > MOST_SUBSTEPS {
-            return Err(outside("substeps a sample", parts, &format!("[1, {MOST_SUBSTEPS}]")));
+        if parts > MAX_SUBSTEPS {
+            return Err(outside("substeps a sample", parts, &format!("[1, {MAX_SUBSTEPS}]")));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let substeps = parts as usize;

@@ -227,7 +227,7 @@ fn outside(name: &str, value: f64, range: &str) -> Error {
 
 /// Maximum resolution of the converters in bits. With more bits the quantization step is below the rounding error of a
 /// voltage.
-const MOST_BITS: u32 = 52;
+const MAX_BITS: u32 = 52;
 
 impl Sensors {
     /// Return an error for scales, limits or ranges that are not positive, negative noise, offsets that are not finite,
@@ -254,8 +254,8 @@ impl Sensors {
         check_finite("strain_bias", &self.strain_bias)?;
         check_finite("sense_bias", &self.sense_bias)?;
         check_finite("current offset", &self.offset)?;
-        if self.bits > MOST_BITS {
-            return Err(outside("bits", f64::from(self.bits), &format!("[0, {MOST_BITS}]")));
+        if self.bits > MAX_BITS {
+            return Err(outside("bits", f64::from(self.bits), &format!("[0, {MAX_BITS}]")));
         }
         Ok(())
     }

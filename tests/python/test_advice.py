@@ -112,7 +112,7 @@ def test_feedback_is_told_from_a_command(closed, seed):
         u[k] = 0.0 if k == 0 else (gain * (reference[k] - y[k - 1]) if closed else error)
         x = decay * x + (1 - decay) / a * b * u[k]
     # A loop near its limit of stability has a tone of its own, which a command may have too.
-    said = {"loop_in_data", "loop_not_told"} & set(made(h, u, y).advice().codes)
+    said = {"loop_in_data", "feedback_inconclusive"} & set(made(h, u, y).advice().codes)
     assert bool(said) == closed
 
 
@@ -241,7 +241,7 @@ def test_advice_changes_nothing_and_takes_hostile_runs():
 
 
 #: A loop in the data, or one that a tone of its own hides.
-LOOP_CODES = {"loop_in_data", "loop_not_told"}
+LOOP_CODES = {"loop_in_data", "feedback_inconclusive"}
 
 
 @needs_data

@@ -154,7 +154,7 @@ def test_a_record_without_noise_at_a_level_has_one_optimum():
 #: True findings on the noise itself: heavy tails are outliers.
 TRUE_OF = {"outliers_dominate": ("heavy",)}
 #: Findings that state a wide interval, which is true where it covers: a slow input does not tell every number.
-OF_INTERVALS = ("number_vague", "interval_open")
+OF_INTERVALS = ("parameter_imprecise", "interval_open")
 
 
 def bounds(count: int, total: int) -> tuple[float, float]:
@@ -290,7 +290,7 @@ FAULTS = {
     "a channel that was off": ("channel_off", 0.9),
     "noise three times the signal": ("buried_in_noise", 0.7),
     "a coarse converter": ("quantised", 0.8),
-    "an unstable plant": ("free_run_grows", 0.9),
+    "an unstable plant": ("simulation_unbounded", 0.9),
 }
 
 

@@ -258,7 +258,7 @@ def test_runs_that_differ_by_a_row_of_delay_are_named(late):
         runs.append(run_of(u, y, name=f"r{k}"))
     found = ftlm.consistency(runs, ftlm.equation("D^2 y = p D y + q y + b u"))
     assert found.consistent is (not late)
-    said = [f.text for f in found.findings if f.code == "parts_differ_by_delay"]
+    said = [f.text for f in found.findings if f.code == "segments_differ_by_delay"]
     assert len(said) == late
     if late:
         assert "r0 differs by a delay: if its inputs are" in said[0]
@@ -393,14 +393,14 @@ def test_quiet_rows_of_a_slow_motion_are_refuted():
     assert rest_evidence(record, structure).rows == 15
     found = ftlm.identify(record, structure)
     assert panel_gain(found) == pytest.approx(2.0, rel=0.01)
-    assert "looked_like_rest" in codes(found)
+    assert "rest_rejected" in codes(found)
     assert "rests_at_level" not in codes(found)
     # The model says so to comparisons.
     assert found.model.structure.initial == "caputo"
     assert found.model.compare(record).fit == pytest.approx(found.fit)
     # A lag that the structure lacks refutes no rest.
     wrong = ftlm.identify(panel_record("two lags", "pulse", "level", 411), ftlm.equation(FRACTIONAL))
-    assert "looked_like_rest" not in codes(wrong)
+    assert "rest_rejected" not in codes(wrong)
     assert "rests_at_level" in codes(wrong)
 
 
@@ -451,7 +451,7 @@ def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     # A lag that the structure lacks makes a past of what a run did from rest.
     record = panel_record(name, "prbs", start, 311)
     found = ftlm.identify(record, ftlm.equation(FRACTIONAL))
-    said = [f for f in found.findings if f.code == "start_not_told"]
+    said = [f for f in found.findings if f.code == "initial_state_not_identifiable"]
     if name == "fractional":
         assert not said
         return
@@ -464,7 +464,7 @@ def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     assert "1.694 ± 0.067" in said[0].text
     assert "1.374 ± 0.049" in said[0].text
     # A start that is given is no question.
-    assert "start_not_told" not in codes(given)
+    assert "initial_state_not_identifiable" not in codes(given)
 
 
 @pytest.mark.parametrize("name", ["two lags", "fractional and a lag"])

@@ -211,7 +211,7 @@ def test_a_number_that_another_hides_is_said_and_their_ratio_holds():
     w = 2 * math.pi * np.geomspace(0.01, 1e4, 60)
     exact = circuits.warburg(w, 0.01, 0.02, 0.005, 0.8, 0.0005)
     found = ftlm.identify_frequency(ftlm.FrequencyData.from_arrays(w, noisy(exact, 0.005, 0)), words)
-    vague = {f.parameter for f in found.findings if f.code == "response_number_vague"}
+    vague = {f.parameter for f in found.findings if f.code == "response_parameter_imprecise"}
     assert "c" in vague
     assert not vague & {"alpha", "a", "r", "b"}
     assert found.values["d"] / -found.values["a"] == pytest.approx(0.0005, rel=0.15)

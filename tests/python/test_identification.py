@@ -346,14 +346,14 @@ def test_a_prior_that_decides_the_ranking_is_named(small_run):
     free = ftlm.equation("D^alpha y = a0 y + b u", initial="rest")
     grid = ftlm.order_grid(increment=0.2)
     strong = ftlm.identify(small_run, free, method=ftlm.MultiInnovation(prior_covariance=1e-4, order_grid=grid), m=256)
-    (finding,) = (f for f in strong.findings if f.code == "prior_ranks")
+    (finding,) = (f for f in strong.findings if f.code == "prior_decides_ranking")
     assert finding.text.startswith(
         "y: the prior determines the ranking of orders: with K0 = 0.0001 the error of the best candidate is "
     )
     for usual in (None, 1e8):
         method = ftlm.MultiInnovation(prior_covariance=usual, order_grid=grid)
         found = ftlm.identify(small_run, free, method=method, m=256)
-        assert not [f for f in found.findings if f.code in ("prior_ranks", "prior_pulls")]
+        assert not [f for f in found.findings if f.code in ("prior_decides_ranking", "prior_shifts_estimate")]
 
 
 def test_the_papers_prior_on_plant_a_is_named(clean_a, plants):

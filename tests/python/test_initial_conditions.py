@@ -211,7 +211,7 @@ def test_a_swing_that_passes_zero_at_the_first_row_is_not_at_rest(seed):
     assert resolve_initial_conditions(run, structure) == "rest"
     found = ftlm.identify(run, structure)
     assert found.settings["initial"] == "caputo"
-    assert "looked_like_rest" in [f.code for f in found.findings]
+    assert "rest_rejected" in [f.code for f in found.findings]
     for name, truth in (("a1", -6.0), ("a0", -9e4), ("b", 1.8e5)):
         assert abs(found.coefficients[name] - truth) < 3.5 * found.standard_errors[name]
 

@@ -192,12 +192,12 @@ def test_a_run_that_forgets_its_parameters_is_said():
         free = OutputSamples(*simulate_samples(model, run, 1, None), 1, np.zeros(1))
         return {f.code: f for f in nonlinear_findings(model, [run], [free])}
 
-    chaos = codes("D^2 y = -0.3 D^0.9 y + 1 y - 1 y^3 + 0.6 u")["run_forgets"]
+    chaos = codes("D^2 y = -0.3 D^0.9 y + 1 y - 1 y^3 + 0.6 u")["simulation_chaotic"]
     assert chaos.level == "do not use"
     assert 20 < chaos.numbers["seconds"] < 150
-    assert "run_forgets" not in codes("D^2 y = -0.3 D^0.9 y - 1 y - 1 y^3 + 0.6 u")
+    assert "simulation_chaotic" not in codes("D^2 y = -0.3 D^0.9 y - 1 y - 1 y^3 + 0.6 u")
     # A linear unstable model grows with its output.
-    assert "run_forgets" not in codes("D y = 0.1 y - 1e-9 y^3 + 0.1 u")
+    assert "simulation_chaotic" not in codes("D y = 0.1 y - 1e-9 y^3 + 0.1 u")
 
 
 def test_a_fit_to_chaotic_motion_has_no_intervals():

@@ -94,8 +94,8 @@ def test_one_of_two_orders_tells_a_run_apart():
 
 def test_a_fractional_damping_improves_the_prediction_where_the_link_has_one(fractional):
     link = fractional.deflections["theta12"]
-    assert link.verdict("fractional damping").earns is True
-    assert link.verdict("both fractional").earns is True
+    assert link.verdict("fractional damping").improves is True
+    assert link.verdict("both fractional").improves is True
     assert min(link.gains("fractional damping").values()) > 2 * MIN_FIT_GAIN
     for low, high in link.intervals("fractional damping")["mu2"].values():
         assert low < 0.4 < high
@@ -107,7 +107,7 @@ def test_a_fractional_damping_improves_the_prediction_where_the_link_has_one(fra
 @pytest.mark.slow
 def test_no_fractional_order_improves_the_prediction_where_orders_are_whole(whole):
     for verdict in whole.deflections["theta12"].verdicts:
-        assert verdict.earns is False, verdict
+        assert verdict.improves is False, verdict
 
 
 def test_fits_are_those_of_the_models_on_the_other_run(fractional):
@@ -148,10 +148,10 @@ def test_a_fit_that_failed_cannot_be_told(fractional):
     del lacking["fractional damping"]["second"]
     broken = replace(link, fits=lacking, failed={("fractional damping", "second"): "no start"})
     verdict = broken.verdict("fractional damping")
-    assert verdict.earns is None
+    assert verdict.improves is None
     assert "second → first" in verdict.words
     assert "no fit" in verdict.words
-    assert broken.verdict("both fractional").earns is True
+    assert broken.verdict("both fractional").improves is True
     assert verdict_sentence("theta12", verdict).endswith("cannot be told.")
 
 
@@ -166,7 +166,7 @@ def test_a_fit_that_is_worse_than_what_it_contains_tells_nothing(fractional):
     broken = replace(link, fits=fits)
     assert broken.worse("fractional damping") == ["first"]
     verdict = broken.verdict("fractional damping")
-    assert verdict.earns is None
+    assert verdict.improves is None
     assert "On first it fits worse than the whole orders that it contains" in verdict.words
 
 
@@ -240,7 +240,7 @@ def test_places_are_told_before_and_after_the_rate(fractional, tmp_path):
     assert page.count("θ₁₂, without the rate of the other deflection") >= 2
     said = found.to_dict()["deflections"]["theta12"]
     assert said["without_rate"] == fractional.to_dict()["deflections"]["theta12"]
-    assert [s["verdicts"]["fractional damping"]["earns"] for s in (said["without_rate"], said)] == [True, False]
+    assert [s["verdicts"]["fractional damping"]["improves"] for s in (said["without_rate"], said)] == [True, False]
     text = cross_validation_text(found)
     told = text[text.index("θ₁₂, without the rate of the other deflection:") :]
     assert "θ₁₂: a fractional order of the damping improves the prediction." in told

@@ -40,7 +40,7 @@ def test_rank_1_carries_the_verdict_of_an_identification(seed, method):
     kind = {m.name: m for m in (ftlm.MultiInnovation, ftlm.LeastSquares, ftlm.InstrumentalVariables)}[method]
     result = ftlm.identify(run, equation, method=kind(order_grid=grid))
     assert found.verdict == result.verdict
-    assert {f.code for f in result.findings} <= set(codes(found)) | {"on_edge"}
+    assert {f.code for f in result.findings} <= set(codes(found)) | {"order_on_edge"}
     assert str(found.verdict) in str(found)
 
 
@@ -50,7 +50,7 @@ def test_noise_decides_where_there_is_nothing_to_find(seed):
     noise = np.random.default_rng(seed).standard_normal(run.length)
     run = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"]}, outputs={"y": noise})
     found = ftlm.search_orders(run, ftlm.equation("D^alpha y = a y + b u"), ftlm.order_grid(0.1))
-    assert "noise_decides" in codes(found)
+    assert "ranking_not_significant" in codes(found)
     assert found.verdict.level in ("do not use", "with care")
 
 
@@ -61,7 +61,7 @@ def test_ranks_are_not_alike_where_the_run_tells_the_order():
         ftlm.order_grid(0.1),
         coefficients="least-squares",
     )
-    assert not {"noise_decides", "ranks_alike"} & set(codes(found))
+    assert not {"ranking_not_significant", "ranks_not_distinguished"} & set(codes(found))
 
 
 def test_rows_that_are_one_model_are_folded_and_counted():
@@ -70,7 +70,7 @@ def test_rows_that_are_one_model_are_folded_and_counted():
     assert len(found.table) == 20
     assert sum(count for _, count in distinct) == 20
     assert len(distinct) <= 4
-    said = next(f for f in found.findings if f.code == "rows_repeat")
+    said = next(f for f in found.findings if f.code == "table_rows_equivalent")
     assert said.numbers["models"] == len(distinct)
     # Rows of one model differ by one number added to all orders.
     first = distinct[0][0]
@@ -79,7 +79,7 @@ def test_rows_that_are_one_model_are_folded_and_counted():
         assert max(shifts) - min(shifts) < 1e-9
     assert str(found).count("\n") < 12
     fixed = ftlm.search_orders(record(3, 0.01), ftlm.equation("D^alpha y = a y + b D^gamma u"))
-    assert "rows_repeat" not in codes(fixed)
+    assert "table_rows_equivalent" not in codes(fixed)
 
 
 def test_the_command_prints_verdict_and_next_step(tmp_path, capsys):
@@ -116,7 +116,9 @@ def test_a_certificate_names_a_free_run_that_grows():
     ).model
     grows = model.stability().unstable_poles > 0
     assert grows or not proof.free_run_nr <= 0.5
-    assert [f.code for f in proof.findings] == ["certified_run_grows" if grows else "certified_run_fails"]
+    assert [f.code for f in proof.findings] == [
+        "certified_simulation_unbounded" if grows else "certified_simulation_poor"
+    ]
     assert "! the simulation" in str(proof)
 
 

@@ -249,16 +249,16 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
 def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
     orders = {"gamma1": (0.9, 0.85, 0.95), "mu2": (1.0, 0.9, 1.1)}
     better = OrderComparison("own", 1, {"y": 0.4}, {"y": 0.1}, orders, {"y": 3.0})
-    assert better.earns("y") is True
+    assert better.improves("y") is True
     # However much better it is on its own run: unseen it is not, or nothing says so.
-    assert replace(better, gains={"y": 0.1}).earns("y") is False
-    assert replace(better, gains={"y": -3.0}).earns("y") is False
-    assert replace(better, gains={}).earns("y") is None
-    assert replace(better, is_degenerate=True).earns("y") is None
+    assert replace(better, gains={"y": 0.1}).improves("y") is False
+    assert replace(better, gains={"y": -3.0}).improves("y") is False
+    assert replace(better, gains={}).improves("y") is None
+    assert replace(better, is_degenerate=True).improves("y") is None
     # An order that the run does not tell from a whole one is none, if it predicts no better.
     whole = replace(better, orders={"gamma1": (0.98, 0.9, 1.1)}, gains={"y": 0.2})
-    assert whole.earns("y") is False
-    assert replace(whole, gains={"y": 3.0}).earns("y") is None
+    assert whole.improves("y") is False
+    assert replace(whole, gains={"y": 3.0}).improves("y") is None
     data = SimpleNamespace(panel=Panel((), (), (replace(better, is_degenerate=True),)), simulated=False)
     claim = make_check(fractional_orders, data)
     assert claim.verdict == "cannot be told"
@@ -641,7 +641,7 @@ def test_threads_do_not_change_a_number(reproduction):
 def test_warnings_that_differ_in_numbers_alone_stand_together(reproduction):
     result = reproduction.stages[1].candidates["output error"].result
     little = [make_finding("explains_little", output=o, nr=nr) for o, nr in (("y1", 0.6), ("y1", 0.7), ("y2", 0.6))]
-    edge = make_finding("on_edge", parameter="alpha1", value=1.05)
+    edge = make_finding("order_on_edge", parameter="alpha1", value=1.05)
     one, two = replace(result, findings=(little[0], edge)), replace(result, findings=tuple(little[1:]))
     assert grouped_findings({"a": one, "b": two, "c": None}) == [
         "a, b: y1: the simulation explains little of the output (NR 0.6) (numbers of the first)",

@@ -339,7 +339,7 @@ def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatc
     assert (test.conclusive, test.passed, test.failed, test.verdict) == (False, False, False, "undecided")
     assert found.to_dict()["outputs"]["y"]["inputs"]["u"]["conclusive"] is False
     assert "undecided" in str(found)
-    assert "follow_undecided" in [f.code for f in residual_findings(found)]
+    assert "residual_test_inconclusive" in [f.code for f in residual_findings(found)]
     assert "undecided" in found._repr_html_()
     assert "undecided: its limit is" in residual_charts(found)[1].caption
 

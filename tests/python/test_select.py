@@ -262,7 +262,7 @@ def relaxing(alpha, noise, seed, rows=400):
     [
         (0.7, 0.01, True, "fractional_orders_gain"),
         (0.98, 0.05, True, "fractional_orders_gain_nothing"),
-        (0.7, 0.01, False, "fractional_orders_not_told"),
+        (0.7, 0.01, False, "fractional_orders_inconclusive"),
     ],
 )
 def test_fractional_orders_are_judged_on_what_was_not_fitted(alpha, noise, rival, code):
@@ -633,7 +633,7 @@ def test_blocks_that_tell_nothing_are_no_folds():
 
 def test_one_step_from_a_level_selects_the_plant():
     found = ftlm.select(heated_plate(2), "auto", threads=2)
-    assert not {"none_is_the_machine", "worse_than_mean"} & {f.code for f in found.findings}
+    assert not {"no_candidate_fits", "worse_than_mean"} & {f.code for f in found.findings}
     assert found.best.model.dcgain() == pytest.approx(0.6, rel=0.01)
 
 

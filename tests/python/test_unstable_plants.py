@@ -112,7 +112,7 @@ def test_an_equation_error_method_that_has_the_truth_is_not_refused_for_growing(
     found = ftlm.identify(run, ftlm.equation(EQUATION), method=method)
     assert found.coefficients["a"] == pytest.approx(4.0, rel=0.05)
     assert "plant_unstable_in_pieces" in codes(found)
-    assert "free_run_grows" not in codes(found)
+    assert "simulation_unbounded" not in codes(found)
     assert found.verdict.level == "with care"
     found.model.save(tmp_path / "plant.json")
     again = ftlm.load_model(tmp_path / "plant.json")
@@ -133,5 +133,5 @@ def test_a_stable_plant_whose_model_grows_is_still_refused(seed):
     )
     grows = ftlm.equation(EQUATION).with_coefficients({"a": 2.0})
     found = ftlm.identify(run, grows, method="least-squares")
-    assert "free_run_grows" in codes(found)
+    assert "simulation_unbounded" in codes(found)
     assert found.verdict.level == "do not use"

@@ -334,7 +334,7 @@ def test_a_validation_on_fitted_rows_is_with_care():
     clean, partly = found.validate(run.window(10, 20)), found.validate(run.window(5, 15))
     assert clean.verdict.trusted
     assert not partly.verdict.trusted
-    (shared,) = (f for f in partly.findings if f.code == "validates_partly_itself")
+    (shared,) = (f for f in partly.findings if f.code == "estimation_rows_repeated")
     assert (shared.numbers["count"], shared.numbers["rows"]) == (250, 500)
     # The state at the start of a run in motion is estimated on it, and the summary says so.
     terms = sum(map(len, clean.initial[0].values()))

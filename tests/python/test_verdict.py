@@ -97,8 +97,8 @@ def test_a_validation_that_leaves_much_more_is_with_care(found, checked):
 @pytest.mark.parametrize(
     "doubt",
     [
-        make_finding("input_number_not_told", parameter="delay_u", words="delay of u"),
-        make_finding("stribeck_slow_untold", output="y", ratio=2.0, speed=1.0, slow=0, total=9),
+        make_finding("input_parameter_not_identifiable", parameter="delay_u", words="delay of u"),
+        make_finding("slow_motion_missing", output="y", ratio=2.0, speed=1.0, slow=0, total=9),
         make_finding("reference_weak", input="u", reference="r", f=2.0, needed=10.0),
     ],
 )
@@ -243,7 +243,7 @@ def test_rough_intervals_are_a_fact(found, checked):
 
 #: Findings as fits give them: facts, one of weight.
 ROUGH = make_finding("intervals_rough", parameter="a0")
-TIED = make_finding("numbers_correlated", parameter="a0 and b0", why="correlation 0.9960")
+TIED = make_finding("parameters_correlated", parameter="a0 and b0", why="correlation 0.9960")
 BOUND = make_finding("on_bound", parameter="alpha", what="order alpha", value="2")
 
 
@@ -463,9 +463,9 @@ def test_remedies_know_the_method():
 def test_findings_are_grouped_the_most_serious_first():
     said = [
         make_finding("output_not_white", output="theta11", statistic=3.0, lags=25, limit=2.0),
-        make_finding("on_edge", parameter="alpha", value=1.6),
+        make_finding("order_on_edge", parameter="alpha", value=1.6),
         make_finding("residuals_follow_input", output="theta11", input="I1", value=0.3, lag=1, limit=0.1),
-        make_finding("free_run_grows", stability="not stable: 1 pole", poles="1 pole"),
+        make_finding("simulation_unbounded", stability="not stable: 1 pole", poles="1 pole"),
         make_finding("data_note", run="r", text="time read in ms, as the header 'time [ms]' says"),
     ]
     found = group_findings([*said, said[0]])
@@ -481,7 +481,7 @@ def test_findings_are_grouped_the_most_serious_first():
 
 def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
     many = (
-        *(make_finding("prior_pulls", output="y", prior=k, share=3.0, length=7) for k in range(3)),
+        *(make_finding("prior_shifts_estimate", output="y", prior=k, share=3.0, length=7) for k in range(3)),
         BOUND,
         make_finding("coefficient_law_broken", parameter="a", value=1.0, wanted=2.0),
         make_finding("quantised", run="r", output="y", step=1.0, noise=0.1),
@@ -616,7 +616,7 @@ def test_an_integrator_is_no_growth_by_chance():
         found = ftlm.identify(integrator_record(seed), ftlm.equation("D y = a0 y + b u"))
         positive += found.coefficients["a0"] > 0
         codes = [f.code for f in found.findings]
-        assert ("growth_not_told" in codes) == (found.coefficients["a0"] > 0)
+        assert ("instability_not_significant" in codes) == (found.coefficients["a0"] > 0)
         assert found.verdict.level == "with care"
         assert saved_verdict(found.model, []).level == "with care"
     assert positive >= 2
@@ -646,13 +646,13 @@ def test_a_spring_that_pushes_grows():
     for seed in range(4):
         found = ftlm.identify(double_integrator_record(seed, -0.25), ftlm.equation("D^2 y = a1 D y + a0 y + b u"))
         assert found.verdict.level == "do not use"
-        assert "free_run_grows" in [f.code for f in found.findings]
+        assert "simulation_unbounded" in [f.code for f in found.findings]
 
 
 def test_a_pole_that_grows_is_still_found():
     found = ftlm.identify(integrator_record(1, pole=0.15), ftlm.equation("D y = a0 y + b u"))
     assert found.verdict.level == "do not use"
-    assert "free_run_grows" in [f.code for f in found.findings]
+    assert "simulation_unbounded" in [f.code for f in found.findings]
     assert saved_verdict(found.model, []).level == "do not use"
 
 

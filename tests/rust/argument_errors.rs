@@ -1,7 +1,7 @@
 //! Arguments that would cause a panic, a hang or exhausted memory return an error at once.
 
 use ftlm::equation::{tidy, AffineOrder, Equation, Filter, Initial, Structure, Term};
-use ftlm::error::{check_dense, check_points, Error, MOST_POINTS};
+use ftlm::error::{check_dense, check_points, Error, MAX_POINTS};
 use ftlm::estimation::instrumental_variables;
 use ftlm::estimation::joint_fit::parameter_set::ParameterSet;
 use ftlm::estimation::joint_fit::{structure as joint, Problem};
@@ -36,7 +36,7 @@ fn refused<T>(result: Result<T, Error>) {
 
 #[test]
 fn lengths_beyond_memory() {
-    for m in [MOST_POINTS + 1, 1 << 31, 1 << 60, usize::MAX] {
+    for m in [MAX_POINTS + 1, 1 << 31, 1 << 60, usize::MAX] {
         refused(check_points("m", m));
         refused(check_dense(m));
         refused(pulse_means(&[0.0, 1.0], m, Intersample::Hold));
@@ -46,7 +46,7 @@ fn lengths_beyond_memory() {
         refused(operational_matrices::operational_matrix(0.5, m, 0.1));
     }
     refused(check_dense(0));
-    check_points("m", MOST_POINTS).unwrap();
+    check_points("m", MAX_POINTS).unwrap();
 }
 
 #[test]

@@ -30,7 +30,7 @@ BAND_EXTENSION_FACTOR = 100.0
 #: Distance of a pole from the imaginary axis, relative to the lower end of the band, below which it is on the axis.
 ORIGIN_POLE_RATIO = 1e-3
 #: Maximum order of Oustaloup's filter. Beyond it neighboring zeros and poles nearly cancel.
-LARGEST_ORDER = 50
+MAX_APPROXIMATION_ORDER = 50
 #: Order of the Padé approximation of a delay.
 PADE_ORDER = 4
 
@@ -56,7 +56,7 @@ class Approximation:
     order
         Order of Oustaloup's filter; each fractional operator has 2 order + 1 poles.
     gain_error, phase_error
-        Largest gain error [dB] and phase error [degrees] over the band, by output and input.
+        Maximum gain error [dB] and phase error [degrees] over the band, by output and input.
     stable
         Whether the approximation is stable.
     warnings
@@ -205,7 +205,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     low, high = frequency_pair(band)
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is not an interval; give 0 < low < high")
-    count = check_integer("order", order, 1, LARGEST_ORDER)
+    count = check_integer("order", order, 1, MAX_APPROXIMATION_ORDER)
     check_linear(model.equations, "a linear system in state space")
     check_no_input_nonlinearity(model, "a linear system in state space")
     delays = model.structure.delay

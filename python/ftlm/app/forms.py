@@ -433,7 +433,7 @@ def _text(texts: Mapping[str, Any], name: str) -> str:
 
 #: Outputs and inputs for which structures are suggested; longer lists are not readable.
 MAX_SUGGESTED_SIGNALS = 6
-#: Largest delay that is searched where one is suggested, as a share of the run.
+#: Maximum delay that is searched where one is suggested, as a share of the run.
 MAX_DELAY_SHARE = 0.1
 
 

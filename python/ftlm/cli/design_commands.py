@@ -94,7 +94,7 @@ def control(
     rate
         Sampling rate of the loop [Hz].
     limit
-        Largest command; default none.
+        Maximum command; default none.
     path : SIZE:SECONDS
         Plan a smooth move of --output of this size.
     trajectory : FILE
@@ -260,11 +260,11 @@ def design_input(
     duration
         Length of the run [s].
     peak : A or INPUT=A
-        Largest absolute value of each input, or of one.
+        Maximum absolute value of each input, or of one.
     slew : A or INPUT=A
-        Largest rate of change of an input [1/s]; default none.
+        Maximum rate of change of an input [1/s]; default none.
     limits : OUTPUT=A
-        Largest absolute value of an output, or inf.
+        Maximum absolute value of an output, or inf.
     parameters : NAME
         Parameter of interest; default every free order.
     criterion

@@ -86,7 +86,7 @@ def resid(
     Options
     -------
     lags
-        Largest lag in samples.
+        Maximum lag in samples.
     """
     loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     tests = loaded.resid(runs, lags=lags)

@@ -110,7 +110,7 @@ def reproduce(
     records
         Records per arm, with different noise.
     rivals_increment
-        Smallest order increment of the comparison with the GA.
+        Minimum order increment of the comparison with the GA.
     """
     if save is not None:
         check_folder(Path(save), ALWAYS_SAVED, force=force)

@@ -239,7 +239,7 @@ def record(
         print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
         result = live.identify(run, stream)
         if result is not None:
-            prior = [f"! {finding}" for finding in result.findings if finding.code == "prior_pulls"]
+            prior = [f"! {finding}" for finding in result.findings if finding.code == "prior_shifts_estimate"]
             print(f"live: {result.verdict}", *prior, sep="\n", file=sys.stderr)
     if as_json:
         summary = {"written": out, "rows": run.length, "step": run.step, "about": run.metadata}

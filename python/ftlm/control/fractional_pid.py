@@ -16,7 +16,7 @@ from ftlm.analysis.frequency_response import (
     parameter_vector,
     response_inputs,
 )
-from ftlm.analysis.rational_approximation import LARGEST_ORDER, oustaloup
+from ftlm.analysis.rational_approximation import MAX_APPROXIMATION_ORDER, oustaloup
 from ftlm.control.arguments import check_limit, check_samples, checked_rate
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of, nyquist_frequencies
 from ftlm.errors import ModelError
@@ -38,7 +38,7 @@ from ftlm.utils.validation import (
 
 #: Poles extend this factor beyond the band on both sides.
 POLE_RANGE_FACTOR = 30.0
-#: Largest ratio of the band's ends.
+#: Maximum ratio of the band's ends.
 MAX_BAND_RATIO = 1e9
 #: Number of frequencies at which the approximation error is measured.
 ERROR_FREQUENCIES = 200
@@ -166,12 +166,12 @@ class DiscretePid:
                 "upper end "
                 f"is at most {MAX_BAND_RATIO:g} times the lower"
             )
-        count = check_integer("order", order, 1, LARGEST_ORDER)
+        count = check_integer("order", order, 1, MAX_APPROXIMATION_ORDER)
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
         reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
         self._derivative = _bank(pid.kd, *_power(pid.mu, reach, count), 1.0 / value)
-        #: Largest errors over the band against the exact controller [dB], [degrees].
+        #: Maximum errors over the band against the exact controller [dB], [degrees].
         self.gain_error, self.phase_error = self._errors()
         if not math.isfinite(self.gain_error + self.phase_error):
             raise ModelError(f"{pid} has no finite response in its band; give finite gains, at least one of them not 0")
@@ -309,9 +309,9 @@ COMPARISON_FREQUENCIES = 300
 TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE = 1.5, 1.05
 #: Frequency of the low-frequency gain, as a share of the crossover; that gain rejects friction and offsets.
 LOW_FREQUENCY_SHARE = 0.1
-#: Largest share of parameter samples whose requirements the design may violate.
+#: Maximum share of parameter samples whose requirements the design may violate.
 MAX_BROKEN_SHARE = 0.05
-#: Smallest phase margin of a sample as a share of the requested one.
+#: Minimum phase margin of a sample as a share of the requested one.
 MIN_PHASE_MARGIN_SHARE = 0.5
 #: Lowest crossover as a share of the rate; below, margins are not computable in floating point.
 MIN_CROSSOVER_SHARE = 1e-6

@@ -22,7 +22,7 @@ from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, che
 
 #: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
 SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
-#: Largest residual vibration over the confidence intervals of the poles.
+#: Maximum residual vibration over the confidence intervals of the poles.
 MAX_RESIDUAL_VIBRATION = 0.2
 #: Longest shaper [samples], and range of its poles [rad/s].
 MAX_SHAPER_SAMPLES = 1 << 22
@@ -46,7 +46,7 @@ class Shaper:
     times, amplitudes
         Times [s] and amplitudes of the impulses in continuous time.
     worst
-        Largest residual vibration within the 95 % intervals of the modes; None without intervals.
+        Maximum residual vibration within the 95 % intervals of the modes; None without intervals.
     """
 
     kind: str

@@ -21,13 +21,13 @@ from ftlm.utils.validation import Complex, Floats, as_array, real_number, short_
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
 #: continuation, which the fading memory of a fractional model would never forget.
 TRANSFORM_LENGTH_FACTOR, WEIGHT_DECAY = 8, 28.0
-#: Largest reference relative to the move; larger ones are unstable.
+#: Maximum reference relative to the move; larger ones are unstable.
 MAX_REFERENCE_RATIO = 20.0
 #: Longest path [samples].
 MAX_PATH_ROWS = 100_000
-#: Largest initial offset of a reference relative to the move; above, the path needs a longer dwell before the move.
+#: Maximum initial offset of a reference relative to the move; above, the path needs a longer dwell before the move.
 MAX_INITIAL_OFFSET_SHARE = 1e-3
-#: Largest residual vibration relative to that of the path as reference; above, the uncertainty is too large.
+#: Maximum residual vibration relative to that of the path as reference; above, the uncertainty is too large.
 MAX_RESIDUAL_SHARE = 0.5
 
 

@@ -249,7 +249,7 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
     return tuple(out)
 
 
-#: Largest sensitivity of an acceptable design: phase margin of at least 19 degrees, gain margins of at least 1.5.
+#: Maximum sensitivity of an acceptable design: phase margin of at least 19 degrees, gain margins of at least 1.5.
 MAX_SENSITIVITY = 3.0
 #: Number of frequencies of a Nyquist curve, and its start relative to the band.
 CURVE_POINTS, BAND_EXTENSION = 2500, 1e-2
@@ -473,7 +473,7 @@ def lqg(
         Process noise intensity; see :func:`observer`. The default is a fifth of `max_input`. Larger values give a
         faster observer and more noise in the command.
     limit
-        Largest command.
+        Maximum command.
     samples, seed
         Number of parameter samples from the covariance, 0 to 10000, and their seed.
 

@@ -28,16 +28,16 @@ from ftlm.utils.validation import (
 
 #: Number of fitted frequencies; the error is also evaluated between them.
 FIT_FREQUENCIES = 120
-#: Most iterations of pole relocation, and relative change of converged poles.
+#: Maximum number of iterations of pole relocation, and relative change of converged poles.
 MAX_POLE_ITERATIONS, POLE_TOLERANCE = 30, 1e-6
-#: Smallest contribution of a pole, relative to every output at every frequency; smaller ones are dropped.
+#: Minimum contribution of a pole, relative to every output at every frequency; smaller ones are dropped.
 MIN_POLE_CONTRIBUTION = 1e-6
 #: Poles closer to 0 than this share of the band's lower end are integrators.
 INTEGRATOR_BAND_SHARE = 1e-3
 #: Target errors of gain [dB] and phase [degrees], and range of the number of poles.
 GAIN_DB, PHASE_DEGREES = 0.1, 1.0
 MIN_POLES, MAX_POLES = 2, 30
-#: Largest errors of a realization that a design may use.
+#: Maximum errors of a realization that a design may use.
 COARSE_DB, COARSE_DEGREES = 1.0, 6.0
 
 
@@ -59,7 +59,7 @@ class Realisation:
     a, b, c
         Discrete-time state space: x' = a x + b u, y = c x.
     gain_error, phase_error
-        Largest gain error [dB] and phase error [degrees] of each output over the band, relative to the exact response.
+        Maximum gain error [dB] and phase error [degrees] of each output over the band, relative to the exact response.
     """
 
     outputs: tuple[str, ...]

@@ -38,7 +38,7 @@ class Margins:
     crossover
         Highest frequency with abs(L) = 1 [rad/s]; NaN without one.
     phase
-        Smallest phase margin over all crossovers [degrees].
+        Minimum phase margin over all crossovers [degrees].
     gain
         Gain margin: smallest factor by which an increase or decrease of the loop gain makes L = -1 at some frequency.
     sensitivity

@@ -395,7 +395,7 @@ def describe_resampled_signals(behaviour: Mapping[str, Intersample], *, keep_tim
 #: Treatment of missing samples: raise, give outputs no weight, or hold inputs as well.
 MissingPolicy = Literal["refuse", "weight", "hold"]
 MISSING_POLICIES: tuple[MissingPolicy, ...] = ("refuse", "weight", "hold")
-#: Largest distance from a grid point, in steps, of samples on a regular grid with gaps.
+#: Maximum distance from a grid point, in steps, of samples on a regular grid with gaps.
 GRID_TOLERANCE_STEPS = 0.02
 #: Relative tolerance of comparisons of times, as a share of the duration.
 _RELATIVE_TIME_TOLERANCE = 1e-12
@@ -526,7 +526,7 @@ def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> st
     return f"{thing}: {count} of {is_missing.size} {rows} no value, the first is row {first}; {what}"
 
 
-#: Largest delay that is searched by default, in samples and as a share of a run.
+#: Maximum delay that is searched by default, in samples and as a share of a run.
 MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
 
 

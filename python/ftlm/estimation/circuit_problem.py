@@ -20,9 +20,9 @@ from ftlm.utils.validation import Complex, Floats
 START_POINTS, RATIO_DECADES = 400, 2.0
 #: Range of an exponent, of which the lower end keeps elements apart from resistors; range of exponents of the guesses.
 MIN_EXPONENT, START_EXPONENTS = 0.05, (0.6, 1.0)
-#: Smallest and largest parameter in SI units.
+#: Minimum and maximum parameter in SI units.
 PARAMETER_RANGE = (1e-18, 1e18)
-#: Largest half-width of an interval of a logarithm: beyond it a parameter is not identifiable.
+#: Maximum half-width of an interval of a logarithm: beyond it a parameter is not identifiable.
 MAX_LOG_WIDTH = 700.0
 
 

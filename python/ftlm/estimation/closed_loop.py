@@ -26,7 +26,7 @@ BLOCK_GROWTH_FACTOR = 1.5
 #: samples are averaged over blocks of growing width.
 DENSE_LAG_COUNTS = (3, 6, 12, 25, 50, 100)
 MIN_ROWS_PER_LAG = 15
-#: Smallest first-stage F statistic of a strong instrument (Staiger and Stock, doi:10.2307/2171753).
+#: Minimum first-stage F statistic of a strong instrument (Staiger and Stock, doi:10.2307/2171753).
 MIN_FIRST_STAGE_F = 10.0
 
 

@@ -28,13 +28,13 @@ Intervals = Literal["auto", "quadratic", "profile"]
 DEFAULT_INTERVAL_LEVEL = 0.95
 #: A lower optimum is reported if the residuals of an output fall by this fraction.
 MIN_NOISE_REDUCTION = 1e-3
-#: Largest number of restarts from a lower optimum found by the interval search.
+#: Maximum number of restarts from a lower optimum found by the interval search.
 MAX_RESTARTS = 2
 #: Budget of block pulses for profiles under intervals="auto", and fewest simulations with which a bound is started.
 #: With free orders a pulse costs FREE_ORDER_COST_FACTOR times as much.
 MAX_AUTO_PULSES, MIN_INITIAL_BUDGET_PER_BOUND = 6_000_000, 20
 FREE_ORDER_COST_FACTOR = 3
-#: Largest number of evaluations of the descent to the optimum around which intervals are searched.
+#: Maximum number of evaluations of the descent to the optimum around which intervals are searched.
 MAX_DESCENT_EVALUATIONS = 120
 
 

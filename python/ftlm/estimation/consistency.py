@@ -31,7 +31,7 @@ from ftlm.validation.comparison import compare
 DEFAULT_SEGMENTS = 2
 #: Table entries for the comparison of two intervals.
 DISJOINT_TEXT, OVERLAP_TEXT, NOT_IDENTIFIABLE_TEXT = "disjoint", "overlap", "not identifiable"
-#: Largest ratio of an interval bound to the Wald bound for which the covariance is used.
+#: Maximum ratio of an interval bound to the Wald bound for which the covariance is used.
 MAX_ASYMMETRY_RATIO = 2.0
 #: Runs differ by a delay if inputs shifted by at most so many rows leave less than this share of the residuals of
 #: another run's model, and little more than the run's own model leaves.
@@ -155,13 +155,13 @@ class Consistency(ReportMixin):
         """Findings that limit the conclusion: first on parameters that are not identifiable, then on each segment."""
         out = []
         if self.not_identifiable and self.consistent is not None:
-            out.append(make_finding("not_told_by_part", parameter=", ".join(self.not_identifiable)))
+            out.append(make_finding("not_identifiable_from_segment", parameter=", ".join(self.not_identifiable)))
         for name, result in zip(self.names, self.results, strict=True):
             if result.joint is not None and not result.joint.converged:
-                out.append(make_finding("part_not_converged", run=name))
+                out.append(make_finding("segment_not_converged", run=name))
         out += self.delays
         if any(f.code == "residuals_not_white" for r in self.results for f in r.findings):
-            out.append(make_finding("parts_not_white"))
+            out.append(make_finding("segments_not_white"))
         return tuple(out)
 
     @property
@@ -384,7 +384,7 @@ def _delay_findings(names: Sequence[str], pieces: Sequence[Run], results: Sequen
             ):
                 text = f"{abs(rows)} row{'s' if abs(rows) > 1 else ''} {'later' if rows > 0 else 'earlier'}"
                 numbers = {"before": misfit_before, "after": misfit_after, "other": names[j], "shown": text}
-                findings.append(make_finding("parts_differ_by_delay", run=names[k], output=output, **numbers))
+                findings.append(make_finding("segments_differ_by_delay", run=names[k], output=output, **numbers))
     return findings
 
 

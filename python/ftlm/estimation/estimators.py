@@ -46,13 +46,13 @@ from ftlm.validation.comparison import compare_means
 #: Maximum number of Gauss-Newton steps, and of halvings of one step.
 MAX_GAUSS_NEWTON_STEPS = 40
 MAX_STEP_HALVINGS = 6
-#: Largest step of a converged fit, in standard errors of each parameter.
+#: Maximum step of a converged fit, in standard errors of each parameter.
 STEP_TOLERANCE_ERRORS = 1e-3
 #: Relative size below which a singular direction of the instruments is rounding.
 INSTRUMENT_RANK_TOLERANCE = 1e-12
 #: Score of the best candidate under a prior, relative to that of a zero output, that is not reported.
 MAX_PRIOR_SCORE_RATIO = 0.5
-#: Fewest pulses per sampling interval. The estimates are those of one grid.
+#: Minimum number of pulses per sampling interval. The estimates are those of one grid.
 MIN_PULSES_PER_SAMPLE = 2
 
 
@@ -162,7 +162,7 @@ def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
     return _core.long_run_covariance(influence, series)
 
 
-#: Largest number of block pulses per run for the final instrumental-variable fit if m is not given.
+#: Maximum number of block pulses per run for the final instrumental-variable fit if m is not given.
 MAX_IV_PULSES = 1 << 14
 
 
@@ -229,7 +229,7 @@ def estimate_output_error(
     if start == "rest" and joint.initial != "rest":
         # A comparison would otherwise assume rest from the first value alone.
         structure = request = replace(structure, initial="history")
-        findings.append(make_finding("looked_like_rest", run=", ".join(r.name for r in task.runs)))
+        findings.append(make_finding("rest_rejected", run=", ".join(r.name for r in task.runs)))
     coefficients = problem.coefficients_by_name(list(joint.coefficients.values()))
     # On another run the initial conditions are determined again.
     identified = request.with_orders(joint.orders).with_coefficients(coefficients)
@@ -321,7 +321,7 @@ def fit_at_best_orders(
             *prior_findings(task, settings, m, searches),
             *step_bias_findings(task.runs, at_orders, settings, fit),
             *coefficient_law_findings(model),
-            *(make_finding("on_edge", parameter=n, value=v) for n, v in edges),
+            *(make_finding("order_on_edge", parameter=n, value=v) for n, v in edges),
         ],
         dict(searches),
         errors,
@@ -348,7 +348,9 @@ def prior_findings(
         still = np.abs(outputs).sum() if settings.norm == "l1" else np.sqrt(np.mean(outputs**2))
         share = search.score / float(still)
         if share > MAX_PRIOR_SCORE_RATIO:
-            findings.append(make_finding("prior_ranks", output=output, prior=settings.prior_covariance, share=share))
+            findings.append(
+                make_finding("prior_decides_ranking", output=output, prior=settings.prior_covariance, share=share)
+            )
     return findings
 
 

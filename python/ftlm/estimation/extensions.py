@@ -50,23 +50,23 @@ from ftlm.validation.residual_tests import (
     sign_tanh_slope,
 )
 
-#: Smallest decrease of the Schwarz criterion that is reported. A decrease of 10 is very strong evidence (Kass and
+#: Minimum decrease of the Schwarz criterion that is reported. A decrease of 10 is very strong evidence (Kass and
 #: Raftery, doi:10.1080/01621459.1995.10476572). Three times that is asked, because the best of several is chosen.
 MIN_CRITERION_DECREASE = 30.0
-#: Smallest further decrease of the criterion at which an extension replaces one above it in the list. Some give the
+#: Minimum further decrease of the criterion at which an extension replaces one above it in the list. Some give the
 #: same samples, for example feedthrough of a first-order plant and an input that was logged one row late.
 MIN_CRITERION_GAP = 10.0
 #: Total number of samples to which extensions are fitted, from the start of each run.
 MAX_EXTENSION_SAMPLES = 6000
-#: Smallest share of a run before and after a load step.
+#: Minimum share of a run before and after a load step.
 MIN_LOAD_SHARE = 0.05
 #: Maximum number of searches of the row of a load step from one fit.
 MAX_LOAD_SEARCHES = 4
 #: Share of the power of a load step that the parameters do not explain, below which it is collinear with them.
 LOAD_COLLINEARITY_TOLERANCE = 1e-6
-#: Smallest saturation limit that is tried, as a share of the largest value of an input.
+#: Minimum saturation limit that is tried, as a share of the largest value of an input.
 MIN_SATURATION_SHARE = 0.05
-#: Largest dead zone that is tried, as a share of the largest value of an input.
+#: Maximum dead zone that is tried, as a share of the largest value of an input.
 MAX_DEAD_ZONE_SHARE = 0.9
 #: Initial guesses of a saturation or dead zone, as shares of the largest value of an input.
 LIMIT_GUESS_SHARES = (0.25, 0.6)
@@ -76,7 +76,7 @@ LOCAL_FRICTION_SHARE = 0.02
 MIN_CHANGING_SHARE = 0.5
 #: Intersample behavior as text.
 INTERSAMPLE_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
-#: Smallest difference of an estimated delay from that of the structure that is reported, in standard errors.
+#: Minimum difference of an estimated delay from that of the structure that is reported, in standard errors.
 MIN_DELAY_CHANGE_SIGMAS = 3.0
 #: Initial conditions and offsets of the fits with which a fit is compared.
 ALTERNATIVE_INITIAL_CONDITIONS: tuple[tuple[Initial, Offset], ...] = (
@@ -681,7 +681,7 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
                 numbers = {"gain": own_gain, "error": own_error, "other_gain": gain, "other_error": error}
                 words = {"taken": _name_start(*own_setting), "other": _name_start(initial, offset), "ratio": ratio}
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
-                worst = distance, make_finding("start_not_told", **about, **numbers, **words)
+                worst = distance, make_finding("initial_state_not_identifiable", **about, **numbers, **words)
     return [worst[1]] if worst else []
 
 

@@ -41,11 +41,11 @@ from ftlm.utils.validation import Floats, as_floats, check_known, real_number
 from ftlm.validation.information_criteria import InformationCriteria, criteria_of_likelihood
 
 Weights = Literal["auto", "relative", "uniform", "deviation"]
-#: Largest relative difference of the sums of squares of one and the same optimum.
+#: Maximum relative difference of the sums of squares of one and the same optimum.
 SAME_OPTIMUM_TOLERANCE = 1e-6
 #: Relative size of the residuals below which they are rounding.
 RESIDUAL_FLOOR_RATIO = 1e-13
-#: Largest number of frequencies of a record in the multistart.
+#: Maximum number of frequencies of a record in the multistart.
 MAX_MULTISTART_FREQUENCIES = 800
 #: Fractions of the progress at which the initial guesses are found, and at which the multistart ends.
 STARTS_END_FRACTION, MULTISTART_END_FRACTION = 0.25, 0.85
@@ -593,12 +593,12 @@ def _identifiability_findings(problem: ResponseProblem, values: Floats, standard
     unidentifiable = [n for n, e in standard.items() if not math.isfinite(e)]
     out = []
     if unidentifiable:
-        out.append(make_finding("response_not_told_apart", parameter=", ".join(unidentifiable)))
+        out.append(make_finding("response_not_separately_identifiable", parameter=", ".join(unidentifiable)))
     for name, value in zip(problem.names, values.tolist(), strict=True):
         error = standard[name]
         vague = error > 0.25 if name in problem.orders else error > 0.5 * abs(value)
         if math.isfinite(error) and vague:
-            out.append(make_finding("response_number_vague", parameter=name, value=value, error=error))
+            out.append(make_finding("response_parameter_imprecise", parameter=name, value=value, error=error))
     return out
 
 

@@ -180,7 +180,7 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> L
     )
 
 
-#: Largest relative error of a usable model.
+#: Maximum relative error of a usable model.
 MAX_RELATIVE_ERROR = 0.5
 #: A validation is worse if its error exceeds this multiple of the estimation error and this relative error.
 VALIDATION_ERROR_RATIO, MIN_VALIDATION_ERROR = 3.0, 0.02

@@ -45,15 +45,15 @@ PARENT_FRACTION = 0.25
 CROSSOVER_DISTRIBUTION_INDEX, MUTATION_DISTRIBUTION_INDEX, CROSSOVER_PROBABILITY = 15.0, 20.0, 0.9
 #: Copies of parents are not evaluated again. The number of generations may exceed the nominal one by this factor.
 MAX_GENERATION_FACTOR = 4
-#: Most seeds of one fit.
+#: Maximum number of seeds of one fit.
 MAX_SEEDS = 1000
 #: Range of the time estimate, relative to the first generation: most later candidates are abandoned early.
 DURATION_FACTOR_RANGE = (0.1, 1.5)
 #: Fitness of candidates that diverge or cannot become parents. PyGAD accepts finite numbers only.
 INFEASIBLE_FITNESS = -1e300
-#: Largest ratio of the final errors of two seeds. Above it some seeds have missed the optimum.
+#: Maximum ratio of the final errors of two seeds. Above it some seeds have missed the optimum.
 MAX_SEED_ERROR_RATIO = 1.2
-#: Largest number of evaluations used without an explicit request: an order grid under an order law has millions.
+#: Maximum number of evaluations used without an explicit request: an order grid under an order law has millions.
 MAX_DEFAULT_EVALUATIONS = 1_000_000
 
 

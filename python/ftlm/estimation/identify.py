@@ -98,7 +98,7 @@ MOTION_OFFSETS: tuple[Literal["none"], Literal["level"]] = ("none", "level")
 LEVEL_DEVIATIONS = 3.0
 #: Residuals of an output, in its standard deviations, from which on a fit has failed.
 MAX_RESIDUAL_SHARE = 0.5
-#: Largest number of samples with which an offset is tested without request: the test stores a sensitivity of each
+#: Maximum number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
 
@@ -265,7 +265,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
     if candidate is None:
         return None
     whole = hypotheses.take(*candidate)
-    start_finding = make_finding("looked_like_rest", run=", ".join(r.name for r in runs))
+    start_finding = make_finding("rest_rejected", run=", ".join(r.name for r in runs))
     return replace(whole, findings=[*whole.findings, start_finding])
 
 
@@ -595,7 +595,7 @@ def assess_fit(fit: Fit) -> Identification:
         + stribeck_findings(model, runs, free)
         + nonlinear_findings(model, runs, free)
     )
-    if fit.joint is not None and any(f.code == "run_forgets" for f in findings):
+    if fit.joint is not None and any(f.code == "simulation_chaotic" for f in findings):
         # The cost is nowhere quadratic, and a profile follows one of its many minima.
         unknown = np.diag(np.full(len(fit.joint.names), np.inf))
         fit = replace(fit, joint=replace(fit.joint, covariance=unknown, profiles={}))

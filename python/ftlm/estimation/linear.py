@@ -41,11 +41,11 @@ from ftlm.utils.validation import Floats, check_integer
 #: the iteration has converged.
 MAX_IV_ITERATIONS = 40
 IV_RELATIVE_TOLERANCE = 1e-8
-#: Largest relative change of a coefficient by the prior covariance that is not reported.
+#: Maximum relative change of a coefficient by the prior covariance that is not reported.
 MAX_PRIOR_SHIFT = 0.05
 #: Fewest block pulses with which the effect of the step is estimated.
 MIN_STEP_TEST_PULSES = 32
-#: Largest discretization bias of a coefficient, in standard errors, that is not reported.
+#: Maximum discretization bias of a coefficient, in standard errors, that is not reported.
 MAX_STEP_BIAS_ERRORS = 0.5
 
 
@@ -193,7 +193,7 @@ def _prior_findings(output: str, raw: list[float], weak: list[float], settings: 
     if worst <= MAX_PRIOR_SHIFT:
         return []
     numbers = {"prior": settings.prior_covariance, "share": 100 * min(worst, 9.99)}
-    return [make_finding("prior_pulls", output=output, length=settings.innovation_length, **numbers)]
+    return [make_finding("prior_shifts_estimate", output=output, length=settings.innovation_length, **numbers)]
 
 
 @dataclass(frozen=True)

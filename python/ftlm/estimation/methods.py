@@ -44,7 +44,7 @@ from ftlm.utils.statistics import autoregression
 from ftlm.utils.validation import Floats, check_choice, check_threads
 from ftlm.validation.residual_tests import DEFAULT_LAGS
 
-#: Largest number of alternations of model and noise model, and largest change of a parameter of a converged one, in
+#: Maximum number of alternations of model and noise model, and largest change of a parameter of a converged one, in
 #: standard errors.
 MAX_ALTERNATIONS, ALTERNATION_TOLERANCE = 30, 0.02
 #: Relative size of a direction of lagged noise below which it is rounding.

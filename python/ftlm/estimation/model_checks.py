@@ -37,12 +37,12 @@ from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_findings
 from ftlm.validation.data_advice import check_excitation, find_dead_channel
 
-#: Largest correlation of two separately identifiable parameters, unless one of them is well determined.
+#: Maximum correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
 #: Least number of samples per period of a mode whose numbers do not rest on the inputs between samples, and damping
 #: ratio from which on a mode is not a swing.
 MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
-#: Largest relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
+#: Maximum relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
 #: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
 MAX_RELATIVE_STANDARD_ERROR = 0.1
 #: An output is early if it leaves its level by so many standard deviations of its noise before its input can act, by a
@@ -57,30 +57,30 @@ MIN_OUTLIER_POWER_FRACTION = 0.5
 ROWS_OF_ONE_SPEED = 25
 #: Quantization step in noise standard deviations above which residuals are dominated by rounding.
 QUANTIZATION_NOISE_RATIO = 2.0
-#: Largest deviation of a value from a multiple of the quantization step, as a fraction of the step.
+#: Maximum deviation of a value from a multiple of the quantization step, as a fraction of the step.
 QUANTIZATION_STEP_TOLERANCE = 0.01
-#: Smallest change within a sample that counts as motion, as a fraction of the range of the output.
+#: Minimum change within a sample that counts as motion, as a fraction of the range of the output.
 MIN_MOTION_RANGE_FRACTION = 1e-6
 #: Level at which growth is significant, one-sided: a pole grows if its real part exceeds 0 by so many standard errors.
 GROWTH_LEVEL = 0.99
 GROWTH_SIGMAS = NormalDist().inv_cdf(GROWTH_LEVEL)
 #: A parameter whose variance falls below this share is fixed by the eliminated ones.
 MIN_VARIANCE_RATIO = 1e-9
-#: Fewest intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
+#: Minimum number of intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
 MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
 #: An end of the multistart is a second optimum if its log likelihood is smaller by no more than this, and a value
 #: differs by more than so many standard errors.
 SECOND_OPTIMUM_LOG_LIKELIHOOD, SECOND_OPTIMUM_ERRORS = 2.0, 3.0
-#: Largest sum of squared differences of the residuals of one and the same model, in units of their variance.
+#: Maximum sum of squared differences of the residuals of one and the same model, in units of their variance.
 SAME_MODEL_POWER = 1e-2
-#: Largest coarse cost of a candidate that may end in a second optimum, relative to the best.
+#: Maximum coarse cost of a candidate that may end in a second optimum, relative to the best.
 MAX_SECOND_COST_RATIO = 1.05
-#: Largest number of evaluations from a candidate to its optimum.
+#: Maximum number of evaluations from a candidate to its optimum.
 MAX_SECOND_EVALUATIONS = 60
 #: Samples of the first parts of all runs, on which second optima of longer records are looked for first, and fewest of
 #: one run.
 MAX_SECOND_SAMPLES, MIN_SECOND_RUN_SAMPLES = 6000, 1000
-#: Largest relative deviation of two coefficients from the coefficient law.
+#: Maximum relative deviation of two coefficients from the coefficient law.
 MAX_LAW_DEVIATION = 0.05
 
 
@@ -94,14 +94,18 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
     unidentifiable = [n for n in joint.names if math.isinf(errors[n])]
     if unidentifiable:
         findings.append(
-            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
+            make_finding(
+                "not_separately_identifiable",
+                parameter=", ".join(unidentifiable),
+                shown=enumerate_names(unidentifiable),
+            )
         )
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
         # Negated so that a NaN standard error counts as too large.
         if name in unidentifiable:
             continue
         if not errors[name] <= high - low and not _has_bounded_interval(joint, name):
-            findings.append(make_finding("order_not_told", parameter=name))
+            findings.append(make_finding("order_not_identifiable", parameter=name))
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
             findings.append(make_finding("on_bound", parameter=name, what=f"order {name}", value=f"{value:g}"))
     for item in problem.inputs:
@@ -109,7 +113,7 @@ def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Find
         if item.name in unidentifiable:
             continue
         if not errors[item.name] <= high - low and not _has_bounded_interval(joint, item.name):
-            findings.append(make_finding("input_number_not_told", parameter=item.name, words=item.words))
+            findings.append(make_finding("input_parameter_not_identifiable", parameter=item.name, words=item.words))
         elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
             unit = " s" if item.law == "delay" else ""
             findings.append(
@@ -221,7 +225,7 @@ def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:
     if not joint.unstable_optimum.is_accepted:
         limit = joint.unstable_optimum.at_stability_limit
         smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.unstable_optimum.residual_excess))
-        return [make_finding("damping_not_told" if limit else "unstable_optimum_discarded", smaller=smaller)]
+        return [make_finding("damping_not_identifiable" if limit else "unstable_optimum_discarded", smaller=smaller)]
     if not math.isfinite(excess):
         return [make_finding("no_stable_optimum")]
     return [make_finding("unstable_optimum_kept", excess=excess)]
@@ -267,7 +271,7 @@ def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) 
         run.name for run in runs if run.sample_times is not None and not has_nonuniform_samples(run, problem.structure)
     ]
     if run_names:
-        findings.append(make_finding("times_not_honoured", run=", ".join(run_names)))
+        findings.append(make_finding("sample_times_interpolated", run=", ".join(run_names)))
     return findings
 
 
@@ -437,7 +441,7 @@ def correlation_findings(joint: JointFit) -> list[Finding]:
         finite_values = [c for i in group for j in group if i < j and math.isfinite(c := float(correlation[i, j]))]
         of = "correlation" if len(group) == 2 else "correlations up to"
         why = f"{of} {max(finite_values):.4f}" if finite_values else "their standard errors are not finite"
-        findings.append(make_finding("numbers_correlated", parameter=f"{', '.join(most)} and {last}", why=why))
+        findings.append(make_finding("parameters_correlated", parameter=f"{', '.join(most)} and {last}", why=why))
     return findings
 
 
@@ -540,9 +544,9 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
         slow = int(np.sum(pace < SLOW_SPEED_RATIO * vs))
         if slow < MIN_SLOW_INTERVALS:
             numbers = {"ratio": SLOW_SPEED_RATIO, "speed": SLOW_SPEED_RATIO * vs, "slow": slow, "total": pace.size}
-            findings.append(make_finding("stribeck_slow_untold", output=item.output, **numbers))
+            findings.append(make_finding("slow_motion_missing", output=item.output, **numbers))
         elif pace.max(initial=0.0) < vs:
-            findings.append(make_finding("stribeck_fast_untold", output=item.output, speed=vs))
+            findings.append(make_finding("fast_motion_missing", output=item.output, speed=vs))
     return findings
 
 
@@ -558,7 +562,9 @@ def stability_findings(model: Model) -> list[Finding]:
     stable = model.stability(coupling=model.structure.coupling)
     if not stable.unstable_poles > 0:
         return []
-    code = "free_run_grows" if has_growing_mode(model, model.structure.coupling) else "growth_not_told"
+    code = (
+        "simulation_unbounded" if has_growing_mode(model, model.structure.coupling) else "instability_not_significant"
+    )
     return [make_finding(code, stability=str(stable), poles=unstable_poles_text(stable.unstable_poles))]
 
 

@@ -132,4 +132,4 @@ def _forgetting_findings(model: Model, runs: Sequence[Run], free: Sequence[Outpu
                 worst = late / early, at * run.step, run.name
     if worst is None:
         return []
-    return [make_finding("run_forgets", run=worst[2], growth=worst[0], seconds=worst[1])]
+    return [make_finding("simulation_chaotic", run=worst[2], growth=worst[0], seconds=worst[1])]

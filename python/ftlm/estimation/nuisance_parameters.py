@@ -64,7 +64,7 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS
 DEFAULT_PULSES_PER_SAMPLE = 2
 #: Relative size of the offset sensitivity below which it is collinear with the other parameters.
 OFFSET_COLLINEARITY_TOLERANCE = 1e-6
-#: Smallest reported effect of an offset, as a fraction of the standard deviation of the output.
+#: Minimum reported effect of an offset, as a fraction of the standard deviation of the output.
 MIN_OFFSET_SIZE_RATIO = 1e-3
 #: Significance level of the finding on an offset that was not requested.
 UNREQUESTED_OFFSET_LEVEL = 1e-4

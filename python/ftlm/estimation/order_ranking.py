@@ -161,7 +161,7 @@ def with_verdict(
     try:
         result = identification_of_searches({name: first}, runs, structure, settings, order_grid, m=m)
     except FtlmError as error:
-        failed = make_finding("rank_not_judged", method=settings.coefficients, text=str(error))
+        failed = make_finding("rank_not_validated", method=settings.coefficients, text=str(error))
         return replace(search, verdict=verdict_from([failed]), model_findings=(failed,))
     alike = [] if result.residuals is None else _alike_findings(search, result.residuals)
     return replace(search, verdict=result.verdict, model_findings=unique([*alike, *result.findings]))
@@ -201,7 +201,7 @@ def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]
     spans_text = ", ".join(f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in spans_of_change.items())
     last = max(row.rank for row in alike)
     every = ", all that are kept," if alike[-1] is distinct[-1][0] and len(distinct) > 1 else ""
-    code = "ranks_alike" if decided else "noise_decides"
+    code = "ranks_not_distinguished" if decided else "ranking_not_significant"
     return [make_finding(code, parameter=", ".join(spans_of_change), last=last, every=every, shown=spans_text)]
 
 

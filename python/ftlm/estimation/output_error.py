@@ -116,7 +116,7 @@ class RobustLossSummary:
 
 #: Residual of cost 1 in a coarse fit, as a fraction of the standard deviation of the output.
 COARSE_SHARE = 0.01
-#: Largest relative difference of the costs of one and the same optimum.
+#: Maximum relative difference of the costs of one and the same optimum.
 SAME_COST = 1e-3
 
 

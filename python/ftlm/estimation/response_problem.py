@@ -16,11 +16,11 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats
 
-#: Smallest highest order of an equation, and smallest gap between it and the order of an own term.
+#: Minimum highest order of an equation, and smallest gap between it and the order of an own term.
 MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
 
 
-#: Largest exponent of a constant-phase element: that of a capacitor.
+#: Maximum exponent of a constant-phase element: that of a capacitor.
 MAX_EXPONENT = 1.0
 
 
@@ -303,7 +303,7 @@ class ResponseProblem:
         return max([MAX_DEFAULT_SEARCH_ORDER, *(o.constant for o in orders if not o.names)])
 
 
-#: Largest number of grid points, of frequencies, of reweighting iterations, and of initial guesses returned.
+#: Maximum number of grid points, of frequencies, of reweighting iterations, and of initial guesses returned.
 MAX_GRID_POINTS, MAX_START_FREQUENCIES, REWEIGHTING_ITERATIONS, MAX_STARTS = 3000, 160, 4, 8
 #: Points whose exact cost is computed, corner frequencies tried for one own term, and points at which they are tried.
 MAX_EVALUATED_POINTS, CORNERS_PER_POINT, MAX_CORNER_POINTS = 60, 14, 120

@@ -24,12 +24,12 @@ from ftlm.validation.comparison import MAX_FIT_DROP_POINTS, MAX_NORMALIZED_RESID
 from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO, OutputResiduals
 
 TRUST_LEVEL = "trust"
-#: Largest relative standard error of a well-determined coefficient, and largest standard error of an order. Half the 95
+#: Maximum relative standard error of a well-determined coefficient, and largest standard error of an order. Half the 95
 #: % interval then equals the coefficient, or the increment of 0.5 between common mechanisms.
 MAX_COEFFICIENT_ERROR_RATIO, MAX_ORDER_ERROR = 0.5, 0.25
 #: Limits of the validation loss: ratio to the estimation loss, and percentage below which the ratio does not matter.
 VALIDATION_LOSS_LIMITS = ((3.0, 10.0), (5.0, 5.0))
-#: Smallest significant difference in fit on a validation run [percentage points].
+#: Minimum significant difference in fit on a validation run [percentage points].
 MIN_FIT_GAIN = 0.5
 #: NR below which a model explains something of an output that noise buries.
 MAX_BURIED_RESIDUAL = 0.99
@@ -37,7 +37,7 @@ MAX_BURIED_RESIDUAL = 0.99
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
 NOT_SEPARABLE_TOPIC = "not_separable"
 #: Findings on validation runs with rows to which the model was fitted.
-REPEATED_RUN_CODES = ("validates_itself", "validates_partly_itself")
+REPEATED_RUN_CODES = ("estimation_run_repeated", "estimation_rows_repeated")
 #: Findings on an unstable plant: simulations of whole runs do not judge its model.
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 
@@ -218,7 +218,11 @@ def saved_findings(estimate: Estimate) -> list[Finding]:
     unidentifiable = [n for n, e in estimate.standard_errors.items() if e is None]
     if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in findings):
         findings.append(
-            make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
+            make_finding(
+                "not_separately_identifiable",
+                parameter=", ".join(unidentifiable),
+                shown=enumerate_names(unidentifiable),
+            )
         )
     return findings
 
@@ -233,10 +237,12 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     codes = {f.code for f in result.findings}
     yield from _free_runs(result)
     errors, joint = result.standard_errors, result.joint
-    yield from (f for f in result.findings if f.code == "run_forgets")
+    yield from (f for f in result.findings if f.code == "simulation_chaotic")
     unidentifiable = [n for n, e in errors.items() if not math.isfinite(e)]
-    if unidentifiable and "run_forgets" not in codes:
-        yield make_finding("not_told_apart", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable))
+    if unidentifiable and "simulation_chaotic" not in codes:
+        yield make_finding(
+            "not_separately_identifiable", parameter=", ".join(unidentifiable), shown=enumerate_names(unidentifiable)
+        )
     yield from (f for f in result.findings if f.code == "equation_says_identity")
     yield from (f for f in result.findings if f.kind.names_missing_part)
     yield from _residuals(result)
@@ -245,7 +251,7 @@ def _against_result(result: Identification) -> Iterator[Finding]:
     vague = [n for n in errors if n not in unidentifiable and _is_uncertain(result, n)]
     if vague:
         text = enumerate_names([_format_uncertain(result, n) for n in vague])
-        yield make_finding("number_vague", parameter=", ".join(vague), shown=text)
+        yield make_finding("parameter_imprecise", parameter=", ".join(vague), shown=text)
     endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
     if endless:
         yield make_finding("interval_open", parameter=enumerate_names(endless), sides=", ".join(endless))
@@ -288,8 +294,8 @@ def _unstable_poles(model: Model) -> Iterator[Finding]:
     growth = stability_findings(model)
     yield from growth
     if math.isnan(model.stability(coupling=model.structure.coupling).unstable_poles):
-        yield make_finding("growth_untold")
-    elif not any(f.code == "free_run_grows" for f in growth):
+        yield make_finding("stability_unknown")
+    elif not any(f.code == "simulation_unbounded" for f in growth):
         with contextlib.suppress(FtlmError):
             yield from _undamped_modes(model)
 
@@ -299,7 +305,9 @@ def _undamped_modes(model: Model) -> Iterator[Finding]:
     for mode in modes(model, coupling=model.structure.coupling):
         if mode.oscillatory and mode.damping - NORMAL_95 * (mode.damping_error or 0.0) <= 0.0:
             spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
-            yield make_finding("swing_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=spread)
+            yield make_finding(
+                "oscillation_may_not_decay", frequency=mode.frequency, damping=mode.damping, spread=spread
+            )
             return
 
 

@@ -124,11 +124,11 @@ class Bounds:
     Parameters
     ----------
     peaks
-        Largest absolute value of each input.
+        Maximum absolute value of each input.
     slews
-        Largest rate of change of each input [unit/s]; infinite if unlimited.
+        Maximum rate of change of each input [unit/s]; infinite if unlimited.
     output_limits
-        Largest absolute value of each output; infinite if unlimited.
+        Maximum absolute value of each output; infinite if unlimited.
     """
 
     peaks: Mapping[str, float]

@@ -208,7 +208,7 @@ def _encoding(value: object) -> str:
 _WORDS_BY_SEPARATOR = {character: word for word, character in SEPARATOR_CHARACTERS.items()}
 SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}
 _SEPARATOR_CANDIDATES = (";", "\t", ",", None)
-#: Most columns of a text file; opening so many takes a few seconds.
+#: Maximum number of columns of a text file; opening so many takes a few seconds.
 MAX_COLUMNS = 100_000
 _COMMA_THOUSANDS_PATTERN = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _COMMA_PAIRS_PATTERN = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")

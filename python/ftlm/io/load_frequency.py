@@ -59,7 +59,7 @@ _PHASE_UNITS = ("deg", "rad", "mrad")
 _DIMENSIONLESS_UNITS = ("", "1", "-", "abs", "lin", "linear")
 #: Longer column names are not compared with the names of parts.
 _MAX_PART_NAME_CHARACTERS = 60
-#: Fewest rows of a sweep; instruments repeat single frequencies as a check.
+#: Minimum number of rows of a sweep; instruments repeat single frequencies as a check.
 MIN_SWEEP_ROWS = 3
 #: Relative tolerance between a magnitude column and real and imaginary part in the same file.
 _MAGNITUDE_TOLERANCE = 0.02

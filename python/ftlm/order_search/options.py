@@ -147,7 +147,7 @@ RowBasis = Literal["haar", "time"]
 COMPARED_INNOVATION_LENGTHS = (1, 3, 5, 7)
 #: Bound on the refined-instrumental-variables iterations per candidate; most converge earlier.
 MAX_IV_ITERATIONS = 5
-#: Largest number of rows of a table.
+#: Maximum number of rows of a table.
 MAX_TOP = 100_000
 #: Settings of multi-innovation alone.
 MULTI_INNOVATION_SETTINGS = ("innovation_length", "prior_covariance", "row_basis")

@@ -34,7 +34,7 @@ class OrderCertificate:
         Lower bound of the RMS equation error for all orders in the intervals and all coefficients within
         `max_term_ratio`, for exact arithmetic on the block-pulse means. 0 if nothing is proved.
     best
-        Smallest RMS equation error found; infinite if none was found.
+        Minimum RMS equation error found; infinite if none was found.
     orders
         Free orders with the smallest error, by name.
     requested_tolerance
@@ -85,9 +85,11 @@ class OrderCertificate:
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the simulation at the best orders, which the certificate of the equation error does not cover."""
         if self.unstable_poles > 0:
-            return (make_finding("certified_run_grows", poles=int(self.unstable_poles), nr=self.free_run_nr),)
+            return (
+                make_finding("certified_simulation_unbounded", poles=int(self.unstable_poles), nr=self.free_run_nr),
+            )
         if self.free_run_nr > MAX_FREE_RUN_NR:
-            return (make_finding("certified_run_fails", nr=self.free_run_nr),)
+            return (make_finding("certified_simulation_poor", nr=self.free_run_nr),)
         return ()
 
     @property
@@ -279,18 +281,21 @@ class SearchResult:
     @property
     def search_findings(self) -> tuple[Finding, ...]:
         """Findings on the table: orders at a limit of their interval, and equivalent rows."""
-        edges = [make_finding("on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
+        edges = [make_finding("order_on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
         if 0 < self.free_runs < self.candidates:
-            edges.append(make_finding("free_runs_of_some", count=self.free_runs, candidates=self.candidates))
+            edges.append(make_finding("simulations_incomplete", count=self.free_runs, candidates=self.candidates))
         distinct, rows = len(self.distinct_rows), len(self.table)
         if distinct == rows:
             return tuple(edges)
-        return (*edges, make_finding("rows_repeat", rows=rows, models=distinct, plural="s" if distinct > 1 else ""))
+        return (
+            *edges,
+            make_finding("table_rows_equivalent", rows=rows, models=distinct, plural="s" if distinct > 1 else ""),
+        )
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the table and on the model of rank 1."""
-        return unique([*self.search_findings, *(f for f in self.model_findings if f.code != "on_edge")])
+        return unique([*self.search_findings, *(f for f in self.model_findings if f.code != "order_on_edge")])
 
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)

@@ -622,7 +622,7 @@ def model_page(
             findings_there += validation_fit_findings(
                 {n: f for n, f in estimate.fit.items() if f is not None}, comparison
             )
-            findings_there += [make_finding("run_of_its_own", run=run.name)] * (run.name in estimate.runs)
+            findings_there += [make_finding("estimation_run_name_repeated", run=run.name)] * (run.name in estimate.runs)
         findings += _on_validation(findings_there, run)
     compared = [("validation", comparison) for comparison in validated]
     bands = [confidence_bands(model, run, c) for run, c in zip(others, validated, strict=True)]

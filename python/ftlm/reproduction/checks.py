@@ -390,8 +390,8 @@ def manual(reproduction: Reproduction) -> Evidence:
 def fractional_orders(reproduction: Reproduction) -> Evidence:
     """Return whether fractional orders improve the fit significantly, if the simulated arms agree."""
     freed = reproduction.panel.order_comparisons
-    verdicts = [(f, o, earns) for f in freed for o in f.free_nr if (earns := f.earns(o)) is not None]
-    cases = [case(earns, the_arm=f.arm, the_angle=symbol(o)) for f, o, earns in verdicts]
+    verdicts = [(f, o, improves) for f in freed for o in f.free_nr if (improves := f.improves(o)) is not None]
+    cases = [case(improves, the_arm=f.arm, the_angle=symbol(o)) for f, o, improves in verdicts]
     both = (f"{f.arm}: {by_angle({o: (f.integer_nr[o], f.free_nr[o]) for o in f.free_nr})}" for f in freed)
     return combine_cases(cases, of_the_machine=reproduction.simulated), {
         "unknown": sum(len(f.free_nr) for f in freed) - len(verdicts),

@@ -45,7 +45,7 @@ FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
     "both fractional": ("beta", "mu"),
 }
 WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
-#: Most samples of a run in a fit; the arm's modes are a decade below the reduced rate of a 20 s run.
+#: Maximum number of samples of a run in a fit; the arm's modes are a decade below the reduced rate of a 20 s run.
 MAX_SAMPLES = 1250
 #: Label of the structures of ``Deflection.without_rate``.
 WITHOUT_RATE_LABEL = "without the rate of the other deflection"
@@ -121,14 +121,14 @@ class Verdict:
     ----------
     kind
         A key of ``FREE_ORDERS_BY_KIND``.
-    earns
+    improves
         The decision; None if it is inconclusive.
     words
         Numbers that it follows from, as text.
     """
 
     kind: str
-    earns: bool | None
+    improves: bool | None
     words: str
 
 
@@ -193,7 +193,7 @@ class Deflection:
         degenerate = list(dict.fromkeys(bad))
         complete = not worse and not degenerate and not any(k in (kind, INTEGER_KIND) for k, _ in self.failed)
         whole = {name: WHOLE_ORDERS[letter_of(name)] for name in intervals}
-        earns = improves_prediction(list(self.gains(kind).values()), intervals, whole) if complete else None
+        improves = improves_prediction(list(self.gains(kind).values()), intervals, whole) if complete else None
 
         def fit(each: Mapping[str, RunFit], run: str, other: str) -> str:
             return percent(each[run].fit(other)) if run in each else "no fit"
@@ -213,13 +213,13 @@ class Deflection:
             words += f" On {', '.join(worse)} it fits worse than the whole orders that it contains: no optimum found."
         if degenerate:
             words += f" On {', '.join(degenerate)} one of the two fits must not be used, so nothing follows from it."
-        return Verdict(kind, earns, words)
+        return Verdict(kind, improves, words)
 
     def to_dict(self) -> dict[str, Any]:
         """Return fits and verdicts of this structure for JSON."""
         return {
             "equation": str(self.structure),
-            "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in self.verdicts},
+            "verdicts": {v.kind: {"improves": v.improves, "words": v.words} for v in self.verdicts},
             "fits": json_value(self.fits),
             "failed": {f"{kind}, {run}": words for (kind, run), words in self.failed.items()},
         }
@@ -396,7 +396,7 @@ def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
 
 def verdict_sentence(output: str, verdict: Verdict) -> str:
     """Return a verdict as a sentence."""
-    sentence: str = read_texts("page")["order_verdicts"][verdict.kind][VERDICT_CELLS[verdict.earns]]
+    sentence: str = read_texts("page")["order_verdicts"][verdict.kind][VERDICT_CELLS[verdict.improves]]
     return f"{symbol(output)}: {sentence}"
 
 
@@ -442,7 +442,7 @@ def rate_effect_table(result: OrderCrossValidation) -> Table | None:
     """Table of the verdicts without and with the rate of the other deflection."""
     rows = {
         symbol(output): [
-            [kind, *(VERDICT_CELLS[d.verdict(kind).earns] for d in (full.without_rate, full))]
+            [kind, *(VERDICT_CELLS[d.verdict(kind).improves] for d in (full.without_rate, full))]
             for kind in FRACTIONAL_KINDS
         ]
         for output, full in result.deflections.items()

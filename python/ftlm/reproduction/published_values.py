@@ -189,7 +189,7 @@ TERM_INTERPRETATIONS = {
 PRIOR_GRID = tuple(float(v) for v in np.logspace(-3, 5, 65))
 #: Grid of orders around the printed ones, in the paper's increments, for the rank of the printed orders.
 MIN_GRID_ORDER, MAX_GRID_ORDER, GRID_INCREMENT = 1.6, 1.95, 0.05
-#: Largest ratio to a printed coefficient that counts as agreement, with equal signs.
+#: Maximum ratio to a printed coefficient that counts as agreement, with equal signs.
 MAX_COEFFICIENT_RATIO = 1.25
 
 

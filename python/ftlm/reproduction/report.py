@@ -84,7 +84,7 @@ COLUMN_HEADS: Mapping[str, Sequence[str]] = {
 }
 #: Points per line: some fifty charts keep the page below 2 MB.
 LINE_POINTS = 500
-#: Largest drawn excursion relative to the reference line, and largest drawn error of the recursion relative to its last
+#: Maximum drawn excursion relative to the reference line, and largest drawn error of the recursion relative to its last
 #: value. Diverging lines would hide all others.
 MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
 

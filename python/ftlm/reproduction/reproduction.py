@@ -46,7 +46,7 @@ MEASURED_LABEL = "as measured"
 ALWAYS_SAVED = ("square.csv", "sine.csv", "tables.json")
 #: Polling interval for Ctrl-C [s].
 INTERRUPT_POLL_S = 0.1
-#: Most records of an arm.
+#: Maximum number of records of an arm.
 MAX_RECORDS = 1000
 
 
@@ -196,7 +196,7 @@ def reproduce(
         as many as 20 000 evaluations per angle allow. Each seed has as many evaluations as the compared order grid has
         candidates. The order grid and the norm come from the comparison and must not be given.
     rivals_increment
-        Smallest increment of the order grid on which multi-innovation, the genetic algorithm and differential
+        Minimum increment of the order grid on which multi-innovation, the genetic algorithm and differential
         evolution are compared. The paper's 0.05 takes sixteen times as long as the default.
     arms
         Simulated arms for verdicts besides the first: keys of `ARM_VARIANTS`, by default all. For a measured run there

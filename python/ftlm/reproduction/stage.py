@@ -387,7 +387,7 @@ class OrderComparison:
         orders = {n: (v, *free.result.intervals[n]) for n, v in free.result.orders.items()}
         return cls(arm, stage, nr, free_nr, orders, gains, not are_usable(integer, free))
 
-    def earns(self, output: str) -> bool | None:
+    def improves(self, output: str) -> bool | None:
         """Whether free orders improve the fit of an angle significantly, as in ``ftlm orders``; None if unknown."""
         if self.is_degenerate or output not in self.gains:
             return None
@@ -407,7 +407,7 @@ class OrderComparison:
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
         names = ("arm", "stage", "integer_nr", "free_nr", "orders", "fractional_orders", "gains", "is_degenerate")
-        return attributes(self, names) | {"earns": {n: self.earns(n) for n in self.free_nr}}
+        return attributes(self, names) | {"improves": {n: self.improves(n) for n in self.free_nr}}
 
 
 @dataclass(frozen=True)

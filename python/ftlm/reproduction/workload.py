@@ -28,7 +28,7 @@ CONTEST_CANDIDATES = 3800
 #: Default smallest increment of the order grid, on every arm: the paper's grid has 60 000 candidates per angle, as many
 #: evaluations per seed, and takes minutes.
 CONTEST_STEP = 0.1
-#: Largest and smallest number of seeds, and most evaluations of one optimizer on one angle over all seeds.
+#: Maximum and minimum number of seeds, and most evaluations of one optimizer on one angle over all seeds.
 MAX_SEEDS, MIN_SEEDS, MAX_EVALUATIONS = 10, 3, 40_000
 
 

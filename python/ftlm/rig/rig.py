@@ -302,7 +302,7 @@ SENSE_SCALE = 2.0
 COMMAND_SCALE = 0.5
 #: Hub angle per count [rad]: 1024 lines read fourfold, behind gears of 100:1 and 50:1.
 ENCODER_SCALE = (2.0 * math.pi / 4096.0 / 100.0, 2.0 * math.pi / 4096.0 / 50.0)
-#: Largest currents for which the amplifiers are configured [A].
+#: Maximum currents for which the amplifiers are configured [A].
 CURRENT_LIMIT = (0.94, 1.2)
 #: Rest before every run, over which the bias of the gauges is averaged [s].
 REST_DURATION_S = 0.2
@@ -327,15 +327,15 @@ class Limits:
     Parameters
     ----------
     current
-        Largest command [A].
+        Maximum command [A].
     slew
-        Largest rate of change of a command [A/s]; a full reversal takes two samples of 2 ms.
+        Maximum rate of change of a command [A/s]; a full reversal takes two samples of 2 ms.
     continuous
         Continuous current rating [A]: bound on the RMS current over `thermal_time`.
     thermal_time
         Thermal time constant of the motors [s].
     deflection
-        Largest link deflection [rad].
+        Maximum link deflection [rad].
     saturation
         Gauge voltage [V] from which a gauge counts as saturated.
     moving_current

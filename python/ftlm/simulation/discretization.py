@@ -33,7 +33,7 @@ from ftlm.utils.validation import Floats, check_pulses, nearest
 DEFAULT_PULSES = 2048
 #: Maximum number of pulses of a record: 2^24 of one signal are 128 MB.
 MAX_M = 1 << 24
-#: Largest relative excess of a negative delay over one sampling interval that is rounding.
+#: Maximum relative excess of a negative delay over one sampling interval that is rounding.
 MAX_EARLY_ROUNDING = 1e-9
 COULOMB_PREFIX = "coulomb_"
 #: Placeholder for the column in a line of a columns file.

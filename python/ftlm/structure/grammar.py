@@ -89,9 +89,9 @@ OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask
 FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt", "sign", "atan", "arctan")
 #: Limit of nested parentheses and functions in a non-linear term.
 MAX_DEPTH = 30
-#: Largest power of a polynomial in s that is multiplied out.
+#: Maximum power of a polynomial in s that is multiplied out.
 MAX_POLYNOMIAL_POWER = 10
-#: Largest number of terms of a polynomial in s with named coefficients.
+#: Maximum number of terms of a polynomial in s with named coefficients.
 MAX_POLYNOMIAL_TERMS = 200
 
 

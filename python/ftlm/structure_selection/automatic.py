@@ -35,7 +35,7 @@ EXTENDED_CANDIDATES, VALIDATED_CANDIDATES, VALIDATED_FRACTIONAL = 3, 6, 2
 #: Difference of Schwarz criteria beyond which a candidate of integer orders is not validated, unless it is the best of
 #: its order, and one of fractional orders.
 MAX_BIC_GAP, MAX_FRACTIONAL_BIC_GAP = 60.0, 10.0
-#: Smallest decrease of the Schwarz criterion for which delays or an offset are tried in all candidates, and the largest
+#: Minimum decrease of the Schwarz criterion for which delays or an offset are tried in all candidates, and the largest
 #: distance from the best one of forms whose neighbors are fitted.
 MIN_BIC_DECREASE = 6.0
 #: Order of the best form of integer orders for which D^2 y = a1 D^mu y + a0 y + … is tried.

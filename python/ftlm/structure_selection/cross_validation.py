@@ -131,7 +131,7 @@ def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run
     return masked.with_unmasked_run(run)
 
 
-#: Most pieces of the runs of an unstable plant that are folds.
+#: Maximum number of pieces of the runs of an unstable plant that are folds.
 MAX_SPLIT_FOLDS = 16
 
 

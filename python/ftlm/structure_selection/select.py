@@ -383,7 +383,7 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
         if lower:
             findings.append(make_finding("other_optimum", output=", ".join(lower)))
     if winner.validation_fit < MIN_VALIDATION_FIT:
-        findings.append(make_finding("none_is_the_machine", fit=format_fit(winner.validation_fit)))
+        findings.append(make_finding("no_candidate_fits", fit=format_fit(winner.validation_fit)))
     worse = [f"{name} ({format_fit(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
     if worse:
         findings.append(make_finding("worse_than_mean", parts=", ".join(worse)))
@@ -424,13 +424,13 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: I
     rival = next((t for t in ranked if t.failed is None and not has_memory(t.structure)), None)
     if rival is None or set(rival.parts) != set(winner.parts):
         reason = "no candidate with integer orders was fitted"
-        return [make_finding("fractional_orders_not_told", parameter=orders_text, reason=reason)]
+        return [make_finding("fractional_orders_inconclusive", parameter=orders_text, reason=reason)]
     gains = [fit - rival.parts[name] for name, fit in winner.parts.items()]
     parts = f"{len(gains)} part{'s' if len(gains) > 1 else ''}"
     about = {"parameter": orders_text, "other": rival.name, "parts": parts, "gain": median(gains)}
     if is_degenerate(result) or rival.unstable or not rival.validation_fit >= MIN_VALIDATION_FIT:
         reason = f"the fit of {rival.name}, or of the chosen candidate, must not be used"
-        return [make_finding("fractional_orders_not_told", reason=reason, **about)]
+        return [make_finding("fractional_orders_inconclusive", reason=reason, **about)]
     intervals = {n: {"all": result.intervals[n]} for n in orders if n in result.intervals}
     whole = {n: float(round(orders[n])) for n in intervals}
     gained = improves_prediction(gains, intervals, whole) if intervals else None
@@ -438,7 +438,7 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: I
         is_worse = min(gains) <= -MIN_FIT_GAIN
         others = "lower" if is_worse else "not higher"
         reason = f"compared with {rival.name}, the fit is higher on some parts and {others} on other parts"
-        return [make_finding("fractional_orders_not_told", reason=reason, **about)]
+        return [make_finding("fractional_orders_inconclusive", reason=reason, **about)]
     return [make_finding("fractional_orders_gain" if gained else "fractional_orders_gain_nothing", **about)]
 
 

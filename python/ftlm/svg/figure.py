@@ -130,7 +130,7 @@ def text_width(text: str) -> float:
 
 #: Points of a line in the wide chart: two per pixel column, so that no peak is lost.
 MAX_LINE_POINTS = 1500
-#: Smallest difference between axis limits; denormal numbers have too few digits.
+#: Minimum difference between axis limits; denormal numbers have too few digits.
 MIN_DIFFERENCE = 1e-290
 #: Lines that leave the range of the measured line by more than this many times its height do not extend the axis.
 MAX_STRAY_HEIGHTS = 3.0

@@ -537,7 +537,7 @@ def near_identity_findings(
             findings.append(make_finding("equation_says_identity", output=name, **numbers))
         elif worse and useless:
             findings.append(
-                make_finding("flattered_by_equation_error", output=name, nr=output.nr, equation_nr=equation.nr)
+                make_finding("simulation_worse_than_equation_error", output=name, nr=output.nr, equation_nr=equation.nr)
             )
         elif useless:
             findings.append(make_finding("explains_little", output=name, nr=output.nr))
@@ -554,10 +554,10 @@ def validation_findings(own: Comparison, validation: Comparison) -> list[Finding
             )
             shared = common_rows(first_lags, tested)
             if shared == tested.shape[1] == first_lags.shape[1]:
-                findings.append(make_finding("validates_itself", run=other, other=name))
+                findings.append(make_finding("estimation_run_repeated", run=other, other=name))
             elif shared:
                 numbers = {"count": shared, "rows": tested.shape[1]}
-                findings.append(make_finding("validates_partly_itself", run=other, other=name, **numbers))
+                findings.append(make_finding("estimation_rows_repeated", run=other, other=name, **numbers))
     return findings + validation_fit_findings({n: f.fit for n, f in own.output_error.items()}, validation)
 
 

@@ -58,9 +58,9 @@ DRIFT_SIGMAS = 6.0
 DRIFT_BLOCKS = 16
 DRIFT_PULSES = 1024
 DRIFT_LAGS = 12
-#: Smallest share of the trend regressor that must be orthogonal to the input responses for a drift test.
+#: Minimum share of the trend regressor that must be orthogonal to the input responses for a drift test.
 MIN_TREND_RESIDUAL_SHARE = 1e-3
-#: Largest number of rows of the test for feedback.
+#: Maximum number of rows of the test for feedback.
 MAX_FEEDBACK_SAMPLES = 8_000
 #: Statistic over its limit from which undecided feedback is mentioned. Sweeps in open loop reach a few.
 MIN_UNDECIDED_RATIO = 3.0
@@ -458,7 +458,7 @@ def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Findi
         elif strongest and tests[strongest].ratio > MIN_UNDECIDED_RATIO:
             test = tests[strongest]
             numbers = {"ratio": test.ratio, "reason": test.reason}
-            yield make_finding("loop_not_told", run=run.name, input=u, output=strongest, **numbers)
+            yield make_finding("feedback_inconclusive", run=run.name, input=u, output=strongest, **numbers)
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ INPUT_CLIP, OUTPUT_CLIP, RESIDUAL_CLIP = 3.0, 5.0, 12.0
 ROBUST_SIGMAS, ROBUST_ITERATIONS = 2.0, 4
 #: Share of an innovation that outputs explain, prediction error and ratio from which no coincidence explains as much.
 CERTAIN_SHARE, ROUGH_SHARE, CERTAIN_RATIO = 0.5, 2e-3, 5.0
-#: Smallest rows x share x (prediction error)^2 that could move an estimate by a part of its standard error.
+#: Minimum rows x share x (prediction error)^2 that could move an estimate by a part of its standard error.
 MIN_FEEDBACK_POWER = 0.01
 #: Shares of the largest possible input noise that are tried; number of shifts in time that serve as placebos, and
 #: ratio of the statistic to the largest of theirs from which feedback counts as found.
@@ -77,7 +77,7 @@ class FeedbackTest:
     rows
         Number of samples that were tested.
     bias
-        Largest bias that the feedback causes in a parameter, in standard errors of the parameter; None if unknown.
+        Maximum bias that the feedback causes in a parameter, in standard errors of the parameter; None if unknown.
     same_row
         Correlation between the innovations of input and output in the same sample, divided by its 99.5 % limit, with
         its sign. Feedback without delay and direct feedthrough both cause it.

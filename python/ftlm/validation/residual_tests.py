@@ -45,7 +45,7 @@ NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
 MAX_REST_VELOCITY_RATIO = 0.01
 #: Slope at 0 of the tanh that replaces the sign of a measured velocity, times the largest velocity.
 SIGN_TANH_SLOPE = 100.0
-#: Smallest value of the other sign, relative to the largest value, of a velocity that changes its direction.
+#: Minimum value of the other sign, relative to the largest value, of a velocity that changes its direction.
 MIN_REVERSAL_RATIO = 0.01
 #: Singular values of sensitivities, relative to the largest one, below which they count as rounding errors.
 SENSITIVITY_RANK_TOLERANCE = 1e-10
@@ -72,7 +72,7 @@ class CorrelationTest:
         Whether the test can fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant;
         the test then neither passes nor fails.
     first
-        Smallest tested lag: 1 if only the correlation at lag 0 exceeds the limit, otherwise 0.
+        Minimum tested lag: 1 if only the correlation at lag 0 exceeds the limit, otherwise 0.
     """
 
     lags: NDArray[np.int64]
@@ -299,7 +299,7 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     runs
         One run or several with the same names and units, each of at least ``2 * lags + 3`` rows.
     lags
-        Largest lag in samples; 25 by default, as in Ljung's book.
+        Maximum lag in samples; 25 by default, as in Ljung's book.
 
     Returns
     -------
@@ -612,7 +612,7 @@ def failed_tests(tests: Residuals) -> list[Finding]:
         for signal, test in output.informative_tests.items():
             lag, value = test.largest
             if not test.conclusive:
-                code = "follow_undecided_still" if math.isnan(test.limit) else "follow_undecided"
+                code = "residual_test_input_constant" if math.isnan(test.limit) else "residual_test_inconclusive"
                 findings.append(make_finding(code, output=name, input=signal, limit=test.limit))
             elif not test.passed:
                 numbers = {"value": value, "lag": lag, "limit": test.limit}

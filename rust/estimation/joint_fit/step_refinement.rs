@@ -14,7 +14,7 @@ const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
 /// Increase of the log residuals by halving the step above which other survivors are tried on the finer grid.
 const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
-/// Fewest block pulses of a grid whose optimum is corrected for its step without optimizations on finer grids.
+/// Minimum number of block pulses of a grid whose optimum is corrected for its step without finer grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
 /// Maximum number of corrections by one pair of finer grids. Each correction multiplies the error of the last by about
 /// the relative discretization error of the grid.

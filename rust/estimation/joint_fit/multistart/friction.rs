@@ -39,11 +39,11 @@ const STRIBECK_COULOMB_RATIOS: [f64; 3] = [0.02, 0.2, 1.0];
 const STRIBECK_SPEED_RATIOS: [f64; 3] = [0.05, 0.2, 0.6];
 /// Initial inertia of the attached bodies relative to the inertia of the body.
 const LOAD_INERTIA_RATIOS: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
-/// Largest number of initial guesses in which each body has its own fraction of attached inertia.
+/// Maximum number of initial guesses in which each body has its own fraction of attached inertia.
 const MAX_LOAD_COMBINATIONS: usize = 64;
-/// Largest difference of the orders of two terms that are action and reaction of two coupled equations.
+/// Maximum difference of the orders of two terms that are action and reaction of two coupled equations.
 const MAX_REACTION_ORDER_GAP: f64 = 0.5;
-/// Smallest peak-to-peak motion of a body, in standard deviations of its noise.
+/// Minimum peak-to-peak motion of a body, in standard deviations of its noise.
 const MIN_MOTION_NOISE_RATIO: f64 = 10.0;
 /// Prefix of the name of the signal that is the sign of a measured velocity.
 const SIGN_PREFIX: &str = "coulomb_";
