@@ -633,7 +633,7 @@ class SampleResponses:
         if late and (late & direct or resolve_initial_conditions(run, structure) != "rest"):
             # What acted before the run, and at its last sample, is no answer to one of its samples.
             return None
-        every = {n: interpolate_gaps(apply_input_nonlinearity(run, structure, n)[n]) for n in drivers}
+        every = {n: interpolate_gaps(apply_input_nonlinearity(run, structure)[n]) for n in drivers}
         moving = {n: v for n, v in every.items() if v.any()}
         ramps = [n for n in moving if n not in run.inputs or run.intersample[n] != ZERO_ORDER_HOLD]
         still = replace(model, structure=replace(structure, initial="rest", input_nonlinearities=UNSET))

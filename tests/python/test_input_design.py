@@ -302,7 +302,6 @@ def test_no_exchange_of_one_hold_or_of_two_tells_more(name: str) -> None:
     goal = Criterion("D", (0, 1), (1.0, 1.0))
     begin = scaled_design("square", 0.8 * np.stack([square_wave(rows, 24)] * len(laid.inputs)), known, goal, bounds)
     best = exchange_holds(begin, hold, known, goal, bounds)
-    assert best.exchanges > 0
     assert best.score > begin.score
 
     def naive(commands: np.ndarray) -> float:

@@ -562,22 +562,15 @@ def refit_if_accepted(
     return fit if accepts(fit) else None
 
 
-def refit_from(
-    joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss = "squares", *, refine: bool = False
-) -> JointFit:
-    """Return the fit of another structure, started from an optimum; without `refine` on the coarsest grid."""
-    values = joint.values_by_name
-    return fit_output_error(runs, structure, start=values, loss=loss, refine=refine)
-
-
 def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
     """Return a fit with Caputo initial terms and a constant if it fits as well as one with a history, else None."""
     request = replace(structure, offset="constant")
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
-        few = refit_from(joint, runs, replace(request, initial="caputo"), loss)
+        fit = partial(fit_output_error, runs, start=joint.values_by_name, loss=loss, refine=False)
+        few = fit(replace(request, initial="caputo"))
         # Both fits use the same grids, because discretization errors of a coarse grid are no evidence of a history.
-        many = refit_from(joint, runs, replace(structure, initial=joint.initial), loss)
+        many = fit(replace(structure, initial=joint.initial))
     except FtlmError:
         return None
     fewer = few.initial_terms < many.initial_terms

@@ -37,14 +37,11 @@ class Design:
         Commands of shape (inputs, rows), within all limits.
     score
         Value of the criterion; higher is better.
-    exchanges
-        Number of exchanges made.
     """
 
     name: str
     commands: Floats
     score: float
-    exchanges: int = 0
 
 
 def scaled_design(
@@ -86,8 +83,7 @@ def exchange_holds(
     derivatives, outputs = sensitivities.derivatives(commands()), sensitivities.outputs(commands())
     information = sensitivities.information(derivatives)
     score = float(criterion.score(information)) - _log_limit_excess(outputs, limits)
-    count = 0
-    while count < MAX_EXCHANGES:
+    for _ in range(MAX_EXCHANGES):
         stopped()
         slope = None if score == -math.inf else criterion.gradient(information) / 2
         moves: list[tuple[float, int, int, int, float, Floats]] = []
@@ -125,9 +121,7 @@ def exchange_holds(
             level[k, at + gap] -= step
         derivatives = holds[k].apply_exchange(derivatives, at, gap, step, of_response=False)
         information = sensitivities.information(derivatives)
-        count += 1
-    ended = scaled_design(begin.name, commands(), sensitivities, criterion, bounds)
-    return Design(begin.name, ended.commands, ended.score, count)
+    return scaled_design(begin.name, commands(), sensitivities, criterion, bounds)
 
 
 def _log_limit_excess(outputs: Floats, limits: Floats) -> float:

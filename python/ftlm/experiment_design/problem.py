@@ -273,20 +273,19 @@ class ModelFit:
         return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.refinement)
 
     def predicted_covariance(self, run: Run) -> Floats:
-        """Return the covariance that is predicted for a fit to a simulated run alone, from exact derivatives."""
-        return _covariance_of(self.jacobian(run))
+        """Return the covariance that is predicted for a fit to a simulated run alone, from exact derivatives.
 
-
-def _covariance_of(rows: Floats) -> Floats:
-    """Return the inverse of the Fisher information from scaled derivatives; infinite variances if not identifiable."""
-    size = np.linalg.norm(rows, axis=1)
-    scaled = rows / np.where(size > 0, size, 1.0)[:, None]
-    _, sizes, right = thin_svd(scaled.T)
-    tolerance = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
-    if np.any(size == 0) or sizes[-1] <= tolerance * sizes[0]:
-        return np.diag(np.full(len(rows), np.inf))
-    half = right.T / sizes / size[:, None]
-    return np.asarray(half @ half.T)
+        It is the inverse of the Fisher information. If a parameter is not identifiable, all variances are infinite.
+        """
+        rows = self.jacobian(run)
+        size = np.linalg.norm(rows, axis=1)
+        scaled = rows / np.where(size > 0, size, 1.0)[:, None]
+        _, sizes, right = thin_svd(scaled.T)
+        tolerance = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
+        if np.any(size == 0) or sizes[-1] <= tolerance * sizes[0]:
+            return np.diag(np.full(len(rows), np.inf))
+        half = right.T / sizes / size[:, None]
+        return np.asarray(half @ half.T)
 
 
 def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weights: list[float], every: int) -> Floats:

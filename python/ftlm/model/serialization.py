@@ -13,7 +13,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.model.model import Estimate, Model
 from ftlm.structure.equation import Equation, Friction, Stribeck, Term
 from ftlm.structure.grammar import EquationParser
-from ftlm.structure.input_nonlinearity import InputNonlinearity, NonlinearityKind
+from ftlm.structure.input_nonlinearity import InputNonlinearity
 from ftlm.structure.order import Order
 from ftlm.structure.sensor_filter import SensorFilter
 from ftlm.structure.structure import Offset, Structure, check_initial
@@ -50,51 +50,27 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
         return Term(self.signal, Order(self.order), self.coefficient, self.factor, self.name, shape)
 
 
-class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Stribeck term ``factor * coefficient * exp(-(D y / speed)^2) * sign(D y)`` of friction in a model file."""
-
-    coefficient: float
-    speed: float
-    factor: float = -1.0
-    name: str | None = None
-    speed_name: str | None = None
-
-
 class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
     """Coulomb friction ``factor * coefficient * sign(D y)`` in a model file, with any Stribeck term."""
 
     coefficient: float
     factor: float = -1.0
     name: str | None = None
-    stribeck: StribeckFile | None = None
+    stribeck: Stribeck | None = None
 
     @classmethod
     def of(cls, rubs: Friction) -> FrictionFile:
         """Return the file form of a friction."""
-        out, near = cls(float(rubs.coefficient), rubs.factor, rubs.name), rubs.stribeck
-        if near is not None:
-            more = StribeckFile(float(near.coefficient), float(near.speed), near.factor, near.name, near.speed_name)
-            out.stribeck = more
-        return out
+        return cls(float(rubs.coefficient), rubs.factor, rubs.name, rubs.stribeck)
 
     def friction(self) -> Friction:
         """Return the friction from its file form."""
-        s = self.stribeck
-        near = UNSET if s is None else Stribeck(s.coefficient, s.speed, s.factor, s.name, s.speed_name)
-        return Friction(self.coefficient, self.factor, self.name, near)
+        return Friction(self.coefficient, self.factor, self.name, self.stribeck or UNSET)
 
     @property
     def count(self) -> int:
         """Number of friction parameters."""
         return 1 if self.stribeck is None else 3
-
-
-class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Saturation or dead zone of an input in a model file, in the unit of the input."""
-
-    signal: str
-    law: NonlinearityKind
-    value: float
 
 
 class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -124,14 +100,6 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
         return 1 + 2 * len(self.terms) + (0 if self.friction is None else self.friction.count)
 
 
-class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Sensor filter of signals in a model file."""
-
-    signals: tuple[str, ...]
-    numerator: tuple[tuple[float, float], ...]
-    denominator: tuple[tuple[float, float], ...]
-
-
 class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     """File form of a model, without data that only the identification requires."""
 
@@ -142,21 +110,19 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     coupling: Literal["measured", "simulated"]
     delay: dict[str, float]
     initial: str | list[float]
-    sensor_filter: FilterFile | None
+    sensor_filter: SensorFilter | None
     units: dict[str, str]
     orders: dict[str, float]
     m: int | None
     about: dict[str, str | float | int | bool | None]
     estimate: Estimate | None = None
     offset: Offset = "none"
-    limits: list[LimitFile] = []
+    limits: tuple[InputNonlinearity, ...] = ()
 
     @classmethod
     def of(cls, model: Model) -> ModelFile:
         """Return the file form of a model."""
         s = model.structure
-        sensor = s.sensor_filter
-        values = [(limit, limit.value) for limit in s.limits]
         return cls(
             "ftlm-model",
             MODEL_SCHEMA,
@@ -165,14 +131,14 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             s.coupling,
             dict(s.delay),
             s.initial if isinstance(s.initial, str) else list(s.initial),
-            None if sensor is None else FilterFile(sensor.signals, sensor.numerator, sensor.denominator),
+            s.sensor_filter,
             dict(model.units),
             dict(model.orders),
             model.m,
             dict(model.about),
             model.estimate,
             s.offset,
-            [LimitFile(limit.signal, limit.law, v) for limit, v in values if not isinstance(v, tuple)],
+            s.limits,
         )
 
     def restore_model(self) -> Model:
@@ -183,17 +149,15 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         ModelError
             If an equation is invalid, or the covariance has the wrong size.
         """
-        file = self.sensor_filter
-        sensor = None if file is None else SensorFilter(file.signals, file.numerator, file.denominator)
         structure = Structure(
             equations=tuple(e.equation() for e in self.equations),
             coupling=self.coupling,
             delay=self.delay,
             initial=check_initial(self.initial),
-            sensor_filter=sensor,
+            sensor_filter=self.sensor_filter,
             name=self.name,
             offset=self.offset,
-            input_nonlinearities=tuple(InputNonlinearity(x.signal, x.law, x.value) for x in self.limits) or UNSET,
+            input_nonlinearities=self.limits or UNSET,
         )
         if self.estimate is not None and self.estimate.covariance is not None:
             count = sum(e.count for e in self.equations)
@@ -238,4 +202,4 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     try:
         return read.restore_model()
     except ModelError as error:
-        raise DataError(f"{path} holds no usable model: {error_text(error)}") from error
+        raise DataError(f"{path} holds no usable model: {error_text(error)}; give a file written by save()") from error

@@ -271,13 +271,10 @@ def _check_known_inputs(structure: Structure) -> None:
         )
 
 
-def apply_input_nonlinearity(run: Run, structure: Structure, name: str | None = None) -> Run:
-    """Return the run with the structure's known saturations and dead zones applied to its inputs.
-
-    `name` restricts this to one input.
-    """
+def apply_input_nonlinearity(run: Run, structure: Structure) -> Run:
+    """Return the run with the structure's known saturations and dead zones applied to its inputs."""
     _check_known_inputs(structure)
-    limits = [limit for limit in structure.limits if limit.signal in run and name in (None, limit.signal)]
+    limits = [limit for limit in structure.limits if limit.signal in run]
     return run.with_input_nonlinearities(limits) if limits else run
 
 

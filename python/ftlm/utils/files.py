@@ -168,7 +168,7 @@ def nearest_file_hint(path: Path) -> str:
     return nearest(path.name, beside)
 
 
-def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_bytes: int) -> bytes:
+def read_small_file(path: str | os.PathLike[str], what: str, source: str) -> bytes:
     """Return the bytes of a regular file within a size limit; pipes and devices are rejected.
 
     Parameters
@@ -177,8 +177,6 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
         File to read.
     what, source
         Name of the content, and remedy: the kind of file to pass.
-    max_bytes
-        Size limit.
 
     Raises
     ------
@@ -191,9 +189,9 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
     try:
         descriptor = os.open(file, _READ_FLAGS)
         state = os.fstat(descriptor)
-        if stat.S_ISREG(state.st_mode) and state.st_size <= max_bytes:
+        if stat.S_ISREG(state.st_mode) and state.st_size <= MAX_SMALL_FILE_BYTES:
             with os.fdopen(descriptor, "rb") as stream:
-                return stream.read(max_bytes)
+                return stream.read(MAX_SMALL_FILE_BYTES)
         os.close(descriptor)
     except (OSError, ValueError) as error:
         # The path may be too long or unprintable for a message.
@@ -206,7 +204,7 @@ def read_small_file(path: str | os.PathLike[str], what: str, source: str, max_by
         raise DataError(f"{what} {path_text} cannot be read: {why}{hint}; check the path") from error
     if not stat.S_ISREG(state.st_mode):
         raise DataError(f"{file} is not a regular file; give {source}")
-    raise DataError(f"{file} has {state.st_size} bytes, no {what} is larger than {max_bytes}; give {source}")
+    raise DataError(f"{file} has {state.st_size} bytes, no {what} is larger than {MAX_SMALL_FILE_BYTES}; give {source}")
 
 
 F = TypeVar("F", bound=msgspec.Struct)
@@ -229,7 +227,7 @@ def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F
     DataError
         If the file cannot be read, is too large, is not TOML, or has other content.
     """
-    content = read_small_file(path, what, source, MAX_SMALL_FILE_BYTES)
+    content = read_small_file(path, what, source)
     try:
         # Other editors put a byte-order mark first.
         return msgspec.toml.decode(content.removeprefix(b"\xef\xbb\xbf"), type=kind)
@@ -296,7 +294,7 @@ class JsonFormat(Generic[T]):
         DataError
             If the file cannot be read, is too large, or has another format or schema.
         """
-        content = read_small_file(path, self.what, self.source, MAX_SMALL_FILE_BYTES)
+        content = read_small_file(path, self.what, self.source)
         file = Path(path)
         self._check_schema(file, content)
         try:
