@@ -152,7 +152,7 @@ def test_a_fit_that_failed_cannot_be_told(fractional):
     assert "second → first" in verdict.words
     assert "no fit" in verdict.words
     assert broken.verdict("both fractional").improves is True
-    assert verdict_sentence("theta12", verdict).endswith("cannot be told.")
+    assert verdict_sentence("theta12", verdict).endswith("is inconclusive.")
 
 
 def test_a_fit_that_is_worse_than_what_it_contains_tells_nothing(fractional):
@@ -198,7 +198,7 @@ def test_a_page_without_a_fit_says_so(fractional, tmp_path):
     text = cross_validation_page(found, tmp_path / "orders.html").read_text()
     assert "both fractional: no fit" in text
     assert "no start was found" in text
-    assert "cannot be told." in text
+    assert "is inconclusive." in text
     assert "no fit" in cross_validation_text(found)
 
 

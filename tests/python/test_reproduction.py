@@ -161,7 +161,7 @@ def test_verdicts_follow_the_numbers(reproduction):
     ):
         assert by_words(found, words).verdict == "does not hold", words
     # One simulated arm says nothing of the paper's.
-    assert by_words(found, "orders of Tables 4 and 5").verdict == "cannot be told from a simulated truth"
+    assert by_words(found, "orders of Tables 4 and 5").verdict == "not decidable by a simulation"
     measured = checks(replace(reproduction, simulated=False))
     assert by_words(measured, "orders of Tables 4 and 5").verdict == "does not hold"
     form = by_words(found, "find the orders of an arm").computed
@@ -197,7 +197,7 @@ def test_multi_innovation_against_its_rivals_turns_with_k0(reproduction):
 
 def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
     claim = by_words(checks(reproduction), "larger p converges faster")
-    assert claim.verdict == "turns with K0"
+    assert claim.verdict == "depends on K0"
     assert [(level, held == count) for level, count, held in claim.ruling.levels] == [
         ("1", True),
         ("10¹⁰", False),
@@ -216,7 +216,7 @@ def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
 
 def test_larger_p_has_a_smaller_error_on_some_angles_with_one_prior(reproduction):
     claim = by_words(checks(reproduction), "larger innovation length")
-    assert claim.verdict.startswith("turns with")
+    assert claim.verdict.startswith("depends on")
     assert set(claim.ruling.factors) == {"K0", "the angle"}
     for t in reproduction.panel.trials:
         if t.prior == 1e10:
@@ -226,7 +226,7 @@ def test_larger_p_has_a_smaller_error_on_some_angles_with_one_prior(reproduction
 def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduction):
     found = checks(reproduction)
     for words in ("better than whole ones", "closer to the run than the manual's"):
-        assert by_words(found, words).verdict == "cannot be told from a simulated truth"
+        assert by_words(found, words).verdict == "not decidable by a simulation"
     freed = {(f.arm, f.stage): f for f in reproduction.panel.order_comparisons}
     for stage in (1, 2):
         put_in, whole = freed["fractional", stage], freed["whole orders", stage]
@@ -243,7 +243,7 @@ def test_fractional_against_whole_cannot_be_told_from_a_simulated_truth(reproduc
     own = replace(reproduction.panel, trials=(), order_comparisons=(freed["fractional", 1], freed["fractional", 2]))
     measured = replace(reproduction, simulated=False, panel=own)
     assert by_words(checks(measured), "better than whole ones").verdict == "holds"
-    assert by_words(checks(measured), "closer to the run than the manual's").verdict == "cannot be told"
+    assert by_words(checks(measured), "closer to the run than the manual's").verdict == "inconclusive"
 
 
 def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
@@ -261,14 +261,14 @@ def test_fractional_orders_earn_their_place_on_runs_that_were_not_fitted():
     assert replace(whole, gains={"y": 3.0}).improves("y") is None
     data = SimpleNamespace(panel=Panel((), (), (replace(better, is_degenerate=True),)), simulated=False)
     claim = make_check(fractional_orders, data)
-    assert claim.verdict == "cannot be told"
-    assert "Not told in 1 cases" in claim.computed
+    assert claim.verdict == "inconclusive"
+    assert "Inconclusive in 1 cases" in claim.computed
 
 
 def test_a_fit_that_must_not_be_used_is_no_case_of_a_claim(reproduction):
     label = "published, output error"
     stages = dict(reproduction.stages)
-    for number, verdict, cases in ((2, "does not hold", 1), (1, "cannot be told", 0)):
+    for number, verdict, cases in ((2, "does not hold", 1), (1, "inconclusive", 0)):
         candidates = stages[number].candidates
         worse = replace(candidates[label], result=candidates["instrumental variables"].result)
         stages[number] = replace(stages[number], candidates={**candidates, label: worse})

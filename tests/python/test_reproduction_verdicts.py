@@ -53,18 +53,18 @@ def cases(rule, *, arms=("one", "two"), angles=("a", "b")):
 def test_where_all_cases_agree_the_verdict_is_theirs():
     assert str(combine_cases(cases(lambda *_: True))) == "holds"
     assert str(combine_cases(cases(lambda *_: False))) == "does not hold"
-    assert str(combine_cases([])) == "cannot be told"
+    assert str(combine_cases([])) == "inconclusive"
 
 
 def test_a_verdict_turns_with_what_changes_it_while_all_else_stays():
     weak = combine_cases(cases(lambda prior, *_: prior == "weak"))
-    assert (str(weak), weak.cases, weak.holding_cases) == ("turns with K0", 8, 4)
+    assert (str(weak), weak.cases, weak.holding_cases) == ("depends on K0", 8, 4)
     assert weak.levels == (("1", 4, 0), ("weak", 4, 4))
     both = combine_cases(cases(lambda prior, arm, angle: prior == "weak" and angle == "a"))
     assert set(both.factors) == {"K0", "the angle"}
     assert str(combine_cases(cases(lambda prior, arm, angle: (prior == "weak") != (angle == "a")))) in (
-        "turns with K0 and the angle",
-        "turns with the angle and K0",
+        "depends on K0 and the angle",
+        "depends on the angle and K0",
     )
 
 
@@ -72,14 +72,14 @@ def test_what_turns_with_the_arm_cannot_be_told_of_the_machine_from_a_simulated_
     def of_arm(prior, arm, angle):
         return arm == "one" and angle == "a"
 
-    assert str(combine_cases(cases(of_arm), of_the_machine=True)) == "cannot be told from a simulated truth"
-    assert combine_cases(cases(of_arm)).word == "turns with"
+    assert str(combine_cases(cases(of_arm), of_the_machine=True)) == "not decidable by a simulation"
+    assert combine_cases(cases(of_arm)).word == "depends on"
     # What the arm does not change can be told of any.
-    assert str(combine_cases(cases(lambda prior, *_: prior == "1"), of_the_machine=True)) == "turns with K0"
+    assert str(combine_cases(cases(lambda prior, *_: prior == "1"), of_the_machine=True)) == "depends on K0"
     # One arm says what was put into it, whatever it says.
     for rule in (of_arm, lambda *_: True, lambda *_: False):
         one = combine_cases(cases(rule, arms=("one",)), of_the_machine=True)
-        assert (str(one), one.cases) == ("cannot be told from a simulated truth", 4)
+        assert (str(one), one.cases) == ("not decidable by a simulation", 4)
     assert str(combine_cases(cases(lambda *_: True), of_the_machine=True)) == "holds"
 
 

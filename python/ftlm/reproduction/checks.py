@@ -31,7 +31,7 @@ from ftlm.validation.comparison import metrics
 if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
 
-Word = Literal["holds", "does not hold", "turns with", "cannot be told from a simulated truth", "cannot be told"]
+Word = Literal["holds", "does not hold", "depends on", "not decidable by a simulation", "inconclusive"]
 #: Case of a claim: whether the claim holds, and the conditions by name, the same names in all cases of a claim.
 Case = tuple[bool, dict[str, str]]
 #: Factor chosen by the simulation; a verdict that it alone decides reproduces this choice.
@@ -65,7 +65,7 @@ class ClaimVerdict:
 
     def __str__(self) -> str:
         words = " and ".join(part for part in (", ".join(self.factors[:-1]), *self.factors[-1:]) if part)
-        return f"{self.word} {words}" if self.word == "turns with" else self.word
+        return f"{self.word} {words}" if self.word == "depends on" else self.word
 
     @property
     def counts(self) -> str:
@@ -106,19 +106,19 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
         return ClaimVerdict(word, tuple(factors), len(cases), holding, levels)
 
     if not cases:
-        return verdict("cannot be told")
+        return verdict("inconclusive")
     if of_the_machine and len({factors.get(ARM_FACTOR) for _, factors in cases}) < 2:
-        return verdict("cannot be told from a simulated truth", [ARM_FACTOR])
+        return verdict("not decidable by a simulation", [ARM_FACTOR])
     if holding in (0, len(cases)):
         return verdict("holds" if holding else "does not hold")
     names = list(cases[0][1])
     turning = sorted(filter(flips, names), key=flips, reverse=True)
     if of_the_machine and ARM_FACTOR in turning:
-        return verdict("cannot be told from a simulated truth", [ARM_FACTOR], ARM_FACTOR)
+        return verdict("not decidable by a simulation", [ARM_FACTOR], ARM_FACTOR)
     # One factor that decides every outcome says all.
     deciding = [n for n in names if all(len(set(g)) == 1 for g in outcomes(itemgetter(n)).values())]
     factors = deciding[:1] or turning or names
-    return verdict("turns with", factors, factors[0])
+    return verdict("depends on", factors, factors[0])
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Check:
         """Return the check for JSON."""
         counts = {"cases": self.ruling.cases, "held": self.ruling.holding_cases}
         texts = {"computed": self.computed, "printed": self.printed, "rule": self.rule}
-        return {"claim": self.claim, "verdict": self.verdict, "turns with": list(self.ruling.factors)} | counts | texts
+        return {"claim": self.claim, "verdict": self.verdict, "depends on": list(self.ruling.factors)} | counts | texts
 
 
 def by_angle(numbers: Mapping[str, Iterable[float]], digits: int = 3) -> str:

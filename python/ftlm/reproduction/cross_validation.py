@@ -56,7 +56,7 @@ CHARTED_KIND = "both fractional"
 #: Kinds with a fractional order.
 FRACTIONAL_KINDS = tuple(kind for kind in FREE_ORDERS_BY_KIND if kind != INTEGER_KIND)
 #: Verdict in a table cell.
-VERDICT_CELLS = {True: "yes", False: "no", None: "cannot be told"}
+VERDICT_CELLS = {True: "yes", False: "no", None: "inconclusive"}
 #: Points of a line.
 LINE_POINTS = 700
 

@@ -141,7 +141,7 @@ def demo_run(
         Another shape, or negative noise.
     """
     if not (np.isfinite(noise) and noise >= 0):
-        raise ModelError(f"{setting('noise')} {noise} rad is not a non-negative number")
+        raise ModelError(f"{setting('noise')} {noise} rad is not a standard deviation; give a number of at least 0")
     if shape not in CURRENT_AMPLITUDES_A:
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
     recorded = record(
