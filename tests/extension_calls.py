@@ -637,14 +637,14 @@ class Sound:
 
     def search_plan(self):
         _, orders, inputs, _, terms, settings = self.asked()
-        return orders, inputs, terms, settings, self.one(None, 0, 1)
+        return orders, inputs, terms, settings
 
     def search_join(self):
         if "parts" not in self.kept or self.random.random() < 0.05:
             asked = self.asked()
             runs, orders, inputs, _, terms, settings = asked
             whole = _core.OrderSearch(*asked)
-            _, waves, _ = _core.search_plan(orders, inputs, terms, settings, None)
+            _, waves = _core.search_plan(orders, inputs, terms, settings)
             ends = [0, *waves] if waves[0] else waves
             parts = [whole.rounds(a, b, [], None, 1, None, None) for a, b in itertools.pairwise(ends)]
             samples = sum(run[1].shape[1] for run in runs)

@@ -115,7 +115,7 @@ class FractionalRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.Ba
         inputs = tuple(s for s in structure.signals if s not in structure.outputs)
         for what, names, count in (("X", inputs, X.shape[1]), ("y", structure.outputs, table.shape[1])):
             if len(names) != count:
-                raise ValueError(f"{what} has {count} columns, and the structure has {len(names)}: {', '.join(names)}")
+                raise ValueError(f"{what} has {count} columns; give those of the structure: {', '.join(names)}")
         by_name = not isinstance(self.structure, str) or self.structure != "auto"
         self._inputs = _in_order("X", inputs, getattr(self, "feature_names_in_", None) if by_name else None)
         self._outputs = _in_order("y", structure.outputs, columns if by_name else None)

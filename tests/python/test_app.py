@@ -717,7 +717,7 @@ def test_fields_become_arguments():
         ({"skip": "1.5"}, "skip: '1.5'"),
         ({"skip": "9" * 40}, "not a number of lines"),
         ({"skip": "²"}, "not a number of lines"),
-        ({"decimal": []}, "decimal must be text"),
+        ({"decimal": []}, "decimal is not text"),
         ({"columns": "x"}, "not a list"),
         ({"columns": [3]}, "not an object"),
         ({"columns": [{"name": "a", "role": "boss"}]}, "'boss' of column 'a'"),

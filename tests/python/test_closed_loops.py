@@ -382,7 +382,7 @@ def test_a_weak_reference_is_named():
     [
         ("q", ftlm.DataError, "has no signal 'q'"),
         ("u", ftlm.ModelError, "is a signal of the model"),
-        (3, ftlm.ModelError, "not the name of a signal"),
+        (3, ftlm.ModelError, "give the name of a signal"),
         ("still", ftlm.DataError, "is constant, so it explains no input"),
     ],
 )

@@ -435,7 +435,7 @@ def test_the_command_line_names_filtered_signals():
         (
             {"filtered_signals": ["y"], "sensor_filter": "slow"},
             WORDS,
-            "--sensor-filter 'slow' is not stock, HZ or HZ:DAMPING",
+            "--sensor-filter 'slow' is not a filter; give stock, HZ or HZ:DAMPING",
         ),
         ({"filtered_signals": ["w"]}, WORDS, "filtered signal 'w' does not occur"),
         (

@@ -517,7 +517,7 @@ def test_the_command_says_what_python_says(tmp_path):
     assert "validation" in done.stdout
     for words, code, text in (
         (["--structure", ARC, "--weights", "deviation"], 3, "states no standard deviation; use --weights relative"),
-        (["--structure", "arm:1"], 2, "a frequency response takes an equation in words"),
+        (["--structure", "arm:1"], 2, "a frequency response needs an equation"),
         (["--structure", ARC, "--columns", "amplitude=dB"], 3, "'amplitude' is not part"),
         (["--structure", ARC, "--frequency-unit", "kHz"], 3, "states Hz, and --frequency-unit kHz is asked for"),
         (["--structure", ARC, "--start", "alfa=1"], 2, "did you mean alpha?"),

@@ -256,9 +256,9 @@ def test_a_model_with_limits_is_kept(tmp_path):
 @pytest.mark.parametrize(
     ("text", "options", "words"),
     [
-        ("D y = a y + b sat(u, -1)", {}, "saturation of u = -1.0 is not a number above 0"),
+        ("D y = a y + b sat(u, -1)", {}, "saturation of u = -1.0 is out of range; give a number above 0"),
         ("D y = a y + b sat(u)", {}, "expected ','"),
-        ("D y = a y + b sat(u, 0)", {}, "saturation of u = 0.0 is not a number above 0"),
+        ("D y = a y + b sat(u, 0)", {}, "saturation of u = 0.0 is out of range; give a number above 0"),
         ("D y = a y + b sat(u, 2:1)", {}, "from 2.0 to 1.0 is not an interval"),
         ("D y = a y + b sat(u, 1", {}, "expected '\\)'"),
         ("D y = a y + b sat(D u, 1)", {}, "the name of a signal"),
@@ -268,7 +268,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
         ("D y = a sat(y, 1) + b u", {}, "limited input"),
         ("D y = a y + b u", {"saturation": {"v": 1.0}}, "limited input"),
         ("D y = a y + b u", {"saturation": {"u": "much"}}, "saturation of u"),
-        ("D y = a y + b u", {"saturation": {"u": (1, 2, 3)}}, "neither a number nor"),
+        ("D y = a y + b u", {"saturation": {"u": (1, 2, 3)}}, "has another size; give"),
         ("D y = a y + b u", {"dead_zone": {"u": (0, 1)}, "saturation": {"u": 2.0}}, "saturates after it"),
         (
             "D y = a y + b u",

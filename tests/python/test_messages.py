@@ -526,6 +526,6 @@ def test_a_validation_run_has_its_own_window(tmp_path, small_run, saved):
     assert alone.exit_code == 2
     assert "--validation-window is a part of the run that --validation names" in alone.stderr
     assert (
-        "--validation-window '3' is not FROM:TO"
+        "--validation-window '3' is not an interval; give FROM:TO"
         in run_command(*words, "--validation", saved, "--validation-window", 3).stderr
     )

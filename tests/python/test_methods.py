@@ -24,7 +24,7 @@ BAD_VALUES = {
     "loss": ("cubes", "loss = 'cubes' is not known; use 'squares' or 'huber'"),
     "intervals": ("likelihood", "intervals = 'likelihood' is not known"),
     "start": (3.0, "start is float; give an identification, a model, or values by name"),
-    "reference": (3, "reference is int, not the name of a signal of the runs"),
+    "reference": (3, "reference is int; give the name of a signal of the runs"),
     "noise": ("arma", "noise = 'arma' is not known; use 'white' or 'ar'"),
     "order_grid": ({"alpha": 1}, "is dict, not"),
     "criterion": ("error", "criterion = 'error' is not known"),
@@ -37,7 +37,7 @@ BAD_VALUES = {
     "row_basis": ("columns", "row_basis = 'columns' is not known"),
     "seeds": ("12", "seeds = '12': give 1 to 1000 whole numbers"),
     "evaluations": (100, "evaluations = 100 is less than two generations of 200"),
-    "population": (4, "population = 4 is outside [8, 100000]"),
+    "population": (4, "population = 4 is out of range; give a whole number from 8"),
     "bounds": ({"a": (1.0, 0.0)}, "bounds of a = (1.0, 0.0) are not an interval"),
 }
 
@@ -189,7 +189,7 @@ def test_an_estimator_of_ones_own(noisy):
 def test_a_fit_is_a_fit(noisy):
     own = Halved()
     own.fit = lambda *_, **__: None
-    with pytest.raises(ftlm.ModelError, match="the method 'halved' fitted a NoneType, not a Fit"):
+    with pytest.raises(ftlm.ModelError, match="the method 'halved' fitted a NoneType; return a Fit"):
         ftlm.identify(noisy, ftlm.equation(FIXED), method=own)
     fit = ftlm.LeastSquares().fit([noisy], ftlm.equation(FIXED), m=64)
     assert isinstance(fit, Fit)

@@ -265,11 +265,11 @@ def test_a_controller_is_reset_and_told_of():
 
 REFUSED = [
     ({"controller": 3, "reference": HOLD}, ftlm.ModelError, "controller is a int"),
-    ({"reference": "text"}, ftlm.DataError, "not an array of numbers"),
-    ({"reference": None}, ftlm.DataError, "not an array of numbers"),
-    ({"reference": []}, ftlm.DataError, "not an array of numbers"),
-    ({"reference": [[0.1], [0.1]]}, ftlm.DataError, "not an array of numbers"),
-    ({"reference": [(0.1, 0.1j)] * 200}, ftlm.DataError, "not an array of numbers"),
+    ({"reference": "text"}, ftlm.DataError, "not an array of hub angles"),
+    ({"reference": None}, ftlm.DataError, "not an array of hub angles"),
+    ({"reference": []}, ftlm.DataError, "not an array of hub angles"),
+    ({"reference": [[0.1], [0.1]]}, ftlm.DataError, "not an array of hub angles"),
+    ({"reference": [(0.1, 0.1j)] * 200}, ftlm.DataError, "not an array of hub angles"),
     ({"reference": [(0, 1), (0,)]}, ftlm.DataError, "not an array of numbers"),
     ({"reference": (0.1, 0.1)}, ftlm.ModelError, "needs duration"),
     ({"reference": np.zeros((2, 2))}, ftlm.ModelError, "fewer than three samples"),

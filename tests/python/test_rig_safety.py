@@ -837,8 +837,8 @@ def test_the_stand_in_sees_lists_wrong_types_and_unknown_calls(hardware):
         (("deflection", 0, 1.0, float("nan")), r"with the number nan; give more bend \[rad\]"),
         (("late", 0, 1.0, -1.0), "with the number -1.0; give delay"),
         (("dead encodr", 0, 1.0, 0.0), "'dead encodr' is not known; use 'dead encoder' or"),
-        (("dead encoder", 0), "is not .name, channel, time"),
-        (3, "is not .name, channel, time"),
+        (("dead encoder", 0), "; give .name, channel, time"),
+        (3, "; give .name, channel, time"),
     ],
 )
 def test_a_fault_that_could_not_be_the_one_that_was_named_is_refused(fault, words):

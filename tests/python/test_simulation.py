@@ -204,7 +204,7 @@ def test_initial_terms_are_added():
 
 
 def test_initial_terms_of_nothing_are_refused(small_model, small_run):
-    with pytest.raises(ftlm.ModelError, match="initial terms of 'z', which is not an output of the model: y"):
+    with pytest.raises(ftlm.ModelError, match="initial terms of 'z', which is no output of the model; give those of y"):
         small_model.simulate(small_run, initial={"z": {0.0: 1.0}})
     with pytest.raises(ftlm.ModelError, match=r"exponent -2 of an initial term is outside \(-1, 10\]"):
         small_model.simulate(small_run, initial={"y": {-2.0: 1.0}})

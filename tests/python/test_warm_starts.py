@@ -102,7 +102,7 @@ def test_words_for_a_start_that_is_none(run, simple):
     rich = ftlm.equation(RICH, initial="rest")
     with pytest.raises(ftlm.ModelError, match="start value 'c' does not occur"):
         ftlm.identify(run, rich, method=ftlm.OutputError(start={"c": 1.0}))
-    with pytest.raises(ftlm.ModelError, match="start= names none of the free parameters: alpha, mu, d, a, b"):
+    with pytest.raises(ftlm.ModelError, match="start= names no free parameter; give values of alpha, mu, d, a, b"):
         ftlm.identify(run, rich, method=ftlm.OutputError(start={}))
     with pytest.raises(ftlm.ModelError, match="start= has alpha = 9, out of its bounds"):
         ftlm.identify(run, rich, method=ftlm.OutputError(start={"alpha": 9.0}))

@@ -507,7 +507,7 @@ def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str
     if names_argument is not None:
         names = [names_argument] if isinstance(names_argument, str) else list(names_argument)
         if len(names) != count:
-            raise ModelError(f"{what}: {len(names)} given, the system has {count}")
+            raise ModelError(f"{what}: {len(names)} given, the system has {count}; give {count} names")
         return names
     names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]
     plain = [_LABEL_PATTERN.fullmatch(n) for n in names]

@@ -384,7 +384,7 @@ def _roles(columns: Any) -> dict[str, Any]:
     roles: dict[str, Any] = {}
     for entry in columns:
         if not isinstance(entry, Mapping):
-            raise DataError("a column is not an object with name, role, signal and unit")
+            raise DataError("a column is not an object; give name, role, signal and unit of each")
         name, role = _text(entry, "name"), _text(entry, "role")
         signal, unit = _text(entry, "signal") or name, _text(entry, "unit")
         if role not in COLUMN_ROLES:
@@ -427,7 +427,7 @@ def _text(texts: Mapping[str, Any], name: str) -> str:
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise DataError(f"{name} must be text")
+        raise DataError(f"{name} is not text; give a text or a number")
     return str(value).strip() if name not in ("name",) else str(value)
 
 

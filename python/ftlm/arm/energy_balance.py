@@ -142,9 +142,7 @@ def energies(
     at = {n: float((orders or {}).get(n, integer_order(n))) for n in free}
     for name in free[2:]:
         if not 0.0 <= at[name] <= 1.0:
-            raise ModelError(
-                f"{name} = {at[name]:g} is outside [0, 1], the range in which a force only stores and dissipates energy"
-            )
+            raise ModelError(f"{name} = {at[name]:g} is outside [0, 1]; give an order of a passive force")
     link = parameters or PARAMETER_SETS["effective"][stage]
     hub, bend, current = (
         np.asarray(run[n], dtype=np.float64) for n in (f"theta{stage}1", f"theta{stage}2", f"I{stage}")

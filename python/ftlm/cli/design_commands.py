@@ -313,5 +313,7 @@ def _sizes(option: str, texts: list[str] | None) -> float | dict[str, float] | N
         try:
             return float(texts[0])
         except ValueError:
-            raise ModelError(f"{option} {texts[0]!r} is neither a number nor INPUT=NUMBER") from None
+            raise ModelError(
+                f"{option} {texts[0]!r} is neither a number nor INPUT=NUMBER; give one of the two"
+            ) from None
     return numbers(option, texts) or None

@@ -78,7 +78,9 @@ def check_structures(texts: Sequence[str], shape: StructureOptions) -> Structure
         raise ModelError("--structure auto cannot be combined with another structure; leave one of them out")
     options = replace(shape, delay=None, only=None).given_options()
     if options:
-        raise ModelError(f"{', '.join(options)}: options of a given structure, not used with --structure auto")
+        raise ModelError(
+            f"{', '.join(options)}: options of a given structure, not used with --structure auto; leave them out"
+        )
     return None
 
 
@@ -541,7 +543,7 @@ def identify_frequency(
         Validate the model on this response.
     """
     if structure.startswith(("flexible-link", "arm:")) or structure == "auto":
-        raise ModelError(f"--structure {structure!r}: a frequency response takes an equation in words")
+        raise ModelError(f"--structure {structure!r}: a frequency response needs an equation, such as 'D y = a y + u'")
     records = [reading.load(file) for file in files]
     with Progress("fitting", quiet=as_json) as progress:
         result = frequency_estimation(

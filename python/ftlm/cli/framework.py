@@ -39,9 +39,9 @@ def pairs(option: str, texts: list[str] | None) -> dict[str, str]:
             short = re.sub(r"\W+", "_", name.partition("(")[0]).strip("_0123456789").lower() or "name"
             raise ModelError(f'{option} {item!r} has no name; write NAME=…, such as {option} "{short}={item}"')
         if not name or not value:
-            raise ModelError(f"{option} {item!r} is not NAME=VALUE")
+            raise ModelError(f"{option} {item!r} is not a pair; give NAME=VALUE")
         if name in values:
-            raise ModelError(f"{option} names {name!r} twice")
+            raise ModelError(f"{option} names {name!r} twice; give it once")
         values[name] = value
     return values
 
@@ -53,7 +53,7 @@ def numbers(option: str, texts: list[str] | None) -> dict[str, float]:
         try:
             values[name] = float(value)
         except ValueError:
-            raise ModelError(f"{option} {name}={value}: {value!r} is not a number") from None
+            raise ModelError(f"{option} {name}={value}: {value!r} is not a number; give NAME=NUMBER") from None
     return values
 
 
@@ -64,7 +64,9 @@ def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[floa
     for name, value in pairs(option, texts).items():
         ends = split_numbers(value)
         if len(ends) not in (1, 2):
-            raise ModelError(f"{option} {name}={value}: {value!r} is neither {what} nor LOW:HIGH, as in {example}")
+            raise ModelError(
+                f"{option} {name}={value}: {value!r} is not a value; give {what} or LOW:HIGH, such as {example}"
+            )
         values[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
     return values
 
@@ -77,7 +79,7 @@ def interval(text: str, option: str, example: str) -> tuple[float | None, float 
             raise ValueError
         start, stop = (float(p) if p.strip() else None for p in parts)
     except ValueError:
-        raise ModelError(f"{option} {text!r} is not FROM:TO, such as {example}") from None
+        raise ModelError(f"{option} {text!r} is not an interval; give FROM:TO, such as {example}") from None
     return start, stop
 
 
@@ -85,7 +87,8 @@ def parse_numbers(option: str, text: str, *counts: int) -> list[float]:
     """Return numbers that are joined by colons; raise ModelError unless their count is one of `counts`."""
     values = split_numbers(text)
     if len(values) not in counts:
-        raise ModelError(f"{option} {text!r} is not {' or '.join(str(c) for c in counts)} numbers joined by a colon")
+        choices = " or ".join(str(c) for c in counts)
+        raise ModelError(f"{option} {text!r} has another number of values; give {choices} numbers joined by a colon")
     return values
 
 

@@ -179,7 +179,7 @@ class StructureOptions:
             return SensorFilter.low_pass(self.filtered_signals, float(frequency), float(damping or 0.9))
         except ValueError:
             raise ModelError(
-                f"--sensor-filter {self.sensor_filter!r} is not stock, HZ or HZ:DAMPING, such as 2:0.9"
+                f"--sensor-filter {self.sensor_filter!r} is not a filter; give stock, HZ or HZ:DAMPING, such as 2:0.9"
             ) from None
 
     def _arm(self, text: str, alone: bool) -> Structure:
@@ -239,7 +239,7 @@ class StructureOptions:
             return tuple(float(exponent) for exponent in self.initial.split(","))
         except ValueError:
             raise ModelError(
-                f"--initial {self.initial!r} is not {', '.join(INITIAL_CHOICES)} or exponents such as 0,1"
+                f"--initial {self.initial!r} is not known; give {', '.join(INITIAL_CHOICES)} or exponents such as 0,1"
             ) from None
 
 

@@ -22,7 +22,7 @@ def checked_rate(rate: object) -> float:
     value = real_number("rate", rate)
     if not RATE_RANGE_HZ[0] <= value <= RATE_RANGE_HZ[1]:
         raise ModelError(
-            f"{setting('rate')} {short_repr(rate)} Hz is not a positive number of samples per second from "
+            f"{setting('rate')} {short_repr(rate)} Hz is out of range; give samples per second from "
             f"{RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g}"
         )
     return value
@@ -56,11 +56,11 @@ def positive(name: str, value: object) -> float:
     """Return a number; raise ModelError if it is not finite and positive."""
     number = real_number(name, value)
     if not (math.isfinite(number) and number > 0):
-        raise ModelError(f"{name} = {short_repr(value)} is not a finite number above 0")
+        raise ModelError(f"{name} = {short_repr(value)} is not positive and finite; give a number above 0")
     if not POSITIVE_RANGE[0] <= number <= POSITIVE_RANGE[1]:
         raise ModelError(
-            f"{name} = {short_repr(value)} is outside [{POSITIVE_RANGE[0]:g}, {POSITIVE_RANGE[1]:g}], where squares "
-            "are numbers"
+            f"{name} = {short_repr(value)} is out of range; give a number from {POSITIVE_RANGE[0]:g} to "
+            f"{POSITIVE_RANGE[1]:g}"
         )
     return number
 
@@ -69,7 +69,7 @@ def check_limit(limit: object) -> float:
     """Return the limit of a command, which may be infinite; raise ModelError if it is not positive."""
     most = real_number("limit", limit)
     if not most > 0:
-        raise ModelError(f"{setting('limit')} {short_repr(limit)} is not a number above 0")
+        raise ModelError(f"{setting('limit')} {short_repr(limit)} is not positive; give a number above 0, or inf")
     return most
 
 

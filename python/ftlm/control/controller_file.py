@@ -268,7 +268,7 @@ class JointControllers:
         self._reads: list[list[int]] = []
         for j, loop in enumerate(self.loops):
             if not isinstance(loop, (DiscretePid, Lqg, type(None))):
-                raise ModelError("first and second are DiscretePid or Lqg controllers, or None")
+                raise ModelError(f"controller {j + 1} is a {type(loop).__name__}; give a DiscretePid, an Lqg or None")
             names = loop.observer.measured if isinstance(loop, Lqg) else (ANGLE_NAMES[2 * j],)
             unknown = [n for n in names if n not in ANGLE_NAMES]
             if unknown:

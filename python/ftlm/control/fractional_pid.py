@@ -162,9 +162,8 @@ class DiscretePid:
         low, high = frequency_pair(band)
         if not (0 < low < high <= half and high <= MAX_BAND_RATIO * low):
             raise ModelError(
-                f"band = ({low:g}, {high:g}) rad/s is not an interval up to half the rate, {half:g} rad/s, whose "
-                "upper end "
-                f"is at most {MAX_BAND_RATIO:g} times the lower"
+                f"band = ({low:g}, {high:g}) rad/s is out of range; give two increasing frequencies up to half "
+                f"the rate, {half:g} rad/s, the upper at most {MAX_BAND_RATIO:g} times the lower"
             )
         count = check_integer("order", order, 1, MAX_APPROXIMATION_ORDER)
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
@@ -437,12 +436,12 @@ def fractional_pid(
     wc = real_number("crossover", crossover)
     if not MIN_CROSSOVER_SHARE * plant.rate <= wc < math.pi * plant.rate / 4:
         raise ModelError(
-            f"{setting('crossover')} {short_repr(crossover)} rad/s is outside [{MIN_CROSSOVER_SHARE * plant.rate:.4g}, "
-            f"{math.pi * plant.rate / 4:.4g}), from a millionth to an eighth of the rate of {plant.rate:g} Hz"
+            f"{setting('crossover')} {short_repr(crossover)} rad/s is out of range; give one from "
+            f"{MIN_CROSSOVER_SHARE * plant.rate:.4g} to {math.pi * plant.rate / 4:.4g} at {plant.rate:g} Hz"
         )
     margin = real_number("phase_margin", phase_margin)
     if not 10 <= margin <= 80:
-        raise ModelError(f"{setting('phase_margin')} {short_repr(phase_margin)} degrees is outside [10, 80]")
+        raise ModelError(f"{setting('phase_margin')} {short_repr(phase_margin)} degrees is out of range; give 10 to 80")
     count, start = check_samples(samples, seed)
     plant.check_stable()
     samples_drawn = plant.samples(count, start)
@@ -510,7 +509,7 @@ def plant_of(
     """Return the plant from an input to an output; raise ModelError if they are unknown or ambiguous."""
     check_model(model)
     if not isinstance(sensor, bool):
-        raise ModelError(f"sensor = {short_repr(sensor)} is neither True nor False")
+        raise ModelError(f"sensor = {short_repr(sensor)} is neither True nor False; give one of them")
     check_linear(model.equations, "a loop's margin")
     check_no_input_nonlinearity(model, "a loop's margin")
     inputs = response_inputs(model, coupled=is_coupled(coupling))

@@ -123,11 +123,13 @@ class Shaper:
         """
         values = as_array("reference", reference)
         if values.dtype.kind not in "fiu" or values.ndim not in (1, 2) or values.size == 0:
-            raise DataError("reference is not an array of numbers of shape (rows,) or (rows, columns)")
+            raise DataError("reference is not an array of numbers; give one of shape (rows,) or (rows, columns)")
         x = as_floats("reference", values).reshape(len(values), -1)
         bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if bad.size:
-            raise DataError(f"reference is not finite at row {bad[0]} ({bad.size} such rows in all)")
+            raise DataError(
+                f"reference is not finite at row {bad[0]} ({bad.size} such rows in all); give finite numbers"
+            )
         taps = self.impulses(rate)
         rest = x[0]
         shaped = np.column_stack([_convolve(column, taps) for column in (x - rest).T]) + rest

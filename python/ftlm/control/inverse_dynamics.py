@@ -262,11 +262,11 @@ def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,); raise DataError if it is invalid."""
     raw = as_array("path", path)
     if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
-        raise DataError(f"path is not an array of 16 to {MAX_PATH_ROWS} numbers, one per sample")
+        raise DataError(f"path is not a vector of this length; give 16 to {MAX_PATH_ROWS} numbers, one per sample")
     rows = np.array(raw, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(rows))
     if bad.size:
-        raise DataError(f"path is not finite at row {bad[0]} ({bad.size} such rows in all)")
+        raise DataError(f"path is not finite at row {bad[0]} ({bad.size} such rows in all); give finite numbers")
     large = np.flatnonzero(np.abs(rows) > POSITIVE_RANGE[1])
     if large.size:
         raise DataError(

@@ -229,11 +229,13 @@ def kalman_filter(
 def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str, float] | None) -> tuple[float, ...]:
     """Return the noise standard deviation of each measured output; raise ModelError if one is unknown."""
     if noise is not None and not isinstance(noise, Mapping):
-        raise ModelError(f"{setting('noise')} {short_repr(noise)} is not a mapping from outputs to standard deviations")
+        raise ModelError(f"{setting('noise')} {short_repr(noise)} is not a mapping; give standard deviations by output")
     for name in noise or {}:
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
-            raise ModelError(f"noise of {short_repr(name)} does not belong to a measured output{near}")
+            raise ModelError(
+                f"noise of {short_repr(name)} is of no measured output{near}; they are {', '.join(measured)}"
+            )
     free = None if model.estimate is None else model.estimate.free
     noise_of_fit = {} if free is None else dict(free.noise)
     out = []
@@ -288,7 +290,9 @@ class Lqg:
         self.rate = realisation.rate
         gains = as_floats("feedback", feedback).reshape(1, -1).copy()
         if gains.shape[1] != realisation.states or not np.isfinite(gains).all():
-            raise ModelError(f"feedback is not a row of {realisation.states} finite numbers, one per state")
+            raise ModelError(
+                f"feedback is not finite or has another size; give {realisation.states} numbers, one per state"
+            )
         self.feedback = gains
         self._a, self._b, self._c = observer.matrices
         self._gains = np.append(gains, [[1.0]], axis=1)
@@ -324,7 +328,9 @@ class Lqg:
             self._states = self._a @ corrected + self._b[:, 0] * self._applied
             command = self.ahead * reference - float(self._gains[0] @ self._states)
         if not math.isfinite(command):
-            raise ModelError(f"the command is {command}: a measurement, the reference or a state is not finite")
+            raise ModelError(
+                f"the command is {command}: a measurement, the reference or a state is not finite; reset it"
+            )
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
@@ -569,7 +575,9 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
 def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
     """Return the states and the input at rest, as one vector, with the tracked output at 1."""
     if tracked not in realisation.outputs:
-        raise ModelError(f"tracked = {short_repr(tracked)} is not one of the outputs {', '.join(realisation.outputs)}")
+        raise ModelError(
+            f"tracked = {short_repr(tracked)} is not an output; give one of {', '.join(realisation.outputs)}"
+        )
     size = realisation.states
     matrix = np.zeros((size + 1, size + 1))
     matrix[:size, :size] = realisation.a - np.eye(size)

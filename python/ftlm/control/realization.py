@@ -175,7 +175,8 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     low, high = frequency_pair(band)
     if not (math.isfinite(low) and 0 < low < high <= half / 2):
         raise ModelError(
-            f"band = ({low:g}, {high:g}) rad/s is not an interval up to a quarter of the rate, {half / 2:g} rad/s"
+            f"band = ({low:g}, {high:g}) rad/s is out of range; give two increasing frequencies up to a quarter of "
+            f"the rate, {half / 2:g} rad/s"
         )
     return low, high
 

@@ -233,7 +233,7 @@ class RunArguments:
             if dated is not None and self.time_unit != "s":
                 raise DataError(
                     f"{parameter('time_unit', self.time_unit)} is the unit of numbers, and {self.time_label} holds "
-                    "dates"
+                    "dates; leave it out"
                 )
             times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label)
             lengths = {self.time_label: times.size, **lengths}

@@ -318,7 +318,9 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     for limit in window:
         value = as_number(limit)
         if value is None and limit is not None:
-            raise DataError(f"{parameter(argument)}: limit {limit!r} is not a number of seconds")
+            raise DataError(
+                f"{parameter(argument)}: limit {limit!r} is not a number; give seconds, or None for an open end"
+            )
         if value is not None and not math.isfinite(value):
             raise DataError(f"{parameter(argument)}: limit {value!r} is not finite; use None for an open end")
         limits.append(value)

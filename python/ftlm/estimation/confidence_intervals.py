@@ -221,7 +221,7 @@ def result_profiles(
         )
     probability = real_number("level", level)
     if not 0.0 < probability < 1.0:
-        raise ModelError(f"level = {level} is not a probability between 0 and 1, such as 0.95")
+        raise ModelError(f"level = {level} is not a probability; give one between 0 and 1, such as 0.95")
     parameters = list(dict.fromkeys(names)) or problem.names
     profile = profile_intervals(
         result.joint, problem, result.task.runs, parameters, probability, threads=threads, progress=progress

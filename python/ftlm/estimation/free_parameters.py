@@ -207,7 +207,7 @@ def warm_starts(problem: FreeProblem, guess: Mapping[str, float]) -> list[dict[s
     bounds = dict(zip(problem.names, problem.all_bounds, strict=True))
     check_known("start value", guess, problem.names)
     if not guess:
-        raise ModelError(f"{parameter('start')} names none of the free parameters: {', '.join(problem.names)}")
+        raise ModelError(f"{parameter('start')} names no free parameter; give values of {', '.join(problem.names)}")
     for name, value in guess.items():
         low, high = bounds[name]
         if not low <= real_number(f"start value of {name}", value) <= high:

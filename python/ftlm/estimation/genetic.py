@@ -510,7 +510,9 @@ class GeneticAlgorithm:
         check_choice("norm", self.norm, get_args(Norm))
         population = whole_number(self.population)
         if population is None or not 8 <= population <= 100_000:
-            raise ModelError(f"{setting('population')} {self.population!r} is outside [8, 100000]")
+            raise ModelError(
+                f"{setting('population')} {self.population!r} is out of range; give a whole number from 8 to 100000"
+            )
         if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
             raise ModelError(
                 f"{setting('evaluations')} {self.evaluations!r} is less than two generations of {self.population}; "

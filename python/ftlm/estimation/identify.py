@@ -191,7 +191,7 @@ def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fi
     level = _fit_with_level(fit, structure, hypotheses, has_level=suggests_level) if is_level_tried else None
     if level is not None:
         return level
-    test = fit_offset_test(fit) if _is_testable(fit.task.runs) else None
+    test = fit_offset_test(fit) if sum(run.length for run in fit.task.runs) <= MAX_OFFSET_TEST_SAMPLES else None
     offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
     if offset_findings and _has_estimated_initial_conditions(fit) and not is_level_tried:
         level = _fit_with_level(fit, structure, hypotheses, has_level=False)
@@ -374,10 +374,6 @@ def _with_offset_decision(fit: Fit, decision: str) -> Fit:
     return replace(fit, settings={**fit.settings, "offset_test": decision})
 
 
-def _is_testable(runs: tuple[Run, ...]) -> bool:
-    return sum(run.length for run in runs) <= MAX_OFFSET_TEST_SAMPLES
-
-
 @check_arguments
 def identify(
     runs: Run | Sequence[Run],
@@ -502,7 +498,7 @@ def _fit_runs(
     ) -> Fit:
         fit = method.fit(runs, request, m=m, threads=threads, progress=report, **more)
         if not isinstance(fit, Fit):
-            raise ModelError(f"the method {estimator.name!r} fitted a {type(fit).__name__}, not a Fit")
+            raise ModelError(f"the method {estimator.name!r} fitted a {type(fit).__name__}; return a Fit")
         return fit
 
     light, hypotheses = getattr(estimator, "hypothesis", None), Hypotheses(estimate, may_add_offset)

@@ -58,7 +58,8 @@ def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
         raise ModelError(f"{label} is of one output, not of {', '.join(structure.outputs)}; fit each one")
     if not structure.is_linear or structure.limits:
         raise ModelError(
-            f"{label} filters inputs and output alike, and friction, non-linear terms and limits do not commute with it"
+            f"{label} filters inputs and output alike, and friction, non-linear terms and limits do not commute with "
+            "it; leave it out"
         )
     if any(run.sample_times is not None for run in runs):
         raise ModelError(f"{label} needs uniform samples; resample the runs, or leave it out")
@@ -257,7 +258,7 @@ class OutputError:
                 f"start is {type(self.start).__name__}; give an identification, a model, or values by name"
             )
         if not (self.reference is None or isinstance(self.reference, str)):
-            raise ModelError(f"reference is {type(self.reference).__name__}, not the name of a signal of the runs")
+            raise ModelError(f"reference is {type(self.reference).__name__}; give the name of a signal of the runs")
         if self.intervals == "profile" and self.reference is not None:
             raise ModelError(
                 f"{parameter('intervals', 'profile')} needs a cost that has its minimum at the estimate, and "

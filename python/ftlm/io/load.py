@@ -276,7 +276,8 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
         return _TimeColumn(column.numbers(), unit, label, column.name, facts + notes)
     if unit_option is not None:
         raise DataError(
-            f"{parameter('time_unit', unit_option)} is the unit of numbers, and {label} holds dates or times of day"
+            f"{parameter('time_unit', unit_option)} is the unit of numbers, and {label} holds dates or times of day; "
+            "leave it out"
         )
     seconds = column.timestamps.seconds(label, selection.layout.dates)
     order = date_order_assumption(column, selection.layout.dates)

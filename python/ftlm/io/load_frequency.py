@@ -438,7 +438,7 @@ def _resolve_unit(
 
 def _truth(name: str, value: object) -> bool:
     if not isinstance(value, bool):
-        raise DataError(f"{parameter(name)}{value!r} is neither True nor False")
+        raise DataError(f"{parameter(name)}{value!r} is neither True nor False; give one of them")
     return value
 
 

@@ -152,7 +152,7 @@ class OpenedFile:
             If inputs or outputs are unknown, the file exists and ``force`` is False, or it cannot be written.
         """
         if self.problem:
-            raise DataError(f"{self.path} is not a run yet, so there are no columns to write: {self.problem}")
+            raise DataError(f"{self.path} has no columns to write: {self.problem}")
         options = {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items() if k in COLUMN_KEYS}
         lines = ["# Left of = is the signal name; change it to the name in your equation or structure."]
         lines += [f"{key} = {_toml(value)}" for key, value in options.items() if not isinstance(value, dict)]

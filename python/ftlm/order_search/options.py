@@ -195,7 +195,7 @@ class SearchSettings:
                 f"{setting('prior_covariance')} {self.prior_covariance!r} is not positive; a large one is a weak prior"
             )
         if not isinstance(self.pruning, bool):
-            raise ModelError(f"pruning = {self.pruning!r} is neither True nor False")
+            raise ModelError(f"pruning = {self.pruning!r} is neither True nor False; give one of them")
         for name, value in (("top", top), ("innovation_length", length), ("prior_covariance", covariance)):
             object.__setattr__(self, name, value)
         if self.coefficients != "multi-innovation":

@@ -345,7 +345,7 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     """
     results = tests.residuals if isinstance(tests, Identification) else tests
     if results is None:
-        raise ModelError("the runs were too short for residual tests, so there is nothing to draw")
+        raise ModelError("the runs were too short for residual tests; give longer runs to draw them")
     rows = [
         [correlation_chart(*each, label=each[-1].verdict) for each in tests_of_one]
         for _, tests_of_one in groupby(results.tests, key=lambda each: each[0])
@@ -382,14 +382,14 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         surface = output_error_landscape(result)
     else:
         if not result.searches or result.task is None:
-            raise ModelError("this identification searched no order grid, so it has no landscape")
+            raise ModelError("this identification searched no order grid; give one to draw its scores")
         name = next(iter(result.searches)) if output is None else output
         if name not in result.searches:
             raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")
         part = result.task.structure if name == "stage" else result.task.structure.equation(name)
         surface = scores_of(result.task.runs, part, result.searches[name], result.task.part_order_grid(part))
     if surface is None:
-        raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
+        raise ModelError("this fit has no two free orders with standard errors; free two orders to draw them")
     return draw_figure([[surface]], ax, row=3.2)
 
 
@@ -449,7 +449,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     """
     charts = pole_charts(_model_of(model))
     if not charts:
-        raise ModelError("this model has no poles to draw: it has friction, or it only integrates")
+        raise ModelError("this model has no poles to draw, as with friction; draw its response instead")
     return draw_figure([charts], ax, row=4.0)
 
 
@@ -579,7 +579,8 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     for name, comparison in compared.items():
         if list(comparison.output_error) != outputs:
             raise ModelError(
-                f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}"
+                f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}; give "
+                "comparisons of the same outputs"
             )
     chart = BarChart(
         list(compared),

@@ -207,7 +207,7 @@ class ArmParameters:
             if not (0.0 <= value <= highest and math.isfinite(value)):
                 raise ModelError(f"{name} = {value!r} is outside [0, {highest:g}]; correct the arm's parameters")
         if not self.stage2.r > 1.0:
-            raise ModelError(f"r = {self.stage2.r!r} of stage 2 is not above 1, as (J_1 + J_2)/J_2 is")
+            raise ModelError(f"r = {self.stage2.r!r} of stage 2 is not above 1; give (J_1 + J_2)/J_2")
         hub = self.coupling * self.rotating_share * self.inertia_ratio
         arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.reach)
         base, carried = -self.coupling * self.rotating_share, -self.coupling * (1.0 + self.reach)

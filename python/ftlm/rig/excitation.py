@@ -80,7 +80,7 @@ class Excitation:
         ramp = finite_number(self.ramp)
         if ramp is None or not 0 <= ramp <= duration:
             raise ModelError(
-                f"{setting('ramp')} {short_repr(self.ramp)} s is outside [0, {duration:g}] s, the length of the run"
+                f"{setting('ramp')} {short_repr(self.ramp)} s is out of range; give 0 to {duration:g} s, the run length"
             )
         if self.shape == "csv":
             currents = self._file(t)
@@ -103,7 +103,7 @@ class Excitation:
         pair = [a for a in map(finite_number, amplitudes) if a is not None and a >= 0]
         if len(amplitudes) != 2 or len(pair) != 2:
             raise ModelError(
-                f"{setting('amplitude')} {short_repr(self.amplitude)} is not a current in A, or a pair of them"
+                f"{setting('amplitude')} {short_repr(self.amplitude)} is not a current; give one in A, or a pair"
             )
         for k, (value, limit) in enumerate(zip(pair, CURRENT_LIMIT, strict=True)):
             if value > limit:
@@ -118,13 +118,13 @@ class Excitation:
         period = usual if self.period is None else finite_number(self.period)
         if period is None or not period * rate >= 2:
             raise ModelError(
-                f"{setting('period')} {short_repr(self.period)} s is not a time of at least two samples "
-                f"({2 / rate:g} s)"
+                f"{setting('period')} {short_repr(self.period)} s is too short; give at least two samples, "
+                f"{2 / rate:g} s"
             )
         if self.shape == "multisine" and period > MAX_RUN_DURATION_S:
             raise ModelError(
-                f"{setting('period')} {period:g} s of a multisine is longer than the longest run, "
-                f"{MAX_RUN_DURATION_S:g} s"
+                f"{setting('period')} {period:g} s of a multisine is longer than any run; give at "
+                f"most {MAX_RUN_DURATION_S:g} s"
             )
         return period
 
@@ -173,8 +173,8 @@ class Excitation:
         ends = [b for b in map(finite_number, band) if b is not None] if isinstance(band, (tuple, list)) else []
         if len(ends) != 2 or len(band) != 2 or not 0 < ends[0] < ends[1] <= rate / 2:
             raise ModelError(
-                f"{setting('band')} {short_repr(band)} Hz is not two rising frequencies up to half the rate, "
-                f"{rate / 2:g} Hz"
+                f"{setting('band')} {short_repr(band)} Hz is not a band; give two increasing frequencies up to half "
+                f"the rate, {rate / 2:g} Hz"
             )
         return ends[0], ends[1]
 

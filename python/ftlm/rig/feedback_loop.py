@@ -279,7 +279,7 @@ def _numbers(reference: ArrayLike) -> Floats:
     raw = as_array("reference", reference)
     if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
         raise DataError(
-            "reference is not an array of numbers of shape (rows, 2), hub angles [rad] with one row per sample, nor a "
+            "reference is not an array of hub angles; give numbers [rad] of shape (rows, 2), one row per sample, or a "
             "pair of angles to hold"
         )
     return np.array(raw, dtype=np.float64)

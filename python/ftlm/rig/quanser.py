@@ -387,7 +387,7 @@ class QuanserBoard:
         """
         handle = self._hil if hil is None else hil
         if handle is None:
-            raise RigFault(f"Q8-USB, {what}: the board is not open")
+            raise RigFault(f"Q8-USB, {what}: the board is not open; call open() first")
         try:
             yield handle
         except self._error as error:

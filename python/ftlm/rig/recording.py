@@ -360,8 +360,8 @@ class RigSetup:
                     first = second = math.nan
                 if isinstance(self.offset, str) or not (math.isfinite(first) and math.isfinite(second)):
                     raise ModelError(
-                        f"{setting('offset')} {short_repr(self.offset)} is not a pair of currents [A], of motor 1 and "
-                        "motor 2"
+                        f"{setting('offset')} {short_repr(self.offset)} is not a pair; give the currents [A] of motor "
+                        "1 and motor 2"
                     )
                 arm = replace(arm, current_offset=(first, second))
             board = VirtualBoard(arm, seed=self.seed, real_time=self.real_time, horizon=limit)
@@ -413,7 +413,7 @@ class Experiment:
             )
         check_thread(board)
         if not is_run_name(self.name):
-            raise DataError(f"{setting('name')} {short_repr(self.name)} cannot name a run")
+            raise DataError(f"{setting('name')} {short_repr(self.name)} cannot name a run; give one line of text")
         target = None if self.out is None else Path(self.out)
         if target is not None:
             _check_target(target, force=self.force)
@@ -636,7 +636,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
         )
         raise ModelError(f"{setting('duration')} {length:g} s exceeds the limit of {longest:g} s; {way_out}")
     if samples is None or samples <= 0:
-        raise ModelError(f"{setting('rate')} {short_repr(rate)} Hz is not a positive number of samples per second")
+        raise ModelError(f"{setting('rate')} {short_repr(rate)} Hz is not positive; give samples per second")
     check_rate(samples)
     if length * samples < 2:
         raise ModelError(

@@ -91,14 +91,16 @@ class VirtualBoard:
         self._random = np.random.default_rng(self.seed)
         self._rate = 0.0
         if not isinstance(self.inject, (tuple, list)):
-            raise ModelError(f"inject = {short_repr(self.inject)} is not a tuple of faults")
+            raise ModelError(
+                f"inject = {short_repr(self.inject)} is not a tuple; give (name, channel, time [s], number) of faults"
+            )
         for fault in self.inject:
             _checked_injection(fault)
 
     def open(self) -> None:
         """Open the board by creating the file of the output registers."""
         if self._page is not None:
-            raise RigFault("virtual rig: the board is open already")
+            raise RigFault("virtual rig: the board is open already; close it first")
         self._page = watchdog.RegisterPage(self.page or watchdog.create_page_file(), create=True)
 
     def configure(self, rate: float) -> None:
@@ -170,7 +172,7 @@ class VirtualBoard:
     def run(self, guard: _core.Guard, commands: Floats) -> None:
         """Apply commands [A], shape (n, 2), and record a sample for each."""
         if not self._started:
-            raise RigFault("virtual rig: the task is not started")
+            raise RigFault("virtual rig: the task is not started; call start() first")
         self._require_arm().run(guard, commands, self._random.standard_normal((len(commands), 4)), self._output_volts)
 
     def take(self) -> Floats:
@@ -221,7 +223,7 @@ class VirtualBoard:
 
     def _access(self) -> watchdog.RegisterPage:
         if self._page is None:
-            raise RigFault("virtual rig: the board is not open")
+            raise RigFault("virtual rig: the board is not open; call open() first")
         if self._page.has_expired:
             raise RigFault(WATCHDOG_EXPIRED_MESSAGE)
         return self._page
@@ -232,7 +234,7 @@ class VirtualBoard:
 
     def _require_arm(self) -> _core.VirtualArm:
         if self._arm is None:
-            raise RigFault("virtual rig: the board is not configured")
+            raise RigFault("virtual rig: the board is not configured; call configure() first")
         return self._arm
 
     def _output_volts(self, volts1: float, volts2: float) -> tuple[tuple[float, float], bool]:
@@ -308,7 +310,7 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
 def _checked_injection(fault: object) -> tuple[str, int, float, float]:
     """Return an injected fault as (name, channel, time [s], number); raise ModelError if it is invalid."""
     if not isinstance(fault, (tuple, list)) or len(fault) != 4:
-        raise ModelError(f"inject has {short_repr(fault)}, which is not (name, channel, time [s], number)")
+        raise ModelError(f"inject has {short_repr(fault)}; give (name, channel, time [s], number)")
     name, channel, time_s, number = fault
     check_choice("the injected fault", name, FAULT_INJECTIONS)
     count, meaning = _FAULT_CHANNELS.get(name, 1), FAULT_INJECTIONS[name]

@@ -126,7 +126,7 @@ def simulate(
     for name, terms in (initial or {}).items():
         if name not in model.outputs:
             raise ModelError(
-                f"initial terms of {name!r}, which is not an output of the model: {', '.join(model.outputs)}"
+                f"initial terms of {name!r}, which is no output of the model; give those of {', '.join(model.outputs)}"
             )
         check_initial(
             [

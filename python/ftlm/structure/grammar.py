@@ -174,7 +174,8 @@ class EquationParser:
             token = _TOKEN_PATTERN.match(readable, at)
             if token is None:
                 start = at + len(readable[at:]) - len(readable[at:].lstrip())
-                raise ModelError(f"equation {text!r}: {text[start]!r} at character {start + 1} has no meaning there")
+                at_character = f"{text[start]!r} at character {start + 1}"
+                raise ModelError(f"equation {text!r}: {at_character} has no meaning there; leave it out")
             kind = str(token.lastgroup)
             self._tokens.append((kind, token[kind], token.start(kind)))
             at = token.end()

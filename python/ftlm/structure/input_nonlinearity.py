@@ -92,7 +92,7 @@ class InputNonlinearity:
         )
         if isinstance(self.value, (tuple, list)):
             if len(self.value) != 2:
-                raise ModelError(f"{words} = {self.value!r} is neither a number nor (least, largest)")
+                raise ModelError(f"{words} = {self.value!r} has another size; give a number, or (least, largest)")
             low, high = (real_number(f"{words}", v) for v in self.value)
             if not 0 <= low < high < math.inf:
                 raise ModelError(
@@ -101,7 +101,9 @@ class InputNonlinearity:
             return
         value = real_number(words, self.value)
         if not (0 <= value < math.inf and (value > 0 or self.law == "dead_zone")):
-            raise ModelError(f"{words} = {self.value} is not a number {least} 0, in the unit of {self.signal}")
+            raise ModelError(
+                f"{words} = {self.value} is out of range; give a number {least} 0, in the unit of {self.signal}"
+            )
 
     @property
     def free(self) -> FreeInputParameter | None:

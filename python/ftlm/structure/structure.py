@@ -168,7 +168,7 @@ class Structure:
 
     def __post_init__(self) -> None:
         if not self.equations:
-            raise ModelError("a model needs at least one equation")
+            raise ModelError("the structure has no equation; give at least one")
         outputs = [e.output for e in self.equations]
         twice = next((o for i, o in enumerate(outputs) if o in outputs[:i]), None)
         if twice is not None:
@@ -450,7 +450,7 @@ class Structure:
             free.pop(name, None)
             if isinstance(delay, (tuple, list)):
                 if len(delay) != 2:
-                    raise ModelError(f"delay of {name} = {delay!r} is neither a number nor (least, largest) [s]")
+                    raise ModelError(f"delay of {name} = {delay!r} has another size; give seconds, or (least, largest)")
                 free[name] = (delay[0], delay[1])
             else:
                 fixed[name] = delay

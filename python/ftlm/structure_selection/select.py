@@ -288,7 +288,9 @@ def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice
     fits = [t for t in work.trials if t.joint is not None]
     if not fits:
         why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
-        raise ConvergenceError(f"no candidate can be fitted to {work.folds.description}{why}")
+        raise ConvergenceError(
+            f"no candidate can be fitted to {work.folds.description}; give simpler candidates or longer runs{why}"
+        )
     best_trials: dict[str, Trial] = {}
     for trial in work.trials:
         key = signature(trial.structure)

@@ -248,7 +248,7 @@ class PlaneChart(Figure):
         if np.any(bad):
             raise DataError(f"point {int(np.argmax(bad))} of {bad.size} is not finite; leave it out")
         if not 0 < self.sector < math.pi:
-            raise DataError(f"sector = {self.sector!r} is not an angle between 0 and pi")
+            raise DataError(f"sector = {self.sector!r} is not an angle; give one between 0 and pi")
         if self.curve is not None and not bad.size:
             raise DataError("there is no measured value to draw; give at least one")
 
@@ -531,7 +531,9 @@ class CorrelationMap(Figure):
         beyond = np.abs(matrix) > 1 + 1e-6
         if np.any(beyond):
             row, column = divmod(int(np.argmax(beyond)), len(names))
-            raise DataError(f"the correlation of {names[row]} and {names[column]} is {matrix[row, column]}, beyond 1")
+            raise DataError(
+                f"the correlation of {names[row]} and {names[column]} is {matrix[row, column]}; give at most 1"
+            )
 
     @cached_property
     def matrix(self) -> Floats:
