@@ -11,7 +11,7 @@ import stat
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, get_args
+from typing import Any, Generic, TypeVar, get_args
 
 import msgspec
 import msgspec.toml
@@ -248,15 +248,6 @@ def _field_names(kind: type[msgspec.Struct]) -> list[str]:
     return names
 
 
-class SchemaRecord(Protocol):
-    """Protocol of the content of a versioned document."""
-
-    schema: int
-
-
-T = TypeVar("T", bound=SchemaRecord)
-
-
 class FileHeader(msgspec.Struct):
     """Header of every document, which can be read in files of any version."""
 
@@ -266,7 +257,7 @@ class FileHeader(msgspec.Struct):
 
 
 @dataclass(frozen=True)
-class JsonFormat(Generic[T]):
+class JsonFormat(Generic[F]):
     """Format of a versioned JSON document.
 
     Parameters
@@ -283,10 +274,10 @@ class JsonFormat(Generic[T]):
 
     what: str
     source: str
-    kind: type[T]
+    kind: type[F]
     schema: int
 
-    def read(self, path: str | os.PathLike[str]) -> T:
+    def read(self, path: str | os.PathLike[str]) -> F:
         """Return the content of a file.
 
         Raises
