@@ -118,7 +118,7 @@ class RunArguments:
                     times, data = self._insert_missing_samples(times, data, missing, first)
                 step, jitter = regular_step(times, self.time_label, first, clock.resolution, self.known_step)
                 facts += jitter
-        data, notes = self._fill_input_gaps(data, behaviour, missing)
+        data, notes = self._fill_input_gaps(data, behaviour)
         facts += notes
         readings = None
         if new_step is not None:
@@ -171,7 +171,7 @@ class RunArguments:
         return whole, out
 
     def _fill_input_gaps(
-        self, data: dict[str, Floats], behaviour: Mapping[str, Intersample], missing: MissingPolicy
+        self, data: dict[str, Floats], behaviour: Mapping[str, Intersample]
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
         """Return data with missing input samples filled, and notes on the missing samples of all signals."""
         notes, out = [], dict(data)

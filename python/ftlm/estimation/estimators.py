@@ -259,7 +259,7 @@ def estimate_output_error(
 
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
     """Return the covariance of all orders and coefficients of the model; None if one is not identifiable."""
-    jacobian = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
+    jacobian = problem.number_jacobian(list(joint.coefficients.values()))
     with np.errstate(invalid="ignore", over="ignore"):
         # Covariances of non-identifiable directions are NaN or overflow.
         spread = jacobian @ joint.covariance @ jacobian.T

@@ -118,11 +118,6 @@ class Objective:
     robust_weights: Sequence[Floats] | None = None
     prefer_stable: bool = False
 
-    @property
-    def recordings(self) -> list[_core.Recording]:
-        """Runs as objects of the core, before they are sampled."""
-        return [recording(run, self.problem.structure) for run in self.runs]
-
     @cached_property
     def experiments(self) -> list[_core.Experiment]:
         """Runs as sampled objects of the core, with which simulations are compared."""

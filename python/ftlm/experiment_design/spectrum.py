@@ -107,8 +107,8 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
     gains = frequency_response(fit.model, w)
     coupling = fit.problem.structure.coupling
     own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
-    orders, coefficients, _ = fit.problem.split(fit.values)
-    chain = fit.problem.number_jacobian(orders, coefficients)
+    _, coefficients, _ = fit.problem.split(fit.values)
+    chain = fit.problem.number_jacobian(coefficients)
     # The other outputs in an equation are simulated or measured, depending on the coupling.
     drives = (
         gains

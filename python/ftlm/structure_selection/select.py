@@ -373,7 +373,7 @@ def _without_free_delays(choice: Choice) -> Choice:
 def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
     """Return the selection whose chosen structure is identified on all runs, with findings on the choice."""
     folds, winner = work.folds, choice.winner
-    structure = _with_validated_initial_conditions(winner, folds)
+    structure = _with_validated_initial_conditions(winner)
     if folds.split is None:
         result = identify(list(folds.runs), structure, threads=work.threads)
     else:
@@ -553,7 +553,7 @@ def _bic(trial: Trial) -> float:
     return math.inf if trial.bic is None else trial.bic
 
 
-def _with_validated_initial_conditions(trial: Trial, folds: Folds) -> Structure:
+def _with_validated_initial_conditions(trial: Trial) -> Structure:
     """Return the structure of a trial with the initial conditions of its validation.
 
     If the runs started from rest, the structure still allows initial terms, because a later run may have nonzero
