@@ -136,7 +136,7 @@ def test_the_command_line_asks_for_a_history(halves, tmp_path):
     assert document["settings"]["initial"] == found.settings["initial"]
     refused = CliRunner().invoke(cli.app, [*words, "--initial", "tails"])
     assert refused.exit_code == 2
-    assert "is not auto, rest, caputo, history or exponents" in " ".join(refused.output.split())
+    assert "is not known; give auto, rest, caputo, history or exponents" in " ".join(refused.output.split())
 
 
 @pytest.mark.parametrize("offset", ["none", "constant"])

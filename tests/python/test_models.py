@@ -516,7 +516,7 @@ def test_filtered_outputs_must_occur():
 
 def test_other_structures_that_are_none_are_refused():
     (item,) = ftlm.equation("D y = a y").equations
-    with pytest.raises(ftlm.ModelError, match="a model needs at least one equation"):
+    with pytest.raises(ftlm.ModelError, match="the structure has no equation; give at least one"):
         ftlm.Structure(())
     with pytest.raises(ftlm.ModelError, match="coupling = 'loose' is not known; use 'measured' or 'simulated'"):
         ftlm.Structure((item,), coupling="loose")
