@@ -27,7 +27,7 @@ SOUND, TWICE = 0.1, 0.3
 LARGE = 1 << 34
 ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
 #: Where a fit is told how often it may evaluate its cost, which it does; an attack asks it to so often at most.
-EVALUATIONS, MOST_EVALUATIONS = {"JointProblem.minimize": 4}, 2000
+EVALUATIONS, MAX_EVALUATIONS = {"JointProblem.minimize": 4}, 2000
 #: Where a count multiplies other sizes, and the most of it: pulses a sample, pulses of a simulation, rows of up to 128
 #: states.
 COUNTS = {
@@ -974,7 +974,7 @@ def attacked(name, given, named, r):
         spots = [path for path in places(arguments) if len(path) > 1]
         if spots:
             arguments = exchanged(arguments, r.choice(spots), lambda value: hostile(value, r, large))
-    for at, most in (COUNTS.get(name, (None, 0)), (EVALUATIONS.get(name), MOST_EVALUATIONS)):
+    for at, most in (COUNTS.get(name, (None, 0)), (EVALUATIONS.get(name), MAX_EVALUATIONS)):
         if at is not None and isinstance(arguments[0][at], int):
             arguments[0][at] = min(arguments[0][at], most)
     return arguments

@@ -60,7 +60,7 @@ def test_a_fit_is_not_asked_for_more_time_than_an_attack_waits():
     for name, at in HOSTILE["EVALUATIONS"].items():
         _, given, named = HOSTILE["Sound"](0).call(name)
         asked = [HOSTILE["attacked"](name, given, named, r)[0][at] for _ in range(2000)]
-        assert max(v for v in asked if isinstance(v, int)) == HOSTILE["MOST_EVALUATIONS"]
+        assert max(v for v in asked if isinstance(v, int)) == HOSTILE["MAX_EVALUATIONS"]
         assert any(not isinstance(v, int) for v in asked)
         assert any(isinstance(v, int) and v < 0 for v in asked)
 

@@ -354,7 +354,7 @@ def panel_gain(result):
 
 
 #: Findings that say that a gain assumes a start, or that the structure lacks dynamics.
-GAIN_CODES = {"rest_assumed", "start_not_told", "lag_fits", "dynamics_missing"}
+GAIN_CODES = {"rest_assumed", "initial_state_not_identifiable", "lag_fits", "dynamics_missing"}
 
 
 def panel_table(seeds):
@@ -365,7 +365,7 @@ def panel_table(seeds):
             found = ftlm.identify(panel_record(name, kind, start, seed), ftlm.equation(words))
             is_off = abs(panel_gain(found) / 2.0 - 1.0) > 0.2
             silent += is_off and not GAIN_CODES & set(codes(found))
-            off = is_off and not {"rest_assumed", "start_not_told"} & set(codes(found))
+            off = is_off and not {"rest_assumed", "initial_state_not_identifiable"} & set(codes(found))
             wrong.setdefault(("right" if right else "one lag too few", name, start), []).append(off)
             if right and name != "fractional":
                 covered += [found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in TRUTHS[name].items()]

@@ -69,7 +69,7 @@ from ftlm.validation.information_criteria import InformationCriteria, informatio
 from ftlm.validation.residual_tests import DEFAULT_LAGS, Residuals, resid, residual_table
 
 #: Largest number of pole maps and step responses on a page.
-MOST_FIGURES = 9
+MAX_RESPONSE_FIGURES = 9
 _LEVEL_CSS_CLASSES = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
@@ -176,7 +176,7 @@ def behavior_figures(model: Model) -> list[Figure]:
     with contextlib.suppress(FtlmError):
         figures += pole_charts(model)
         figures += model.step().figures()
-    return figures[:MOST_FIGURES]
+    return figures[:MAX_RESPONSE_FIGURES]
 
 
 #: Charts of a page and points in all of them: at no more than 10 bytes a point the page stays below 2 MB.

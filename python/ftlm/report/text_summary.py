@@ -25,8 +25,8 @@ from ftlm.utils.parameters import choose_text
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.validation.comparison import Comparison, describe_initial_terms, describe_offsets
 
-#: Most modes that are listed.
-MOST_MODES = 6
+#: Largest number of modes that are listed.
+MAX_LISTED_MODES = 6
 
 
 def summary(result: Identification, validation: Comparison | None = None) -> str:
@@ -107,10 +107,10 @@ def behavior_lines(model: Model) -> list[str]:
         grows = any(mode.unstable for mode in model_modes)
         word = "mode" if len(model_modes) == 1 else "modes"
         lines += [
-            f"  {word if k == 0 else '':<7}{describe_mode(mode)}" for k, mode in enumerate(model_modes[:MOST_MODES])
+            f"  {word if k == 0 else '':<7}{describe_mode(mode)}" for k, mode in enumerate(model_modes[:MAX_LISTED_MODES])
         ]
-        if len(model_modes) > MOST_MODES:
-            lines.append(f"         and {len(model_modes) - MOST_MODES} faster ones: .model.modes()")
+        if len(model_modes) > MAX_LISTED_MODES:
+            lines.append(f"         and {len(model_modes) - MAX_LISTED_MODES} faster ones: .model.modes()")
         if not (grows or model.structure.limits):
             lines = [f"  {'gain':<7}{describe_gain(s, model)}" for s in steady_states(model)] + lines
     return lines
