@@ -100,7 +100,7 @@ def test_open_writes_a_columns_file_that_loads_the_same_run(tmp_path):
 
 def test_a_file_that_is_no_run_has_no_columns_to_write(tmp_path):
     file = write(tmp_path / "a.csv", ["t", "foo", "bar"])
-    with pytest.raises(ftlm.DataError, match="not a run yet"):
+    with pytest.raises(ftlm.DataError, match="has no columns to write"):
         ftlm.open_file(file).write_columns(tmp_path / "bench.toml")
 
 

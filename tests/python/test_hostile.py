@@ -264,7 +264,9 @@ def test_a_small_file_is_a_regular_file_of_little_size(kind, written, tmp_path):
 
 
 def test_a_multisine_of_years_is_refused():
-    with pytest.raises(ftlm.ModelError, match=r"period = 1e\+09 s of a multisine is longer than the longest run"):
+    with pytest.raises(
+        ftlm.ModelError, match=r"period = 1e\+09 s of a multisine is longer than any run; give at most 600 s"
+    ):
         rig.Excitation("multisine", period=1e9).commands(500.0, 1.0)
 
 

@@ -469,7 +469,7 @@ def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification)
     with pytest.raises(ftlm.ModelError, match="'e', nor 1 more is not a free parameter of this fit; it has c, a, b"):
         found.profile("e", "f")
     for level in (0.0, 1.0, 95, math.nan):
-        with pytest.raises(ftlm.ModelError, match="is not a probability between 0 and 1"):
+        with pytest.raises(ftlm.ModelError, match="is not a probability; give one between 0 and 1"):
             found.profile(level=level)
     with pytest.raises(ftlm.ModelError, match="level = '95 %' is not a number"):
         found.profile(level="95 %")  # type: ignore[arg-type]

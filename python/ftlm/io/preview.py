@@ -350,7 +350,7 @@ class _FilePreview:
         if not selection.outputs:
             choice = join_names((c.name for c in every if c is not clock and has_numbers(c)), 20)
             open_roles = (
-                "which columns are inputs and which are outputs, their names do not say; name them with "
+                "the column names do not say which are inputs and which are outputs; name them with "
                 f"{parameter('inputs', NAMED_COLUMNS)} and {parameter('outputs', NAMED_COLUMNS)}; there are "
                 f"{choice or 'none'}"
             )

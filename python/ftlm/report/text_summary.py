@@ -107,7 +107,8 @@ def behavior_lines(model: Model) -> list[str]:
         grows = any(mode.unstable for mode in model_modes)
         word = "mode" if len(model_modes) == 1 else "modes"
         lines += [
-            f"  {word if k == 0 else '':<7}{describe_mode(mode)}" for k, mode in enumerate(model_modes[:MAX_LISTED_MODES])
+            f"  {word if k == 0 else '':<7}{describe_mode(mode)}"
+            for k, mode in enumerate(model_modes[:MAX_LISTED_MODES])
         ]
         if len(model_modes) > MAX_LISTED_MODES:
             lines.append(f"         and {len(model_modes) - MAX_LISTED_MODES} faster ones: .model.modes()")

@@ -360,8 +360,8 @@ class RigSetup:
                     first = second = math.nan
                 if isinstance(self.offset, str) or not (math.isfinite(first) and math.isfinite(second)):
                     raise ModelError(
-                        f"{setting('offset')} {short_repr(self.offset)} is not a pair; give the currents [A] of motor "
-                        "1 and motor 2"
+                        f"{setting('offset')} {short_repr(self.offset)} is not a pair of currents; give those "
+                        "of motor 1 and motor 2 [A]"
                     )
                 arm = replace(arm, current_offset=(first, second))
             board = VirtualBoard(arm, seed=self.seed, real_time=self.real_time, horizon=limit)
