@@ -145,7 +145,7 @@ def test_what_names_leave_open_is_asked_and_then_answered(tmp_path):
     messages(["no output is named"], opened.load)
     shown = command("open", path)
     assert shown.exit_code == 0
-    assert "to do: which columns are inputs and which are outputs" in shown.stdout
+    assert "to do: the column names do not say which are inputs and which are outputs" in shown.stdout
     assert "-u NAME=COLUMN and -y NAME=COLUMN" in shown.stdout
     assert "no numbers (line 2: 'a' is not a number)" in shown.stdout
     answered = command("open", path, "-u", "CH1", "-y", "y=CH2", "--units", "y=mm", "--window", "0.02:", "--json")
