@@ -564,7 +564,7 @@ def test_colored_noise_of_an_integrator_is_rarely_taken_for_an_offset():
 
 
 def test_a_level_is_found_on_a_record_that_is_too_long_for_the_offset_test(monkeypatch):
-    monkeypatch.setattr("ftlm.estimation.identify.MAX_OFFSET_TEST_SAMPLES", 100)
+    monkeypatch.setattr("ftlm.estimation.initial_condition_selection.MAX_OFFSET_TEST_SAMPLES", 100)
     g = np.random.default_rng(5)
     u = np.repeat(g.choice([-1.0, 1.0], 40), 25)
     y = 30.0 + plant([1.2], [0.5, 1.0], u, 0.05) + 0.01 * g.standard_normal(u.size)

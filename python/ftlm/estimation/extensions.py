@@ -642,8 +642,11 @@ def _passes_residual_tests(extension_fit: FittedExtension, default_runs: Runs) -
     return not failed and not any(o.follows_direction for o in outputs)
 
 
-def undetermined_start_findings(fit: Fit) -> list[Finding]:
-    """Return a finding if other initial conditions fit the runs equally well but give another steady-state gain."""
+def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset], JointFit]) -> list[Finding]:
+    """Return a finding if other initial conditions fit the runs equally well but give another steady-state gain.
+
+    `known` are fits that exist already, by initial conditions and offset; the others are fitted.
+    """
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
         return []
@@ -661,16 +664,19 @@ def undetermined_start_findings(fit: Fit) -> list[Finding]:
     def squares_ratio(other: JointFit) -> float:
         return max((other.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
 
+    def fits_alike(other: JointFit) -> bool:
+        return squares_ratio(other) <= MAX_SQUARES_RATIO
+
     own = _gains(joint, structure)
     worst: tuple[float, Finding] | None = None
     for initial, offset in ALTERNATIVE_INITIAL_CONDITIONS if own else ():
         if (initial, offset) == own_setting:
             continue
-        request = replace(structure, initial=initial, offset=offset)
-        other = refit_if_accepted(
-            joint, runs, request, lambda candidate: squares_ratio(candidate) <= MAX_SQUARES_RATIO, refine=False
-        )
-        if other is None or other.unstable_optimum is not None:
+        other = known.get((initial, offset))
+        if other is None:
+            request = replace(structure, initial=initial, offset=offset)
+            other = refit_if_accepted(joint, runs, request, fits_alike, refine=False)
+        if other is None or other.unstable_optimum is not None or not fits_alike(other):
             continue
         for pair, (gain, error) in _gains(other, structure).items():
             own_gain, own_error = own.get(pair, (math.nan, math.nan))

@@ -6,7 +6,9 @@
 
 use std::collections::BTreeMap;
 
-use super::multistart::{fixed_order_problems as known_orders, FixedOrderProblem};
+use super::multistart::{
+    fixed_order_problems as known_orders, select_survivors, sort_by_cost, FIRST_BUDGET_EVALUATIONS,
+};
 use super::objective::Objective;
 use super::parameter_set::ParameterSet;
 use super::problem::{Candidate, OptimizationResult};
@@ -23,7 +25,7 @@ const STUDENT_T_QUANTILE_99: f64 = 2.54;
 const DECISIVE_RESIDUAL_RATIO: f64 = 2.0;
 /// Maximum number of stable candidates of the multistart that are tried.
 const MAX_STABLE_CANDIDATES: usize = 3;
-/// Maximum number of evaluations of each stable candidate.
+/// Maximum number of evaluations of each stable candidate that continues after a short fit.
 const EVALUATIONS_PER_CANDIDATE: usize = 60;
 
 /// Comparison of an unstable optimum with the best stable one.
@@ -55,18 +57,23 @@ pub fn prefer_stable<'a>(
         return Ok((best, grid, None));
     }
     let constrained = grid.with_stability_constraint();
-    let mut ends = StableSearch { free, grid: constrained.clone() }.stable_optima(&best, reached)?;
+    let search = StableSearch { free, grid: constrained.clone() };
+    let mut first = search.short_fits(&best, reached)?;
     let unit = grid.time_scaling();
     for one in known_orders(free) {
-        // A stable optimum with one order fixed is a candidate for the full equation.
-        let stable_result =
-            stable_with_fixed_order(&one, free, &constrained, |runner| one.restrict(runner, &unit), &best, reached)?;
-        if let Some(stable_result) = stable_result {
-            let stable_result = one.embed(&stable_result, free);
-            ends.extend(ignore_failure(
-                StableSearch { free, grid: constrained.clone() }.minimize_stable(&stable_result),
-            )?);
-        }
+        // A stable optimum with one order fixed is a candidate for the full equation. Those of the multistart are among
+        // its candidates already.
+        let narrow = StableSearch { free: &one.free, grid: constrained.with_problem(&one.free.problem) };
+        let fits = narrow.short_fits(&one.restrict(&best, &unit), &[])?;
+        first.extend(fits.iter().map(|fit| one.embed(fit, free)));
+    }
+    let mut ends = Vec::new();
+    for near in select_survivors(&sort_by_cost(first)) {
+        ends.extend(ignore_failure(search.minimize(&near, &[], EVALUATIONS_PER_CANDIDATE))?);
+    }
+    let mut ends = sort_by_cost(ends);
+    if let Some(limited) = ends.iter_mut().find(|end| !end.result.has_converged()) {
+        *limited = search.minimize_along_limit(limited)?;
     }
     if ends.is_empty() {
         return Ok((
@@ -79,7 +86,7 @@ pub fn prefer_stable<'a>(
             }),
         ));
     }
-    let other = StableSearch { free, grid: constrained.clone() }.select_optimum(&ends)?;
+    let other = search.select_optimum(&ends)?;
     let excess = if best.cost_per_residual() > 0.0 {
         (other.cost_per_residual() / best.cost_per_residual()).sqrt() - 1.0
     } else {
@@ -98,24 +105,6 @@ pub fn prefer_stable<'a>(
         constrained,
         Some(StabilityComparison { keeps_unstable: false, residual_excess: excess, at_stability_limit: at_limit }),
     ))
-}
-
-/// Stable optimum of the problem with one order fixed, if any.
-fn stable_with_fixed_order(
-    one: &FixedOrderProblem,
-    free: &ParameterSet,
-    constrained: &Objective<'_>,
-    without: impl Fn(&Candidate) -> Candidate,
-    best: &Candidate,
-    reached: &[Candidate],
-) -> Result<Option<Candidate>> {
-    debug_assert!(one.order < free.orders.len());
-    let narrow = StableSearch { free: &one.free, grid: constrained.with_problem(&one.free.problem) };
-    let inside = narrow.stable_optima(&without(best), &reached.iter().map(without).collect::<Vec<_>>())?;
-    if inside.is_empty() {
-        return Ok(None);
-    }
-    Ok(ignore_failure(narrow.select_optimum(&inside).map(Some))?.flatten())
 }
 
 /// Convert any error except [`Error::Interrupted`] to None.
@@ -198,48 +187,38 @@ struct StableSearch<'f, 'g> {
 }
 
 impl StableSearch<'_, '_> {
-    fn minimize(&self, start: &Candidate, fixed: &[usize]) -> Result<Candidate> {
+    fn minimize(&self, start: &Candidate, fixed: &[usize], evaluations: usize) -> Result<Candidate> {
         let place = &start.result.iterate;
-        Ok(start.with_result(self.grid.minimize_in(
-            &self.free.problem_at(place, true, fixed),
-            place,
-            EVALUATIONS_PER_CANDIDATE,
-        )?))
+        let problem = self.free.problem_at(place, true, fixed);
+        Ok(start.with_result(self.grid.minimize_in(&problem, place, evaluations)?))
     }
 
-    /// Stable optima from stable candidates of the multistart and from modifications of the unstable optimum.
-    fn stable_optima(&self, best: &Candidate, reached: &[Candidate]) -> Result<Vec<Candidate>> {
-        let raced = reached.iter().filter(|runner| !is_unstable(self.free, runner)).take(MAX_STABLE_CANDIDATES);
-        let mut starts: Vec<(Candidate, Vec<usize>)> = raced.map(|runner| (runner.clone(), Vec::new())).collect();
+    /// Short fits from stable candidates of the multistart and from modifications of the unstable optimum.
+    fn short_fits(&self, best: &Candidate, reached: &[Candidate]) -> Result<Vec<Candidate>> {
+        let stable = reached.iter().filter(|runner| !is_unstable(self.free, runner)).take(MAX_STABLE_CANDIDATES);
+        let mut starts: Vec<(Candidate, Vec<usize>)> = stable.map(|runner| (runner.clone(), Vec::new())).collect();
         starts.push(dissipative_candidate(self.free, best));
         starts.extend(candidates_without_term(self.free, best));
-        let mut ends = Vec::new();
+        let mut fits = Vec::new();
         for (start, turned) in starts.into_iter().filter(|(start, _)| !is_unstable(self.free, start)) {
-            let near = if turned.is_empty() { Ok(start) } else { self.minimize(&start, &turned) };
+            let adapt = |fixed: &[usize]| self.minimize(&start, fixed, FIRST_BUDGET_EVALUATIONS);
+            let near = if turned.is_empty() { Ok(start.clone()) } else { adapt(&turned) };
             // Candidates without a finite simulation on this grid are skipped.
-            ends.extend(ignore_failure(near.and_then(|near| self.minimize_stable(&near)))?);
+            fits.extend(ignore_failure(near.and_then(|near| self.minimize(&near, &[], FIRST_BUDGET_EVALUATIONS)))?);
         }
-        Ok(ends)
-    }
-
-    /// Minimize over stable models, along the stability limit if it is reached.
-    fn minimize_stable(&self, start: &Candidate) -> Result<Candidate> {
-        let end = self.minimize(start, &[])?;
-        if end.result.has_converged() {
-            return Ok(end);
-        }
-        self.minimize_along_limit(end)
+        Ok(fits)
     }
 
     /// Minimize along the stability limit, with one autoregressive coefficient fixed at a time.
     ///
     /// An optimization stops if a step of all parameters would be unstable, although the cost can still decrease along
     /// the limit.
-    fn minimize_along_limit(&self, end: Candidate) -> Result<Candidate> {
+    fn minimize_along_limit(&self, end: &Candidate) -> Result<Candidate> {
         let status = end.result.status;
         let mut best = end.clone();
         for k in autoregressive_indices(self.free) {
-            let optimum = ignore_failure(self.minimize(&end, &[self.free.orders.len() + k]))?;
+            let fixed = [self.free.orders.len() + k];
+            let optimum = ignore_failure(self.minimize(end, &fixed, EVALUATIONS_PER_CANDIDATE))?;
             best = optimum.filter(|optimum| optimum.cost_per_residual() < best.cost_per_residual()).unwrap_or(best);
         }
         // With a fixed coefficient it converged in fewer parameters than the fit has.

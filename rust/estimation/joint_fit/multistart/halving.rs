@@ -13,7 +13,7 @@ use crate::parallel::Stop;
 
 /// Number of evaluations of every candidate in the first budget. Candidates near the best then get
 /// [`SECOND_BUDGET_EVALUATIONS`].
-pub(super) const FIRST_BUDGET_EVALUATIONS: usize = 15;
+pub(in crate::estimation::joint_fit) const FIRST_BUDGET_EVALUATIONS: usize = 15;
 pub(super) const SECOND_BUDGET_EVALUATIONS: usize = 60;
 /// Minimum number of initial guesses of a submodel that continue after the prescreening.
 pub(super) const MIN_SURVIVORS: usize = 8;
@@ -160,7 +160,7 @@ fn zero_vanishing_coefficients(free: &ParameterSet, start: &Candidate, mut ended
 }
 
 /// Sort candidates by cost, stable for ties.
-pub(super) fn sort_by_cost(mut runners: Vec<Candidate>) -> Vec<Candidate> {
+pub(in crate::estimation::joint_fit) fn sort_by_cost(mut runners: Vec<Candidate>) -> Vec<Candidate> {
     runners.sort_by(|a, b| a.cost_per_residual().total_cmp(&b.cost_per_residual()));
     runners
 }

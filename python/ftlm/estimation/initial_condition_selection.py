@@ -1,0 +1,329 @@
+"""Selection of the initial conditions and offsets of a fit: from rest or in motion, with a level or a constant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from ftlm.data.run import Run
+from ftlm.data.sampling import drop_missing
+from ftlm.errors import FtlmError, ModelError
+from ftlm.estimation.extensions import undetermined_start_findings
+from ftlm.estimation.fit import Fit
+from ftlm.estimation.nuisance_parameters import (
+    DEFAULT_PULSES_PER_SAMPLE,
+    OffsetTest,
+    constant_input,
+    fit_score,
+    fit_without_history,
+    fits_better,
+    has_colored_residuals,
+    has_white_residuals,
+    offset_test,
+    refit_if_accepted,
+    unrequested_offset_findings,
+)
+from ftlm.estimation.output_error import JointFit
+from ftlm.findings import Finding, make_finding
+from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
+from ftlm.structure.structure import History, Initial, Offset, Structure
+from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO
+
+#: Initial terms of fits with a level.
+LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
+#: Offsets of fits in motion of runs that looked like rest.
+MOTION_OFFSETS: tuple[Literal["none"], Literal["level"]] = ("none", "level")
+#: Mean of an output, in its standard deviations, from which on it shows a level.
+LEVEL_DEVIATIONS = 3.0
+#: Residuals of an output, in its standard deviations, from which on a fit has failed.
+MAX_RESIDUAL_SHARE = 0.5
+#: Maximum number of samples with which an offset is tested without request: the test stores a sensitivity of each
+#: parameter at every sample.
+MAX_OFFSET_TEST_SAMPLES = 400_000
+
+
+def fit_with_offset_decision(
+    runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit], hypotheses: Hypotheses
+) -> Fit:
+    """Return the fit of a structure; ``offset="auto"`` adds a constant per equation if it is significant.
+
+    `estimate` fits a structure without further decisions.
+
+    The structure with the constant is fitted first, because a fit that lacks a necessary constant may end at any wrong
+    optimum.
+    """
+    if structure.offset != "auto":
+        fit = _fit_with_level_decision(structure, hypotheses)
+        if structure.initial != "auto" or structure.offset != "none":
+            return fit
+        return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit, hypotheses.fits)])
+    try:
+        request = replace(structure, offset="constant")
+    except ModelError as error:
+        # A given initial term has the power of t to which an offset integrates.
+        return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
+    twin = constant_input(runs, structure)
+    if twin is not None:
+        words = f"none: {twin} is constant on every run, from which an offset is not separately identifiable"
+        return _with_offset_decision(estimate(replace(structure, offset="none")), words)
+    fit = estimate(request)
+    if fit.task.structure.offset == "level":
+        return _with_offset_decision(fit, "level: the runs rest at their own level before an input moves")
+    test = fit_offset_test(fit)
+    if test is not None and test.exceeds():
+        return _with_offset_decision(fit, test.decision)
+    decision = "none: its test has no finite simulation" if test is None else test.decision
+    return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Functions that fit a structure with different initial conditions, and complete the fit that is chosen.
+
+    Parameters
+    ----------
+    estimate
+        Function that fits a structure.
+    may_add_offset
+        Whether a level or a constant may be added; False if the user gave an offset.
+    complete
+        Function that adds all confidence intervals to a joint fit of a structure; None if :attr:`estimate` already
+        gives them.
+    fits
+        Last joint fit of each pair of initial conditions and offset.
+    """
+
+    estimate: Callable[[Structure], Fit]
+    may_add_offset: bool
+    complete: Callable[[Structure, JointFit | None], Fit] | None = None
+    fits: dict[tuple[Initial, Offset], JointFit] = field(default_factory=dict)
+
+    def fit(self, structure: Structure) -> Fit:
+        """Return the fit of a structure from automatic initial guesses."""
+        fit = self.estimate(structure)
+        if fit.joint is not None:
+            self.fits[fit.joint.initial, structure.offset] = fit.joint
+        return fit
+
+    def take(self, structure: Structure, fit: Fit) -> Fit:
+        """Return the chosen fit with all requested confidence intervals."""
+        return fit if self.complete is None else self.complete(structure, fit.joint)
+
+    def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
+        """Return a fit of a structure with other initial conditions, started from an existing optimum.
+
+        The result is None if `accepts` rejects the fit.
+        """
+        joint, runs = fit.joint, fit.task.runs
+        if joint is None or self.complete is None:
+            refit = self.fit(structure)
+            return refit if refit.joint is not None and accepts(refit.joint) else None
+        request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
+        near = refit_if_accepted(joint, runs, request, accepts)
+        if near is None:
+            return None
+        self.fits[near.initial, request.offset] = near
+        return replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
+
+
+def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
+    """Return the fit of a structure, with a constant level added to each output if the runs prefer one."""
+    fit = hypotheses.fit(structure)
+    constant = _fit_with_constant(fit, structure, hypotheses)
+    if constant is not None:
+        return constant
+    restart = _fit_in_motion(fit, structure, hypotheses)
+    if restart is not None:
+        return restart
+    # In a non-linear model a constant has no constant sensitivity: it determines where a body rests.
+    if fit.task.structure.offset != "none" or not structure.is_linear:
+        return hypotheses.take(structure, fit)
+    suggests_level = _suggests_level(fit)
+    is_level_tried = suggests_level or _may_hide_level(fit)
+    level = _fit_with_level(fit, structure, hypotheses, has_level=suggests_level) if is_level_tried else None
+    if level is not None:
+        return level
+    test = fit_offset_test(fit) if sum(run.length for run in fit.task.runs) <= MAX_OFFSET_TEST_SAMPLES else None
+    offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
+    if offset_findings and _has_estimated_initial_conditions(fit) and not is_level_tried:
+        level = _fit_with_level(fit, structure, hypotheses, has_level=False)
+        if level is not None:
+            return level
+    fit = hypotheses.take(structure, fit)
+    return replace(fit, findings=[*fit.findings, *offset_findings])
+
+
+def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
+    """Return the fit with a constant in the equations; None if a level suffices or the constant is no improvement.
+
+    No output level describes the response of an integrating or non-linear plant to the offset of an input sensor.
+    The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum.
+    """
+    automatic = structure.initial == "auto" and structure.offset == "none" and hypotheses.may_add_offset
+    if fit.joint is None or not automatic or fit.task.structure.offset != "none":
+        return None
+    level_suffices = structure.is_linear and not structure.integrates
+    if level_suffices or has_white_residuals(fit.joint) or constant_input(fit.task.runs, structure) is not None:
+        return None
+    request = replace(structure, offset="constant")
+    try:
+        candidate = hypotheses.fit(request)
+    except FtlmError:
+        return None
+    joint = candidate.joint
+    # A non-linear structure has several optima, so that a slightly lower criterion is no evidence of a constant.
+    margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
+    if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint, margin):
+        return None
+    whole = _fit_in_motion(candidate, request, hypotheses) or hypotheses.take(request, candidate)
+    about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
+    return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **about)])
+
+
+def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
+    """Return a fit with unknown initial values if the runs clearly refute rest despite quiet first samples.
+
+    A few quiet samples do not distinguish slow motion from rest. If the residuals of the fit from rest are white, rest
+    is kept. If they oscillate, the fit with initial values is chosen only if its residuals are white. None if rest is
+    kept.
+    """
+    joint, runs = fit.joint, fit.task.runs
+    automatic = structure.initial == "auto" and structure.offset in ("none", "constant") and structure.is_linear
+    if joint is None or not automatic or joint.initial != "rest":
+        return None
+    slow = has_colored_residuals(joint)
+    if not slow and has_white_residuals(joint):
+        return None
+    evidence = [rest_evidence(run, structure) for run in runs]
+    if any(item is not None and item.rows == 0 for item in evidence):
+        # A constant input gives no evidence of rest.
+        return None
+    least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
+    offsets = MOTION_OFFSETS if structure.offset == "none" and hypotheses.may_add_offset else (structure.offset,)
+    for offset in offsets:
+        request = replace(structure, initial="caputo", offset=offset)
+
+        def is_better(candidate: JointFit, *, most: float = least) -> bool:
+            return fit_score(candidate, joint) < most
+
+        try:
+            other = hypotheses.refit(request, fit, is_better)
+        except FtlmError:
+            continue
+        if other is None or other.joint is None or other.joint.unstable_optimum is not None:
+            continue
+        if slow or has_white_residuals(other.joint):
+            least, candidate = fit_score(other.joint, joint), (request, other)
+    if candidate is None:
+        return None
+    whole = hypotheses.take(*candidate)
+    start_finding = make_finding("rest_rejected", run=", ".join(r.name for r in runs))
+    return replace(whole, findings=[*whole.findings, start_finding])
+
+
+def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, has_level: bool) -> Fit | None:
+    """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
+
+    The likelihoods of two fits are compared under the noise color of the fit with the larger residuals. If the output
+    means suggest a level, the optimum moves far and automatic initial guesses are used. Otherwise the fit starts from
+    the optimum without a level.
+    """
+    if fit.joint is None or not hypotheses.may_add_offset:
+        return None
+    best = fit.joint
+    candidate: tuple[Structure, Fit] | None = None
+    margin = START_SETTINGS.history_margin if isinstance(best.initial, History) else 0.0
+
+    def is_preferred(joint: JointFit) -> bool:
+        return fits_better(joint, best, margin)
+
+    for initial in LEVEL_STARTS:
+        request = replace(structure, initial=initial, offset="level")
+        try:
+            fresh = has_level and candidate is None
+            near = fit if candidate is None else candidate[1]
+            level = hypotheses.fit(request) if fresh else hypotheses.refit(request, near, is_preferred)
+            if level is not None and level.joint is not None and not (fresh or level.joint.converged):
+                # The optimum under other initial conditions is not near any optimum under these.
+                level = hypotheses.fit(request)
+        except FtlmError:
+            continue
+        if level is not None and level.joint is not None and is_preferred(level.joint):
+            best, candidate, margin = level.joint, (request, level), 0.0
+    if candidate is None:
+        return None
+    whole = hypotheses.take(*candidate)
+    was = "rested" if best.initial == "rest" else "moved"
+    about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
+    # Another run may start otherwise.
+    model = replace(whole.model, structure=replace(whole.model.structure, initial=structure.initial))
+    return replace(whole, model=model, findings=[*whole.findings, make_finding("level_estimated", **about)])
+
+
+def _suggests_level(fit: Fit) -> bool:
+    """Whether a level of an output is so likely that it is fitted from automatic initial guesses.
+
+    This holds if initial conditions were estimated, and the mean or the residuals of an output are large relative to
+    its standard deviation. The optimum with a level may then be far away.
+    """
+    joint = fit.joint
+    if joint is None or not _has_estimated_initial_conditions(fit):
+        return False
+    for output, noise in joint.noise.items():
+        values = [drop_missing(run[output]) for run in fit.task.runs]
+        if any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values):
+            return True
+        if noise > MAX_RESIDUAL_SHARE * max(float(np.std(y)) for y in values):
+            return True
+    return False
+
+
+def _may_hide_level(fit: Fit) -> bool:
+    """Whether estimated initial conditions and colored residuals may keep the offset test from detecting a level."""
+    joint = fit.joint
+    if joint is None or not _has_estimated_initial_conditions(fit):
+        return False
+    sizes = {o: max(float(np.nanstd(run[o])) for run in fit.task.runs) for o in joint.noise}
+    is_negligible = all(noise <= NEGLIGIBLE_RESIDUAL_RATIO * sizes[o] for o, noise in joint.noise.items())
+    return not is_negligible and has_colored_residuals(joint)
+
+
+def _has_estimated_initial_conditions(fit: Fit) -> bool:
+    """Whether nonzero initial conditions were chosen automatically (``initial="auto"``)."""
+    return fit.joint is not None and fit.joint.initial != "rest" and fit.task.structure.initial == "auto"
+
+
+def _history_offset_findings(fit: Fit) -> list[Finding]:
+    """Return a finding if a constant in the equations explains the data as well as the initial terms do.
+
+    A constant is part of the model, whereas initial terms hold for one run only.
+    """
+    joint, structure = fit.joint, fit.task.structure
+    if joint is None or structure.initial != "auto" or not isinstance(joint.initial, History):
+        return []
+    few = fit_without_history(joint, fit.task.runs, structure)
+    if few is None:
+        return []
+    less = joint.initial_terms - few.initial_terms
+    outputs = ", ".join(fit.model.outputs)
+    return [make_finding("constant_instead_of_past", output=outputs, terms=joint.initial_terms, fewer=less)]
+
+
+def fit_offset_test(fit: Fit) -> OffsetTest | None:
+    """Return the offset test at the parameters of a fit; None if the fit does not allow the test."""
+    structure = replace(fit.task.structure, offset="none")
+    if fit.joint is not None:
+        values = fit.joint.values_by_name
+        request = replace(structure, initial=fit.joint.initial)
+        return offset_test(fit.task.runs, request, values, every=fit.joint.refinement)
+    if not fit.at_optimum:
+        return None
+    values = {**fit.model.orders, **fit.model.coefficients}
+    return offset_test(fit.task.runs, replace(structure, coefficient_law=()), values, every=DEFAULT_PULSES_PER_SAMPLE)
+
+
+def _with_offset_decision(fit: Fit, decision: str) -> Fit:
+    return replace(fit, settings={**fit.settings, "offset_test": decision})
