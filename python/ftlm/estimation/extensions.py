@@ -26,7 +26,7 @@ from ftlm.estimation.closed_loop import run_with_inputs
 from ftlm.estimation.estimators import fitted_model
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.model_checks import enumerate_names
-from ftlm.estimation.nuisance_parameters import evaluate_at_point, output_sensitivities, refit_if_accepted
+from ftlm.estimation.nuisance_parameters import evaluate_at_point, output_sensitivities, refit_after_screening
 from ftlm.estimation.output_error import JointFit, fit_output_error
 from ftlm.findings import Finding, make_finding
 from ftlm.model.model import Model
@@ -675,7 +675,7 @@ def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset],
         other = known.get((initial, offset))
         if other is None:
             request = replace(structure, initial=initial, offset=offset)
-            other = refit_if_accepted(joint, runs, request, fits_alike, refine=False)
+            other = refit_after_screening(joint, runs, request, fits_alike, refine=False)
         if other is None or other.unstable_optimum is not None or not fits_alike(other):
             continue
         for pair, (gain, error) in _gains(other, structure).items():

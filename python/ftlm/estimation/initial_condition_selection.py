@@ -23,7 +23,7 @@ from ftlm.estimation.nuisance_parameters import (
     has_colored_residuals,
     has_white_residuals,
     offset_test,
-    refit_if_accepted,
+    refit_after_screening,
     unrequested_offset_findings,
 )
 from ftlm.estimation.output_error import JointFit
@@ -122,11 +122,13 @@ class Hypotheses:
             refit = self.fit(structure)
             return refit if refit.joint is not None and accepts(refit.joint) else None
         request = replace(fit.task.structure, initial=structure.initial, offset=structure.offset)
-        near = refit_if_accepted(joint, runs, request, accepts)
+        near = refit_after_screening(joint, runs, request, accepts)
         if near is None:
             return None
         self.fits[near.initial, request.offset] = near
-        return replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
+        return (
+            None if not accepts(near) else replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
+        )
 
 
 def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:

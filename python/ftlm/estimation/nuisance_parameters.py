@@ -469,13 +469,12 @@ def _pooled_residuals(joint: JointFit) -> list[Floats]:
 
 def _simplify_initial_terms(joint: JointFit, runs: Sequence[Run], structure: Structure, *, refine: bool) -> JointFit:
     """Return the fit with Caputo initial terms if they suffice, otherwise the fit with a history."""
-    request = replace(structure, initial="caputo")
-    return (
-        refit_if_accepted(
-            joint, runs, request, lambda few: not _fit_needs_history(few, joint, runs, structure), refine=refine
-        )
-        or joint
-    )
+
+    def suffices(few: JointFit) -> bool:
+        return not _fit_needs_history(few, joint, runs, structure)
+
+    few = refit_after_screening(joint, runs, replace(structure, initial="caputo"), suffices, refine=refine)
+    return joint if few is None or not suffices(few) else few
 
 
 def _fit_without_implausible_history(
@@ -514,7 +513,7 @@ def _fitted_structure(joint: JointFit, structure: Structure) -> Structure:
     return structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
 
 
-def refit_if_accepted(
+def refit_after_screening(
     joint: JointFit,
     runs: Sequence[Run],
     structure: Structure,
@@ -522,11 +521,11 @@ def refit_if_accepted(
     *,
     refine: bool = True,
 ) -> JointFit | None:
-    """Return the refit of a linear structure with other initial conditions or offsets; None if rejected or failed.
+    """Return the refit of a linear structure with other initial conditions or offsets; None if screened out or failed.
 
     First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The residuals,
-    multiplied by a share, are an optimistic estimate of those of a complete fit. Then follow a fit on the same grid
-    and, with `refine`, one with a refined step. Each is made only if `accepts` accepts the result before.
+    multiplied by a share, are an optimistic estimate of those of a complete fit. If `accepts` accepts them, a fit on
+    the same grid follows, and if it accepts that, with `refine`, one with a refined step.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
@@ -559,7 +558,7 @@ def refit_if_accepted(
             fit = fit_output_error(runs, structure, near=coarser, loss=loss)
     except FtlmError:
         return None
-    return fit if accepts(fit) else None
+    return fit
 
 
 def fit_without_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:

@@ -391,7 +391,7 @@ def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit,
             if runs is not folds.runs and fold.rows is not None and _has_measured_drivers(structure):
                 validation[fold.name] = _validate_separately(structure, fold, joint, refine=fine)
                 continue
-            own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
+            own = joint if runs is folds.runs else fit(runs, structure, [], refine=fine, near=near)
             validation[fold.name] = fold.fit(fitted_model(replace(own, initial=joint.initial), structure))
         except FtlmError as error:
             # The message is about the estimation data of the fold, not about the given runs.

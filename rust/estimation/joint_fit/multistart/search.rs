@@ -21,6 +21,9 @@ use crate::recording::{Recordings, Sampling};
 
 /// Ratio of the best cost to the noise floor above which problems with one free order get a multistart of their own.
 pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
+/// Intervals of the first part of a long record, and of the whole record decimated, on which initial guesses of integer
+/// orders are found.
+const GUESS_INTERVALS: usize = 2000;
 /// Intervals of long records on which problems of integer orders are fitted for their initial guesses.
 pub const SELECTION_INTERVALS: usize = 6000;
 
@@ -97,13 +100,49 @@ fn integer_order_multistart(
     if !free.orders.is_empty() || !free.problem.is_linear() {
         return Ok(None);
     }
-    let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
-    let sampling = Sampling { leading_intervals, ..Sampling::default() };
-    let grid = Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
-    let Some(starts) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
+    let objective = |sampling| {
+        let weights = Weights { outputs: course.weights.to_vec(), robust_weights: None };
+        Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)
+    };
+    let grid = objective(Sampling { leading_intervals, ..Sampling::default() })?;
+    let samplings = guess_samplings(free, course.source, leading_intervals)?;
+    let mut starts = Vec::new();
+    for sampling in &samplings {
+        match course.starts.integer_order_optima(free, &objective(*sampling)?)? {
+            Some(optima) => starts.extend(optima),
+            // Another part of the record can still determine the equation.
+            None if samplings.len() > 1 => {}
+            None => return Ok(None),
+        }
+    }
+    if starts.is_empty() && samplings.len() > 1 {
+        let Some(optima) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
+        starts = optima;
+    }
     let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
+    if samplings.len() > 1 {
+        starts = merge_duplicates(&laps.run(free, &grid, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+    }
     let candidates = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
     Ok((!candidates.is_empty()).then_some(candidates))
+}
+
+/// Samplings of the record on which initial guesses of integer orders are found: of a long record its first part with
+/// all samples, for fast poles and delays, and the whole decimated, for slow poles. Otherwise all samples.
+fn guess_samplings(
+    free: &ParameterSet,
+    source: &Recordings,
+    leading_intervals: Option<usize>,
+) -> Result<Vec<Sampling>> {
+    let all = Sampling { leading_intervals, ..Sampling::default() };
+    let Some(first) = leading_part(free, source, GUESS_INTERVALS)? else { return Ok(vec![all]) };
+    let intervals = source.runs().iter().map(|run| run.len().saturating_sub(1)).min().unwrap_or(0);
+    let decimation = leading_intervals.unwrap_or(usize::MAX).min(intervals) / first;
+    Ok(if decimation < 2 {
+        vec![all]
+    } else {
+        vec![Sampling { leading_intervals: Some(first), ..all }, Sampling { decimation, ..all }]
+    })
 }
 
 /// Convert the error of an invalid model to None.
