@@ -454,7 +454,7 @@ def test_every_entry_of_the_catalogue_renders():
 
 def test_remedies_know_the_method():
     for method, remedy in (
-        ("least-squares", "add a missing input, a delay or a term; or use method='output-error'"),
+        ("least-squares", "add a missing input, a delay or a term; or use identify with method='output-error'"),
         ("output-error", "add a missing input, a delay or a term"),
     ):
         assert Finding("explains_little", method=method).remedy == remedy

@@ -11,9 +11,10 @@ import numpy as np
 from ftlm import control as designs
 from ftlm.cli.framework import (
     NonNegative,
+    OptionalOutputCsv,
     OptionalOutputFile,
+    OptionalOutputJson,
     announce_design,
-    check_ending,
     command,
     figure_kind,
     numbers,
@@ -58,10 +59,10 @@ def control(
     rate: float = 500.0,
     limit: float | None = None,
     path: str | None = None,
-    trajectory: OptionalOutputFile = None,
+    trajectory: OptionalOutputCsv = None,
     samples: int = 100,
     seed: NonNegative = 0,
-    out: OptionalOutputFile = None,
+    out: OptionalOutputJson = None,
     force: bool = False,
     as_json: bool = False,
 ) -> None:
@@ -107,8 +108,6 @@ def control(
         Write the controller to this .json file.
     """
     arguments = dict(locals())
-    check_ending(out, ".json")
-    check_ending(trajectory, ".csv")
     if trajectory is not None and path is None:
         raise ModelError("--trajectory needs a move; give --path SIZE:SECONDS")
     wrong = [n for n in (LQG_OPTIONS if design == "pid" else PID_OPTIONS) if arguments[n] not in (None, [])]
@@ -185,7 +184,7 @@ def input_shaper(
     modes: int = 1,
     coupling: Literal["simulated", "measured"] = "simulated",
     rate: float = 500.0,
-    out: OptionalOutputFile = None,
+    out: OptionalOutputCsv = None,
     force: bool = False,
     as_json: bool = False,
 ) -> None:
@@ -204,7 +203,6 @@ def input_shaper(
     out : FILE
         Write its impulse response to this .csv file.
     """
-    check_ending(out, ".csv")
     shaper = designs.input_shaper(load_model(model), kind, modes=modes, coupling=coupling)
     taps = shaper.impulses(rate)
     if out is not None:
@@ -246,7 +244,7 @@ def design_input(
     noise: list[str] | None = None,
     period: float | None = None,
     seed: NonNegative = 0,
-    out: OptionalOutputFile = None,
+    out: OptionalOutputCsv = None,
     plot: OptionalOutputFile = None,
     force: bool = False,
     as_json: bool = False,
@@ -278,7 +276,6 @@ def design_input(
     plot : FILE
         Write a figure to this .png, .pdf or .svg file.
     """
-    check_ending(out, ".csv", ", as a run for a rig does")
     figure_kind(plot)
     loaded = load_model(model)
     run = None if reference_run is None else reading.runs([reference_run], loaded.structure)[0]

@@ -215,6 +215,8 @@ class OptionDetails:
         Minimum of an integer.
     is_output
         Whether the option is a file to write. A path that cannot be written is rejected before the computation.
+    ending
+        Extension that the file must have; any if empty.
     help_entry
         Name of the option's entry in the shared help; by default the name of the option.
     """
@@ -222,12 +224,16 @@ class OptionDetails:
     flags: tuple[str, ...] = ()
     min: int | None = None
     is_output: bool = False
+    ending: str = ""
     help_entry: str | None = None
 
 
 OutputFile = Annotated[str, OptionDetails(is_output=True)]
-OutputPage = Annotated[str, OptionDetails(is_output=True, help_entry="page")]
+OutputPage = Annotated[str, OptionDetails(is_output=True, ending=".html", help_entry="page")]
 OptionalOutputFile = Annotated[str | None, OptionDetails(is_output=True)]
+OptionalOutputPage = Annotated[str | None, OptionDetails(is_output=True, ending=".html")]
+OptionalOutputCsv = Annotated[str | None, OptionDetails(is_output=True, ending=".csv")]
+OptionalOutputJson = Annotated[str | None, OptionDetails(is_output=True, ending=".json")]
 NonNegative = Annotated[int, OptionDetails(min=0)]
 Positive = Annotated[int, OptionDetails(min=1)]
 #: Flags of options whose flag is not their name alone.
@@ -292,7 +298,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
         else:
             positional = parameter.kind is not inspect.Parameter.KEYWORD_ONLY
             options.append(_option(parameter.name, kind, parameter.default, texts, positional=positional))
-    outputs = [option.name for option in options if option.annotation.__metadata__[0].is_output]
+    described = {option.name: option.annotation.__metadata__[0] for option in options}
+    outputs = {name: option.ending for name, option in described.items() if option.is_output}
 
     @functools.wraps(work)
     def run(**arguments: Any) -> None:
@@ -304,6 +311,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             name: kind(**{f.name: arguments.pop(f.name) for f in fields(kind)}) for name, kind in records.items()
         }
         try:
+            for name, ending in outputs.items():
+                _check_ending(arguments[name], ending)
             if outputs:
                 check_free(*(arguments[name] for name in outputs), force=arguments["force"])
             work(**arguments, **option_records)
@@ -352,7 +361,7 @@ def _option(
         # A switch that is on by default has two flags, which typer makes.
         flags = details.flags or OPTION_FLAGS.get(name) or (() if default is True else (f"--{name.replace('_', '-')}",))
         described = typer.Option(*flags, metavar=metavar, rich_help_panel=text.panel, help=text.help, min=details.min)
-    described.is_output = details.is_output
+    described.is_output, described.ending = details.is_output, details.ending
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, described]
     )
@@ -423,10 +432,10 @@ def _to_json_value(value: Any) -> Any:
 FIGURE_FORMATS = ("png", "pdf", "svg")
 
 
-def check_ending(path: str | None, ending: str, why: str = "") -> None:
-    """Raise ModelError for a file name with another extension; None is ignored."""
-    if path is not None and Path(path).suffix.lower() != ending:
-        raise ModelError(f"{path} does not end in {ending}{why}; use this extension")
+def _check_ending(path: str | None, ending: str) -> None:
+    """Raise ModelError for a file name without a required extension; None is ignored."""
+    if path is not None and ending and Path(path).suffix.lower() != ending:
+        raise ModelError(f"{path} does not end in {ending}; use this extension")
 
 
 def figure_kind(path: str | None) -> str:

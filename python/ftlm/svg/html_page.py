@@ -18,6 +18,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from ftlm._core import __version__
+from ftlm.errors import ModelError
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import chart_css
 from ftlm.utils.files import write_atomically
@@ -222,9 +223,13 @@ def write_page(
 
     Raises
     ------
+    ModelError
+        If the file name does not end in .html or .htm.
     DataError
         If the file exists and ``force`` is False, or it cannot be written.
     """
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise ModelError(f"{path} does not end in .html; use this extension")
     script, digest = _script()
     page = (
         templates("ftlm.svg")

@@ -381,12 +381,24 @@ fn select_on_part(
             let problem = sought.free.problem_at(place, true, &[]);
             Ok(best.with_result(whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?))
         });
-        // The simulation may be finite on the first part only.
-        if !matches!(&winner, Err(error) if *error != Error::Interrupted) {
-            return winner;
+        // On all samples its simulation may overflow, or another survivor may be better before any optimization.
+        match winner {
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            Ok(best) if !has_better(contenders, &best, &whole)? => return Ok(best),
+            _ => {}
         }
     }
     select_best_candidate(sought.free, contenders, &whole)
+}
+
+/// True if one of the candidates, as it is, has a lower cost on a grid than the optimum `best`.
+fn has_better(candidates: &[Candidate], best: &Candidate, grid: &Objective<'_>) -> Result<bool> {
+    for candidate in candidates {
+        if grid.evaluate(&candidate.result.iterate)?.is_some_and(|evaluation| evaluation.cost < best.result.cost) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }
 
 /// Best survivor on a grid, with equal weights of all outputs.
