@@ -177,7 +177,8 @@ def test_a_report_of_a_saved_model(folder: Path) -> None:
     assert "No validation run was given" in (folder / "alone.html").read_text("utf-8")
     for words in (("report", "given.json", "-o", "x.pdf"), ("identify", "square.csv", *SEARCH, "--report", "x.pdf")):
         other = run_command(*words, cwd=folder)
-        assert other.returncode == 2 and "x.pdf does not end in .html; use this extension" in other.stderr
+        assert other.returncode == 2
+        assert "x.pdf does not end in .html; use this extension" in other.stderr
     missing = run_command("report", "given.json", "-o", "nowhere/x.html", cwd=folder)
     assert (missing.returncode, "is not a folder; create it first" in missing.stderr) == (3, True)
     np.savetxt(folder / "other.csv", np.ones((60, 2)).cumsum(axis=0), delimiter=",", header="t,w", comments="")
