@@ -21,8 +21,8 @@ stand for values. `docs/findings.py` writes this page from the catalogue.
 
 #: Cases whose level was changed: the level before, the code that it has today, and the reason.
 CHANGED_LEVELS = (
-    ("do not use", "simulation_unbounded", "a pole on the right by more than 2.33 standard errors"),
-    ("do not use", "instability_not_significant", "a pole on the right, by less: 20 of 40 true integrators had one"),
+    ("do not use", "simulation_unbounded", "a pole in the right half-plane, by more than 2.33 standard errors"),
+    ("do not use", "instability_not_significant", "a pole in the right half-plane, by less: 20 of 40 true integrators"),
     ("do not use", "plant_unstable", "pieces of the run show that the plant itself is unstable"),
     ("do not use", "not_separately_identifiable", "an infinite standard error"),
     ("do not use", "parameters_correlated", "a correlation alone, which intervals include already"),
@@ -52,13 +52,13 @@ CHANGED_LEVELS = (
     ),
     ("with care", "intervals_rough", "a property of the intervals, not a fault of the model"),
     ("with care", "constant_instead_of_past", "both describe the run; one needs fewer parameters"),
-    ("with care", "rest_rejected", "a history was estimated, because the residuals require it"),
+    ("with care", "rest_rejected", "nonzero initial conditions were estimated, because the residuals require it"),
     ("fact", "simulated_from_rest", "a comparison that leaves motion out is wrong at its start"),
     ("fact", "rest_assumed", "a constant input: the gain is that of an assumption"),
-    ("fact", "prior_shifts_estimate", "coefficients of an order search that its prior changes"),
+    ("fact", "prior_shifts_estimate", "an order search whose prior changes the coefficients"),
     ("none", "second_optimum", "another optimum as good, with other parameters"),
-    ("none", "ranking_not_significant", "an order search in which noise decides the ranks"),
-    ("none", "initial_state_not_identifiable", "two initial conditions explain a run, with two gains"),
+    ("none", "tied_orders_far_apart", "an order search in which noise decides the ranks"),
+    ("none", "gain_depends_on_initial_conditions", "two initial conditions explain a run, with two gains"),
     (
         "none",
         "other_intersample_fits",

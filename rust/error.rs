@@ -288,8 +288,8 @@ pub fn check_step(step: f64) -> Result<()> {
     }
 }
 
-/// Maximum number of points of a series or a record: a gigabyte a signal, a hundred times the longest runs, and far
-/// below 2³¹, where the tables of prime divisors end. A larger number is a mistake that would exhaust memory.
+/// Maximum number of points of a series or a record: 1 GiB per signal. A larger number is a mistake that would exhaust
+/// memory. The tables of prime divisors, with 31-bit indices, are large enough.
 pub const MAX_POINTS: usize = 1 << 27;
 
 /// Return an error for more points than [`MAX_POINTS`].

@@ -132,7 +132,7 @@ def objects():
         "control.LqgDesign": lqg,
         "control.Observer": lqg.controller.observer,
         "control.PidDesign": design,
-        "control.Realisation": lqg.realisation,
+        "control.Realization": lqg.realization,
         "control.Shaper": control.input_shaper(-2 + 17j),
         "kernels.Candidates": kernels.Candidates(np.stack([U, T]), [0, 1], step=STEP),
         "rig.ArmParameters": rig.ArmParameters.of("effective"),

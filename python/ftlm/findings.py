@@ -189,7 +189,9 @@ class Finding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     def __post_init__(self) -> None:
         if self.code not in finding_catalogue().kinds:
-            raise ModelError(f"there is no finding {short_repr(self.code)}; give one of the catalogue")
+            raise ModelError(
+                f"{short_repr(self.code)} is not a code of the catalogue of findings; give one of its codes"
+            )
 
     @property
     def kind(self) -> FindingKind:

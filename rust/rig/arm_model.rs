@@ -102,7 +102,7 @@ impl Arm {
         }
         let parts = (step / longest_substep - 1e-9).ceil().max(1.0);
         if parts > MAX_SUBSTEPS {
-            return Err(outside("substeps a sample", parts, &format!("[1, {MAX_SUBSTEPS}]")));
+            return Err(outside("substeps per sample", parts, &format!("[1, {MAX_SUBSTEPS}]")));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let substeps = parts as usize;

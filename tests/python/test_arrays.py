@@ -118,7 +118,7 @@ CALLS = {
     "control.LqgDesign.controller_response": [(LQG.controller_response, W)],
     "control.Observer.rest": [(OBSERVER.rest, np.ones(1))],
     "control.PidDesign.controller_response": [(DESIGN.controller_response, W)],
-    "control.Realisation.response": [(OBSERVER.realisation.response, W)],
+    "control.Realization.response": [(OBSERVER.realization.response, W)],
     "control.Shaper.residual": [
         (lambda x: control.input_shaper(-2 + 17j).residual(x, 0.1), W),
         (lambda x: control.input_shaper(-2 + 17j).residual(17.0, x), W / 20),

@@ -140,7 +140,7 @@ def test_operators_keep_to_what_they_promise():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"population": 4}, r"population = 4 is out of range; give a whole number from 8 to 100000"),
+        ({"population": 4}, r"population = 4 is out of range; give an integer from 8 to 100000"),
         ({"evaluations": 100}, "evaluations = 100 is less than two generations of 200"),
         ({"seeds": ()}, r"seeds = \(\): give 1 to 1000 whole numbers"),
         ({"seeds": (-1,)}, "give 1 to 1000 whole numbers"),

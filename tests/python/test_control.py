@@ -301,7 +301,7 @@ def test_models_that_cannot_be_designed_on_are_refused():
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Realisation
+# Realization
 
 
 PID = control.FractionalPid(6.4, 300.0, 2.5, 0.9, 0.6)

@@ -126,7 +126,7 @@ def broken_files():
     yield json.dumps(good | {"controller": pid, "schema": 2}).encode(), "read it with the version that wrote it, or"
     yield (
         json.dumps(good | {"controller": {"type": "mpc"}, "schema": 2, "written_by": "ftlm 9"}).encode(),
-        "a controller of schema 2, written by .ftlm 9., and ftlm .* reads schema 1; read it with the version",
+        r"a controller file of schema 2 \(written by .ftlm 9.\), and ftlm .* reads schema 1; read it with the version",
     )
     yield json.dumps(good | {"controller": pid | {"rate": -1.0}}).encode(), "damaged: rate"
     yield json.dumps(good | {"controller": pid | {"order": 10**6}}).encode(), "damaged: order"
@@ -210,9 +210,9 @@ REFUSED = [
     ((*WORDS, "MODEL", "--crossover", 40), "--crossover: used with --design pid"),
     ((*WORDS, "MODEL", "--max-deviation", "hob=1"), "did you mean 'hub'"),
     ((*WORDS, "MODEL", "--noise", "hub"), "names 'hub' twice"),
-    ((*WORDS, "MODEL", "--band", "1"), "--band '1' has another number of values; give 2 numbers"),
+    ((*WORDS, "MODEL", "--band", "1"), "--band '1' has 1 numbers; give 2, joined"),
     ((*WORDS, "MODEL", "--band", "9:1"), "rad/s is out of range"),
-    ((*WORDS, "MODEL", "--path", "0.3"), "--path '0.3' has another number of values; give 2 numbers"),
+    ((*WORDS, "MODEL", "--path", "0.3"), "--path '0.3' has 1 numbers; give 2, joined"),
     ((*WORDS, "MODEL", "--path", "0.3:0.5", "--output", "hub+tip"), "is not a sum of outputs"),
     ((*WORDS, "MODEL", "--path", "9:0.5", "--output", "hub+bend", "--limit", "0.9"), "over the limit of 0.9"),
     ((*WORDS, "MODEL", "--trajectory", "p.csv"), "give --path SIZE:SECONDS"),

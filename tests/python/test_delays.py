@@ -163,7 +163,7 @@ def test_other_methods_refuse_a_free_delay(method):
         ({"u": (0.1, 0.1)}, "two rising times"),
         ({"u": (0.0, np.inf)}, "is not an interval"),
         ({"u": (0.0, np.nan)}, "is not an interval"),
-        ({"u": (0.0,)}, "has another size; give"),
+        ({"u": (0.0,)}, r"has 1 values; give seconds, or \(minimum"),
         ({"u": ("a", 0.1)}, "least delay of u"),
         ({"y": (0.0, 0.1)}, "delayed input"),
         ({"v": 0.1}, "delayed input"),
@@ -208,7 +208,7 @@ def test_on_the_command_line(tmp_path):
     assert said["delays"]["u"] == pytest.approx(DELAY, abs=4 * said["standard_errors"]["delay_u"])
     done = CliRunner().invoke(cli.app, [*command, "u=0.2..0.4"])
     assert done.exit_code != 0
-    assert "is not a value; give seconds or LOW:HIGH" in done.output
+    assert "is neither seconds nor LOW:HIGH; give one" in done.output
 
 
 # ----------------------------------------------------------------------------------------------------------------------

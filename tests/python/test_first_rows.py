@@ -354,7 +354,7 @@ def panel_gain(result):
 
 
 #: Findings that say that a gain assumes a start, or that the structure lacks dynamics.
-GAIN_CODES = {"rest_assumed", "initial_state_not_identifiable", "lag_fits", "dynamics_missing"}
+GAIN_CODES = {"rest_assumed", "gain_depends_on_initial_conditions", "lag_fits", "dynamics_missing"}
 
 
 def panel_table(seeds):
@@ -365,7 +365,7 @@ def panel_table(seeds):
             found = ftlm.identify(panel_record(name, kind, start, seed), ftlm.equation(words))
             is_off = abs(panel_gain(found) / 2.0 - 1.0) > 0.2
             silent += is_off and not GAIN_CODES & set(codes(found))
-            off = is_off and not {"rest_assumed", "initial_state_not_identifiable"} & set(codes(found))
+            off = is_off and not {"rest_assumed", "gain_depends_on_initial_conditions"} & set(codes(found))
             wrong.setdefault(("right" if right else "one lag too few", name, start), []).append(off)
             if right and name != "fractional":
                 covered += [found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in TRUTHS[name].items()]
@@ -451,7 +451,7 @@ def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     # A lag that the structure lacks makes a past of what a run did from rest.
     record = panel_record(name, "prbs", start, 311)
     found = ftlm.identify(record, ftlm.equation(FRACTIONAL))
-    said = [f for f in found.findings if f.code == "initial_state_not_identifiable"]
+    said = [f for f in found.findings if f.code == "gain_depends_on_initial_conditions"]
     if name == "fractional":
         assert not said
         return
@@ -464,7 +464,7 @@ def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     assert "1.694 ± 0.067" in said[0].text
     assert "1.374 ± 0.049" in said[0].text
     # A start that is given is no question.
-    assert "initial_state_not_identifiable" not in codes(given)
+    assert "gain_depends_on_initial_conditions" not in codes(given)
 
 
 @pytest.mark.parametrize("name", ["two lags", "fractional and a lag"])

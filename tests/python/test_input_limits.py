@@ -268,7 +268,7 @@ def test_a_model_with_limits_is_kept(tmp_path):
         ("D y = a sat(y, 1) + b u", {}, "limited input"),
         ("D y = a y + b u", {"saturation": {"v": 1.0}}, "limited input"),
         ("D y = a y + b u", {"saturation": {"u": "much"}}, "saturation of u"),
-        ("D y = a y + b u", {"saturation": {"u": (1, 2, 3)}}, "has another size; give"),
+        ("D y = a y + b u", {"saturation": {"u": (1, 2, 3)}}, r"has 3 values; give one, or \(minimum"),
         ("D y = a y + b u", {"dead_zone": {"u": (0, 1)}, "saturation": {"u": 2.0}}, "saturates after it"),
         (
             "D y = a y + b u",

@@ -37,7 +37,7 @@ BAD_VALUES = {
     "row_basis": ("columns", "row_basis = 'columns' is not known"),
     "seeds": ("12", "seeds = '12': give 1 to 1000 whole numbers"),
     "evaluations": (100, "evaluations = 100 is less than two generations of 200"),
-    "population": (4, "population = 4 is out of range; give a whole number from 8"),
+    "population": (4, "population = 4 is out of range; give an integer from 8"),
     "bounds": ({"a": (1.0, 0.0)}, "bounds of a = (1.0, 0.0) are not an interval"),
 }
 

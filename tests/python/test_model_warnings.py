@@ -101,15 +101,16 @@ def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
     assert said_of([0.2, *np.full(n - 1, 0.01)]) == []
     listed = f"{', '.join(joint.names[:-1])} and {joint.names[-1]}"
     assert said_of(np.full(n, 0.2)) == [
-        f"hardly separately identifiable from these runs: {listed} (correlations up to 0.9990)"
+        f"{listed} are strongly correlated: these runs hardly distinguish them (correlations up to 0.9990)"
     ]
     assert said_of([0.2, 0.2, *np.full(n - 2, 0.01)]) == [
-        f"hardly separately identifiable from these runs: {joint.names[0]} and {joint.names[1]} (correlation 0.9990)"
+        f"{joint.names[0]} and {joint.names[1]} are strongly correlated: these runs hardly distinguish them "
+        "(correlation 0.9990)"
     ]
     lost = [np.inf, np.inf, *np.full(n - 2, 0.01)]
     with np.errstate(invalid="ignore"):
         assert said_of(lost) == [
-            f"hardly separately identifiable from these runs: {joint.names[0]} and {joint.names[1]} "
+            f"{joint.names[0]} and {joint.names[1]} are strongly correlated: these runs hardly distinguish them "
             "(their standard errors are not finite)"
         ]
 

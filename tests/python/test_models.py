@@ -200,10 +200,10 @@ def test_equation_is_read(text, output, order, terms):
         ("D^1.5 y = a D^() y", 16, "at character 16: order '' is neither"),
         ("D^1.5 y = a D^(1/0) y", 16, "at character 16: order '1/0' is neither"),
         ("D^1.5 y = a D^lambda y", 15, "at character 15: order 'lambda' is neither"),
-        ("D^1.5 y = a y & b u", 15, "'&' at character 15 has no meaning there"),
-        ("D^1.5 y = a y, b u", 14, "',' at character 14 has no meaning there"),
-        ("D^1.5 y = a y[0]", 14, "'[' at character 14 has no meaning there"),
-        ("D^1.5 y = a y + § u", 17, "'§' at character 17 has no meaning there"),
+        ("D^1.5 y = a y & b u", 15, "unexpected '&' at character 15; remove it"),
+        ("D^1.5 y = a y, b u", 14, "unexpected ',' at character 14; remove it"),
+        ("D^1.5 y = a y[0]", 14, "unexpected '[' at character 14; remove it"),
+        ("D^1.5 y = a y + § u", 17, "unexpected '§' at character 17; remove it"),
         ("D^1.5 y = a * * y", 15, "expected the name of a signal at character 15, found '*'"),
         ("D^1.5 y = a D D y", 15, "expected the name of a signal at character 15, found 'D'"),
         # A column called D.
@@ -709,7 +709,7 @@ HOSTILE = {
     ),
     "NaN": altered(lambda d: d["equations"][0].update(order=math.nan)),
     "another schema": altered(lambda d: d.update(schema=1)),
-    "another schema with what is in it": altered(lambda d: d.update(schema=13, moons={"of": "a later version"})),
+    "another schema with what is in it": altered(lambda d: d.update(schema=14, moons={"of": "a later version"})),
     "another schema, and who wrote it": altered(lambda d: d.update(schema=10**30, written_by="ftlm 7", equations=4)),
     "schema in text": altered(lambda d: d.update(schema="1")),
     "alpha out of range": altered(lambda d: d["equations"][0].update(order=11.0)),
@@ -747,12 +747,13 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
         ftlm.load_model(path)
     message = str(refused.value)
     assert message.startswith(str(path))
-    words = f", and ftlm {ftlm.__version__} reads schema 2; read it with the version that wrote it, or write it again"
+    version = f", and ftlm {ftlm.__version__} reads schema 13"
+    words = f"{version}; read it with the version that wrote it, or compute the model again"
     expected = {
         "too large": "1048577 bytes",
-        "another schema": f"is a model of schema 1, written{words}",
-        "another schema with what is in it": f"is a model of schema 13, written{words}",
-        "another schema, and who wrote it": f"is a model of schema {10**30}, written by 'ftlm 7'{words}",
+        "another schema": f"is a model file of schema 1{words}",
+        "another schema with what is in it": f"is a model file of schema 14{words}",
+        "another schema, and who wrote it": f"is a model file of schema {10**30} (written by 'ftlm 7'){words}",
         "unknown key": "is not an ftlm model: Object contains unknown field `extra`",
     }
     assert expected.get(kind, "") in message

@@ -778,7 +778,7 @@ def test_a_correlation_map_has_every_number():
     for names, bad, message in (
         (["a"], values, "shape"),
         ([], np.zeros((0, 0)), "shape"),
-        (["a", "b"], 3 * values, "give at most 1"),
+        (["a", "b"], 3 * values, r"outside \[-1, 1\]"),
     ):
         with pytest.raises(ftlm.errors.DataError, match=message):
             CorrelationMap(names, bad, title="t")

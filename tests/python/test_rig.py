@@ -214,7 +214,7 @@ def test_numbers_of_numpy_are_numbers(tmp_path):
     assert type(with_numpy.metadata["seed"]) is int
     assert with_numpy.metadata["input"] == plain.metadata["input"]
     assert VirtualBoard(seed=np.uint8(3)).seed == 3
-    with pytest.raises(ftlm.ModelError, match=r"seed = 0\.5 is not a seed; give a whole number from 0 on"):
+    with pytest.raises(ftlm.ModelError, match=r"seed = 0\.5 is not a seed; give an integer of at least 0"):
         VirtualBoard(seed=0.5)
 
 
@@ -369,12 +369,12 @@ def test_the_stock_filter_of_a_record_is_that_of_a_model():
         ({"watchdog": 5.0}, "outside [0.01, 1]"),
         ({"rig": "q9"}, "'q9' is not known"),
         ({"parameters": "effectiv"}, "did you mean 'effective'?"),
-        ({"seed": -1}, "seed = -1 is not a seed; give a whole number from 0 on"),
-        ({"seed": True}, "seed = True is not a seed; give a whole number from 0 on"),
-        ({"seed": np.True_}, "is not a seed; give a whole number from 0 on"),
-        ({"seed": 3.0}, "seed = 3.0 is not a seed; give a whole number from 0 on"),
-        ({"seed": np.float64(3)}, "is not a seed; give a whole number from 0 on"),
-        ({"seed": "3"}, "seed = '3' is not a seed; give a whole number from 0 on"),
+        ({"seed": -1}, "seed = -1 is not a seed; give an integer of at least 0"),
+        ({"seed": True}, "seed = True is not a seed; give an integer of at least 0"),
+        ({"seed": np.True_}, "is not a seed; give an integer of at least 0"),
+        ({"seed": 3.0}, "seed = 3.0 is not a seed; give an integer of at least 0"),
+        ({"seed": np.float64(3)}, "is not a seed; give an integer of at least 0"),
+        ({"seed": "3"}, "seed = '3' is not a seed; give an integer of at least 0"),
         ({"amplitude": True}, "not a current; give one in A"),
         ({"amplitude": (0.1, 0.1, 0.1)}, "not a current; give one in A"),
         ({"amplitude": (0.1, "x", 0.1)}, "not a current; give one in A"),
@@ -474,7 +474,7 @@ def test_a_live_estimate_is_of_the_equation_that_identify_takes_and_its_prior_is
     ("words", "code", "said"),
     [
         (["--amplitude", "0.95"], 2, "over the limit of 0.94 A"),
-        (["--amplitude", "x"], 2, "give 1 or 2 numbers"),
+        (["--amplitude", "x"], 2, "give 1 or 2, joined"),
         (["--duration", "10000"], 2, "no run is longer than 600 s"),
         (["--rig", "q9"], 2, "'q9' is not known"),
         (["--rig", "q8"], 2, "--arm"),

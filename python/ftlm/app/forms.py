@@ -384,7 +384,9 @@ def _roles(columns: Any) -> dict[str, Any]:
     roles: dict[str, Any] = {}
     for entry in columns:
         if not isinstance(entry, Mapping):
-            raise DataError("a column is not an object; give name, role, signal and unit of each")
+            raise DataError(
+                "columns has an entry that is not an object; give name, role, signal and unit of each column"
+            )
         name, role = _text(entry, "name"), _text(entry, "role")
         signal, unit = _text(entry, "signal") or name, _text(entry, "unit")
         if role not in COLUMN_ROLES:

@@ -258,7 +258,7 @@ def design_input(
     duration
         Length of the run [s].
     peak : A or INPUT=A
-        Maximum absolute value of each input, or of one.
+        Maximum absolute value of all inputs, or of one.
     slew : A or INPUT=A
         Maximum rate of change of an input [1/s]; default none.
     limits : OUTPUT=A

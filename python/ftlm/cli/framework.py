@@ -65,7 +65,7 @@ def ranges(option: str, texts: list[str] | None) -> dict[str, float | tuple[floa
         ends = split_numbers(value)
         if len(ends) not in (1, 2):
             raise ModelError(
-                f"{option} {name}={value}: {value!r} is not a value; give {what} or LOW:HIGH, such as {example}"
+                f"{option} {name}={value}: {value!r} is neither {what} nor LOW:HIGH; give one, such as {example}"
             )
         values[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
     return values
@@ -88,7 +88,7 @@ def parse_numbers(option: str, text: str, *counts: int) -> list[float]:
     values = split_numbers(text)
     if len(values) not in counts:
         choices = " or ".join(str(c) for c in counts)
-        raise ModelError(f"{option} {text!r} has another number of values; give {choices} numbers joined by a colon")
+        raise ModelError(f"{option} {text!r} has {len(values)} numbers; give {choices}, joined by colons")
     return values
 
 

@@ -5,7 +5,7 @@ from ftlm.control.fractional_pid import DiscretePid, FractionalPid, PidDesign, f
 from ftlm.control.input_shaping import Shaper, input_shaper
 from ftlm.control.inverse_dynamics import Trajectory, inverse_dynamics, point_to_point
 from ftlm.control.lqg import Lqg, LqgDesign, Observer, lqg, observer
-from ftlm.control.realization import Realisation
+from ftlm.control.realization import Realization
 from ftlm.control.stability_margins import Margins
 
 __all__ = [
@@ -17,7 +17,7 @@ __all__ = [
     "Margins",
     "Observer",
     "PidDesign",
-    "Realisation",
+    "Realization",
     "Shaper",
     "Trajectory",
     "fractional_pid",

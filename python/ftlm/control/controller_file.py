@@ -13,7 +13,7 @@ from ftlm._core import __version__
 from ftlm.control.arguments import same_rate
 from ftlm.control.fractional_pid import DiscretePid, FractionalPid
 from ftlm.control.lqg import Lqg, Observer
-from ftlm.control.realization import MAX_POLES, Realisation
+from ftlm.control.realization import MAX_POLES, Realization
 from ftlm.errors import DataError, FtlmError, ModelError
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
@@ -112,7 +112,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
         if any(len(one) != len(self.outputs) for one in lists):
             raise ModelError("an output has no approximation errors")
         gain, phase, deviations = (dict(zip(self.outputs, one, strict=True)) for one in lists)
-        realisation = Realisation(
+        realization = Realization(
             tuple(self.outputs),
             self.input,
             self.rate,
@@ -126,7 +126,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
         )
         design = tuple(self.measured), tuple(self.noise), self.drift, matrices["correction"], deviations
         limit = math.inf if self.limit is None else self.limit
-        return Lqg(Observer(realisation, *design), matrices["feedback"], self.tracked, limit=limit)
+        return Lqg(Observer(realization, *design), matrices["feedback"], self.tracked, limit=limit)
 
 
 class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -215,27 +215,27 @@ def _pid(controller: DiscretePid) -> PidFile:
 
 def _lqg(controller: Lqg) -> LqgFile:
     observer = controller.observer
-    realisation = observer.realisation
+    realization = observer.realization
     return LqgFile(
-        realisation.rate,
+        realization.rate,
         _limit(controller.limit),
-        realisation.input,
-        list(realisation.outputs),
+        realization.input,
+        list(realization.outputs),
         list(observer.measured),
         controller.tracked,
-        realisation.a.tolist(),
-        realisation.b.tolist(),
-        realisation.c.tolist(),
+        realization.a.tolist(),
+        realization.b.tolist(),
+        realization.c.tolist(),
         observer.gain.tolist(),
         controller.feedback.tolist(),
         controller.ahead,
-        [(p.real, p.imag) for p in realisation.poles],
-        realisation.band,
-        [realisation.gain_error[o] for o in realisation.outputs],
-        [realisation.phase_error[o] for o in realisation.outputs],
+        [(p.real, p.imag) for p in realization.poles],
+        realization.band,
+        [realization.gain_error[o] for o in realization.outputs],
+        [realization.phase_error[o] for o in realization.outputs],
         list(observer.noise),
         observer.process_noise,
-        [observer.deviations[o] for o in realisation.outputs],
+        [observer.deviations[o] for o in realization.outputs],
     )
 
 
@@ -275,7 +275,7 @@ class JointControllers:
                 raise ModelError(
                     f"the controller reads {', '.join(unknown)}; the arm measures {', '.join(ANGLE_NAMES)}"
                 )
-            driven = loop.observer.realisation.input if isinstance(loop, Lqg) else None
+            driven = loop.observer.realization.input if isinstance(loop, Lqg) else None
             if driven in MOTOR_INPUTS and driven != MOTOR_INPUTS[j]:
                 raise ModelError(
                     f"the controller of joint {j + 1} commands {driven}, the current of joint {2 - j}; give it as the "

@@ -308,8 +308,8 @@ COMPARISON_FREQUENCIES = 300
 TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE = 1.5, 1.05
 #: Frequency of the low-frequency gain, as a share of the crossover; that gain rejects friction and offsets.
 LOW_FREQUENCY_SHARE = 0.1
-#: Maximum share of parameter samples whose requirements the design may violate.
-MAX_BROKEN_SHARE = 0.05
+#: Maximum share of parameter samples for which the loop may be unstable or lack phase margin.
+MAX_FAILED_SAMPLE_SHARE = 0.05
 #: Minimum phase margin of a sample as a share of the requested one.
 MIN_PHASE_MARGIN_SHARE = 0.5
 #: Lowest crossover as a share of the rate; below, margins are not computable in floating point.
@@ -489,7 +489,7 @@ def fractional_pid(
         )
     margins = tuple(map(loop_margins, samples_drawn))
     failures = [m for m in margins if not (m.stable and m.phase >= MIN_PHASE_MARGIN_SHARE * margin)]
-    if len(failures) > MAX_BROKEN_SHARE * len(margins):
+    if len(failures) > MAX_FAILED_SAMPLE_SHARE * len(margins):
         raise ModelError(
             f"the intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has less than {MIN_PHASE_MARGIN_SHARE * margin:g} degrees of the "

@@ -21,7 +21,7 @@ from ftlm.utils.validation import Complex, Floats, as_array, real_number, short_
 #: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
 #: continuation, which the fading memory of a fractional model would never forget.
 TRANSFORM_LENGTH_FACTOR, WEIGHT_DECAY = 8, 28.0
-#: Maximum reference relative to the move; larger ones are unstable.
+#: Maximum excursion of the reference relative to the move. A larger one shows that the inverse is unstable.
 MAX_REFERENCE_RATIO = 20.0
 #: Longest path [samples].
 MAX_PATH_ROWS = 100_000
@@ -262,7 +262,7 @@ def _path(path: ArrayLike) -> Floats:
     """Return a path as an array of shape (rows,); raise DataError if it is invalid."""
     raw = as_array("path", path)
     if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
-        raise DataError(f"path is not a vector of this length; give 16 to {MAX_PATH_ROWS} numbers, one per sample")
+        raise DataError(f"path has shape {raw.shape}; give 16 to {MAX_PATH_ROWS} numbers, one per sample")
     rows = np.array(raw, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(rows))
     if bad.size:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.control.arguments import check_limit, check_samples, positive, select_outputs, sum_row
-from ftlm.control.fractional_pid import MAX_BROKEN_SHARE, least_certain_parameter, plant_of
-from ftlm.control.realization import Realisation, catch_numerical_errors, fit_realization
+from ftlm.control.fractional_pid import MAX_FAILED_SAMPLE_SHARE, least_certain_parameter, plant_of
+from ftlm.control.realization import Realization, catch_numerical_errors, fit_realization
 from ftlm.control.stability_margins import LoopDesign, Margins, Plant, margins_of
 from ftlm.data.run import Run
 from ftlm.errors import DataError, ModelError
@@ -33,7 +33,7 @@ class Observer:
 
     Parameters
     ----------
-    realisation
+    realization
         Realization of the model for all outputs, with its approximation error.
     measured
         Names of the measured outputs.
@@ -47,7 +47,7 @@ class Observer:
         Steady-state standard deviation of the estimate of every output, by the model and its noise.
     """
 
-    realisation: Realisation
+    realization: Realization
     measured: tuple[str, ...]
     noise: tuple[float, ...]
     process_noise: float
@@ -57,12 +57,12 @@ class Observer:
     @property
     def rows(self) -> Floats:
         """Output matrix of the measured outputs."""
-        return self.realisation.c[[self.realisation.outputs.index(o) for o in self.measured]]
+        return self.realization.c[[self.realization.outputs.index(o) for o in self.measured]]
 
     @property
     def matrices(self) -> tuple[Floats, Floats, Floats]:
         """Matrices a, b, c of the discrete-time system, in which the input disturbance is the last state."""
-        a, b = self.realisation.a, self.realisation.b
+        a, b = self.realization.a, self.realization.b
         size = len(a)
         whole = np.eye(size + 1)
         whole[:size, :size], whole[:size, size:] = a, b
@@ -79,14 +79,14 @@ class Observer:
         DataError
             If the run lacks a signal, or has another sampling interval.
         """
-        names = (self.realisation.input, *self.measured)
+        names = (self.realization.input, *self.measured)
         absent = [n for n in names if n not in run.signals]
         if absent:
             raise DataError(f"run {run.name} has no {', '.join(absent)}; the observer reads {', '.join(names)}")
-        if abs(run.step * self.realisation.rate - 1.0) > 1e-6:
+        if abs(run.step * self.realization.rate - 1.0) > 1e-6:
             raise DataError(
                 f"run {run.name} has a step of {run.step:g} s, and the observer one of "
-                f"{1.0 / self.realisation.rate:g} s; design it with {parameter('rate')}{1.0 / run.step:g}"
+                f"{1.0 / self.realization.rate:g} s; design it with {parameter('rate')}{1.0 / run.step:g}"
             )
         a, b, c = self.matrices
         y = np.array([run[n] for n in self.measured])
@@ -99,19 +99,19 @@ class Observer:
             np.column_stack([projection @ b, self.gain]),
             np.eye(len(a)),
             np.zeros((len(a), 1 + len(self.measured))),
-            1.0 / self.realisation.rate,
+            1.0 / self.realization.rate,
         )
-        time = np.arange(y.shape[1]) / self.realisation.rate
-        inputs = np.vstack([run[self.realisation.input], np.column_stack([y[:, 1:], y[:, -1:]])])
+        time = np.arange(y.shape[1]) / self.realization.rate
+        inputs = np.vstack([run[self.realization.input], np.column_stack([y[:, 1:], y[:, -1:]])])
         states = library.forced_response(system, time, inputs, start).states
-        estimates = self.realisation.c @ states[:-1]
-        return dict(zip(self.realisation.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: states[-1]}
+        estimates = self.realization.c @ states[:-1]
+        return dict(zip(self.realization.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: states[-1]}
 
     def rest(self, measured: Floats) -> Floats:
         """Return the equilibrium state at measured values, if the first output has an integrator; otherwise 0."""
-        states = np.zeros(self.realisation.states)
+        states = np.zeros(self.realization.states)
         column = self.rows[:, 0]
-        if self.realisation.poles[0] == 0 and np.any(column):
+        if self.realization.poles[0] == 0 and np.any(column):
             at = int(np.argmax(np.abs(column)))
             states[0] = _measured_values(self, measured)[at] / column[at]
         return states
@@ -119,7 +119,7 @@ class Observer:
     def __str__(self) -> str:
         estimates = ", ".join(f"{o} to {d:.3g}" for o, d in self.deviations.items())
         return (
-            f"observer from {', '.join(self.measured)}: {self.realisation}; estimates {estimates} (standard deviation)"
+            f"observer from {', '.join(self.measured)}: {self.realization}; estimates {estimates} (standard deviation)"
         )
 
 
@@ -162,7 +162,7 @@ def observer(
         Process noise intensity: standard deviation of the change of an input disturbance within one second, in the unit
         of the input. The disturbance represents friction, offsets and other unmodeled effects.
     rate, band, poles
-        Options of the realization; see :class:`Realisation`. The default band is from 1/5000 to 1/8 of the Nyquist
+        Options of the realization; see :class:`Realization`. The default band is from 1/5000 to 1/8 of the Nyquist
         frequency. By default, as many poles are used as errors below 0.1 dB and 1 degree require.
     coupling, sensor
         See :func:`ftlm.analysis.frequency_response`; by default the measurements are not filtered.
@@ -199,12 +199,12 @@ def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, s
 
 
 def kalman_filter(
-    realisation: Realisation, measured: tuple[str, ...], noise: tuple[float, ...], process_noise: float
+    realization: Realization, measured: tuple[str, ...], noise: tuple[float, ...], process_noise: float
 ) -> Observer:
     """Return the Kalman filter of a realization."""
-    bare = Observer(realisation, measured, noise, process_noise, np.zeros((0, 0)), {})
+    bare = Observer(realization, measured, noise, process_noise, np.zeros((0, 0)), {})
     a, b, c = bare.matrices
-    step = 1.0 / realisation.rate
+    step = 1.0 / realization.rate
     # Process noise of the input itself: the same deviation per sample as its random walk has in a second.
     inside = np.zeros_like(a)
     inside[:-1, :-1] = b[:-1] @ b[:-1].T * process_noise**2
@@ -219,10 +219,10 @@ def kalman_filter(
         raise ModelError(
             f"no observer from {', '.join(measured)} is stable: not all states are observable; measure more outputs"
         )
-    variances = np.einsum("ij,jk,ik->i", realisation.c, posterior[:-1, :-1], realisation.c)
+    variances = np.einsum("ij,jk,ik->i", realization.c, posterior[:-1, :-1], realization.c)
     deviations = np.sqrt(np.maximum(variances, 0.0)).tolist()
     return Observer(
-        realisation, measured, noise, process_noise, gain, dict(zip(realisation.outputs, deviations, strict=True))
+        realization, measured, noise, process_noise, gain, dict(zip(realization.outputs, deviations, strict=True))
     )
 
 
@@ -234,7 +234,8 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
         if name not in measured:
             near = nearest(name, measured) if isinstance(name, str) else ""
             raise ModelError(
-                f"noise of {short_repr(name)} is of no measured output{near}; they are {', '.join(measured)}"
+                f"{setting('noise')} {{{short_repr(name)}: …}}: this is not a measured output{near}; they are "
+                f"{', '.join(measured)}"
             )
     free = None if model.estimate is None else model.estimate.free
     noise_of_fit = {} if free is None else dict(free.noise)
@@ -251,7 +252,8 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
     return tuple(out)
 
 
-#: Maximum sensitivity of an acceptable design: phase margin of at least 19 degrees, gain margins of at least 1.5.
+#: Maximum peak of the sensitivity function of an acceptable design. It gives a phase margin of at least 19 degrees and
+#: gain margins of at least 1.5.
 MAX_SENSITIVITY = 3.0
 #: Number of frequencies of a Nyquist curve, and its start relative to the band.
 CURVE_POINTS, BAND_EXTENSION = 2500, 1e-2
@@ -286,17 +288,17 @@ class Lqg:
 
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
         self.observer, self.tracked, self.limit = observer, tracked, check_limit(limit)
-        realisation = observer.realisation
-        self.rate = realisation.rate
+        realization = observer.realization
+        self.rate = realization.rate
         gains = as_floats("feedback", feedback).reshape(1, -1).copy()
-        if gains.shape[1] != realisation.states or not np.isfinite(gains).all():
+        if gains.shape[1] != realization.states or not np.isfinite(gains).all():
             raise ModelError(
-                f"feedback is not finite or has another size; give {realisation.states} numbers, one per state"
+                f"feedback is not finite or has {gains.shape[1]} values; give {realization.states}, one per state"
             )
         self.feedback = gains
         self._a, self._b, self._c = observer.matrices
         self._gains = np.append(gains, [[1.0]], axis=1)
-        rest = _equilibrium(realisation, tracked)
+        rest = _equilibrium(realization, tracked)
         #: Of the reference, so that in the end the output is where it is asked for.
         self.ahead = float(gains[0] @ rest[:-1] + rest[-1])
         self.reset()
@@ -310,8 +312,8 @@ class Lqg:
     def estimate(self) -> dict[str, float]:
         """Predictions of all outputs at the next sample, and estimate of the input disturbance, by name."""
         states = np.zeros(len(self._a)) if self._states is None else self._states
-        estimates = (self.observer.realisation.c @ states[:-1]).tolist()
-        return dict(zip(self.observer.realisation.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: float(states[-1])}
+        estimates = (self.observer.realization.c @ states[:-1]).tolist()
+        return dict(zip(self.observer.realization.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: float(states[-1])}
 
     def reset(self) -> None:
         """Reset all states."""
@@ -329,7 +331,7 @@ class Lqg:
             command = self.ahead * reference - float(self._gains[0] @ self._states)
         if not math.isfinite(command):
             raise ModelError(
-                f"the command is {command}: a measurement, the reference or a state is not finite; reset it"
+                f"the command is {command}: a measurement, the reference or a state is not finite; call reset()"
             )
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
@@ -354,20 +356,20 @@ class Lqg:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the controller as a dictionary for JSON."""
-        realisation = self.observer.realisation
+        realization = self.observer.realization
         return {
             "kind": "lqg",
             "rate": self.rate,
             "limit": self.limit if math.isfinite(self.limit) else None,
-            "input": realisation.input,
+            "input": realization.input,
             "tracked": self.tracked,
             "measured": list(self.observer.measured),
             "memory": self.memory,
-            "gain_error_db": max(realisation.gain_error.values()),
-            "phase_error_degrees": max(realisation.phase_error.values()),
-            "a": realisation.a.tolist(),
-            "b": realisation.b.tolist(),
-            "c": realisation.c.tolist(),
+            "gain_error_db": max(realization.gain_error.values()),
+            "phase_error_degrees": max(realization.phase_error.values()),
+            "a": realization.a.tolist(),
+            "b": realization.b.tolist(),
+            "c": realization.c.tolist(),
             "correction": self.observer.gain.tolist(),
             "feedback": self.feedback.tolist(),
         }
@@ -375,7 +377,7 @@ class Lqg:
     def __str__(self) -> str:
         return (
             f"LQG at {self.rate:g} Hz with {self.memory} numbers of memory, from "
-            f"{', '.join(self.observer.measured)} to {self.observer.realisation.input}, {self.tracked} as asked for"
+            f"{', '.join(self.observer.measured)} to {self.observer.realization.input}, {self.tracked} as asked for"
         )
 
 
@@ -388,7 +390,7 @@ class LqgDesign(LoopDesign):
     ----------
     controller
         Designed discrete-time controller.
-    realisation
+    realization
         Realization of the model, with its approximation error.
     nominal
         Margins of the loop, opened at the plant input, at the nominal parameters.
@@ -399,7 +401,7 @@ class LqgDesign(LoopDesign):
     """
 
     controller: Lqg
-    realisation: Realisation
+    realization: Realization
     nominal: Margins
     samples: tuple[Margins, ...]
     plants: tuple[Plant, ...]
@@ -407,7 +409,7 @@ class LqgDesign(LoopDesign):
     @property
     def rate(self) -> float:
         """Sampling rate [Hz]."""
-        return self.realisation.rate
+        return self.realization.rate
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Return measured outputs, and responses of the command to each and to the reference at w [rad/s]."""
@@ -420,22 +422,22 @@ class LqgDesign(LoopDesign):
 
     def to_dict(self) -> dict[str, Any]:
         """Return design and margins as a dictionary for JSON, without the matrices."""
-        realisation = self.realisation
+        realization = self.realization
         return {
             "design": "lqg",
             "rate": self.rate,
-            "input": realisation.input,
+            "input": realization.input,
             "tracked": self.controller.tracked,
             "measured": list(self.controller.observer.measured),
-            "states": realisation.states,
-            "band": list(realisation.band),
-            "gain_error_db": realisation.gain_error,
-            "phase_error_degrees": realisation.phase_error,
+            "states": realization.states,
+            "band": list(realization.band),
+            "gain_error_db": realization.gain_error,
+            "phase_error_degrees": realization.phase_error,
             **self._margins(),
         }
 
     def __str__(self) -> str:
-        lines = [str(self.controller), f"realised by {self.realisation}", *self._margin_lines()]
+        lines = [str(self.controller), f"realised by {self.realization}", *self._margin_lines()]
         return "\n".join(lines)
 
 
@@ -509,17 +511,17 @@ def lqg(
     read = select_outputs("measured", measured, names)
     weights = _weights(max_deviation, names)
     tracked = _tracked_output(output, plants)
-    realisation = fit_realization(plants, band, poles)
-    kalman = kalman_filter(realisation, read, noise_deviations(model, read, noise), walks)
-    c = realisation.c
+    realization = fit_realization(plants, band, poles)
+    kalman = kalman_filter(realization, read, noise_deviations(model, read, noise), walks)
+    c = realization.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
     no = "no state feedback brings the model to rest; allow for deviations of every output that integrates"
     with catch_numerical_errors(*no.split("; ")):
-        gains, _, own = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
+        gains, _, own = python_control().dlqr(realization.a, realization.b, cost, np.eye(1) / dear**2)
     if np.max(np.abs(own)) >= 1.0 - INTEGRATOR_TOLERANCE:
         raise ModelError(no)
     controller = Lqg(kalman, gains, tracked, limit=limit)
-    w = np.geomspace(BAND_EXTENSION * realisation.band[0], 0.999 * math.pi * plants[0].rate, CURVE_POINTS)
+    w = np.geomspace(BAND_EXTENSION * realization.band[0], 0.999 * math.pi * plants[0].rate, CURVE_POINTS)
     acting = -controller.response(w)[0]
     poles_of_it = controller.poles()
     at_one = np.abs(poles_of_it - 1.0) < INTEGRATOR_TOLERANCE
@@ -540,14 +542,14 @@ def lqg(
         )
     margins = tuple(loop_margins(one.model) for one in plants[0].samples(count, start))
     failures = [m for m in margins if not (m.stable and m.sensitivity <= MAX_SENSITIVITY)]
-    if len(failures) > MAX_BROKEN_SHARE * len(margins):
+    if len(failures) > MAX_FAILED_SAMPLE_SHARE * len(margins):
         raise ModelError(
             f"the intervals are too wide to design on: in {len(failures)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has a largest sensitivity above {MAX_SENSITIVITY:g}; "
             f"{least_certain_parameter(model)}; "
             "identify from a longer or richer run (ftlm design-input lays it out), or make max_input smaller"
         )
-    return LqgDesign(controller, realisation, nominal, margins, tuple(plants))
+    return LqgDesign(controller, realization, nominal, margins, tuple(plants))
 
 
 def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
@@ -572,22 +574,22 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
     ]
 
 
-def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
+def _equilibrium(realization: Realization, tracked: str) -> Floats:
     """Return the states and the input at rest, as one vector, with the tracked output at 1."""
-    if tracked not in realisation.outputs:
+    if tracked not in realization.outputs:
         raise ModelError(
-            f"tracked = {short_repr(tracked)} is not an output; give one of {', '.join(realisation.outputs)}"
+            f"tracked = {short_repr(tracked)} is not an output; give one of {', '.join(realization.outputs)}"
         )
-    size = realisation.states
+    size = realization.states
     matrix = np.zeros((size + 1, size + 1))
-    matrix[:size, :size] = realisation.a - np.eye(size)
-    matrix[:size, size:] = realisation.b
-    matrix[size, :size] = realisation.c[realisation.outputs.index(tracked)]
+    matrix[:size, :size] = realization.a - np.eye(size)
+    matrix[:size, size:] = realization.b
+    matrix[size, :size] = realization.c[realization.outputs.index(tracked)]
     try:
         equilibrium = np.linalg.solve(matrix, np.eye(size + 1)[-1])
     except np.linalg.LinAlgError:
         raise ModelError(
-            f"{tracked} cannot follow a constant reference, because its steady-state gain from {realisation.input} is "
+            f"{tracked} cannot follow a constant reference, because its steady-state gain from {realization.input} is "
             "0; choose another output"
         ) from None
     return np.asarray(equilibrium, dtype=np.float64)

@@ -43,7 +43,7 @@ COARSE_DB, COARSE_DEGREES = 1.0, 6.0
 
 @check_arguments
 @dataclass(frozen=True)
-class Realisation:
+class Realization:
     """Integer-order state-space realization of a model from one input, in continuous and discrete time.
 
     Parameters
@@ -93,7 +93,7 @@ class Realisation:
         )
 
 
-def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, poles: int | None) -> Realisation:
+def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, poles: int | None) -> Realization:
     """Fit an integer-order system to the exact responses of outputs to one input, and discretize it.
 
     Parameters
@@ -129,15 +129,15 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
         if m.oscillatory and low < m.frequency < high
     ]
     integrates = [p.integral_order() > 0.5 for p in plants]
-    best: Realisation | None = None
+    best: Realization | None = None
     for count in counts:
         with catch_numerical_errors(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
             poles_and_residues = _fit(
                 np.asarray(1j * w, dtype=np.complex128), exact, integrates, _initial_poles(own, low, high, count)
             )
-            realisation = _discretize(library, plants, (low, high), *poles_and_residues)
-        if best is None or _scaled_error(realisation) < _scaled_error(best):
-            best = realisation
+            realization = _discretize(library, plants, (low, high), *poles_and_residues)
+        if best is None or _scaled_error(realization) < _scaled_error(best):
+            best = realization
         if _scaled_error(best) <= 1.0:
             break
     assert best is not None
@@ -289,7 +289,7 @@ def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Com
 
 def _discretize(
     library: Any, plants: Sequence[Plant], band: tuple[float, float], poles: Complex, residues: Floats, integral: bool
-) -> Realisation:
+) -> Realization:
     """Return the discretized realization with its approximation errors."""
     a, b = _system(poles)
     c = residues[:, 1:]
@@ -302,7 +302,7 @@ def _discretize(
     system = library.sample_system(library.ss(a, b, c, np.zeros((len(c), 1))), 1.0 / rate, "zoh")
     # Scale the states, so that units have no influence on the weights of a design.
     size = np.maximum(np.sqrt(np.sum(c * c, axis=0)), 1e-300)
-    realisation = Realisation(
+    realization = Realization(
         tuple(p.output for p in plants),
         plants[0].input,
         rate,
@@ -315,14 +315,14 @@ def _discretize(
         {},
     )
     w = np.geomspace(*band, 2 * FIT_FREQUENCIES - 1)
-    quotient = realisation.response(w) / np.array([p.held_response(w) for p in plants])
-    for name, line in zip(realisation.outputs, quotient, strict=True):
-        realisation.gain_error[name] = float(np.max(np.abs(20.0 * np.log10(np.abs(line)))))
-        realisation.phase_error[name] = float(np.degrees(np.max(np.abs(np.angle(line)))))
-    return realisation
+    quotient = realization.response(w) / np.array([p.held_response(w) for p in plants])
+    for name, line in zip(realization.outputs, quotient, strict=True):
+        realization.gain_error[name] = float(np.max(np.abs(20.0 * np.log10(np.abs(line)))))
+        realization.phase_error[name] = float(np.degrees(np.max(np.abs(np.angle(line)))))
+    return realization
 
 
-def _scaled_error(realisation: Realisation) -> float:
+def _scaled_error(realization: Realization) -> float:
     """Return the largest approximation error, divided by its target."""
-    worst = max(max(realisation.gain_error.values()) / GAIN_DB, max(realisation.phase_error.values()) / PHASE_DEGREES)
+    worst = max(max(realization.gain_error.values()) / GAIN_DB, max(realization.phase_error.values()) / PHASE_DEGREES)
     return worst if math.isfinite(worst) else math.inf

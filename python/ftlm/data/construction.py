@@ -90,7 +90,7 @@ class RunArguments:
         """
         self._check_names()
         units = check_units(self.units, (*self.inputs, *self.outputs))
-        behaviour: dict[str, Intersample] = {
+        behavior: dict[str, Intersample] = {
             **dict.fromkeys(self.inputs, ZERO_ORDER_HOLD),
             **check_intersample(self.intersample, tuple(self.inputs)),
         }
@@ -118,7 +118,7 @@ class RunArguments:
                     times, data = self._insert_missing_samples(times, data, missing, first)
                 step, jitter = regular_step(times, self.time_label, first, clock.resolution, self.known_step)
                 facts += jitter
-        data, notes = self._fill_input_gaps(data, behaviour)
+        data, notes = self._fill_input_gaps(data, behavior)
         facts += notes
         readings = None
         if new_step is not None:
@@ -126,8 +126,8 @@ class RunArguments:
             whole = not any(np.isnan(data[s]).any() for s in self.outputs)
             if not (whole and rows_coincide(since, new_step)):
                 readings = NonuniformSamples(since, data)
-            data = resample_uniform(since, data, behaviour, new_step)
-            how = describe_resampled_signals(behaviour, keep_times=readings is not None)
+            data = resample_uniform(since, data, behavior, new_step)
+            how = describe_resampled_signals(behavior, keep_times=readings is not None)
             facts += (describe_resampling(since, new_step, first, how),)
         return dict(
             name=self.name,
@@ -137,7 +137,7 @@ class RunArguments:
             outputs=tuple(self.outputs),
             _data=data,
             _units={s: unit for s, (unit, _) in units.items()},
-            _intersample=behaviour,
+            _intersample=behavior,
             notes=tuple(dict.fromkeys(facts)),
             _metadata=dict(self.metadata),
             sample_times=readings,
@@ -171,7 +171,7 @@ class RunArguments:
         return whole, out
 
     def _fill_input_gaps(
-        self, data: dict[str, Floats], behaviour: Mapping[str, Intersample]
+        self, data: dict[str, Floats], behavior: Mapping[str, Intersample]
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
         """Return data with missing input samples filled, and notes on the missing samples of all signals."""
         notes, out = [], dict(data)
@@ -195,8 +195,8 @@ class RunArguments:
                     "begin where the input is known, with ",
                 )
                 raise masked_rows_error(self.label_of(name), what, is_missing, remedy + parameter("window"))
-            out[name] = fill_input_gaps(values, behaviour[name])
-            how = "its last value was held" if behaviour[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
+            out[name] = fill_input_gaps(values, behavior[name])
+            how = "its last value was held" if behavior[name] == ZERO_ORDER_HOLD else "a straight line was drawn"
             notes.append(describe_missing(f"input {name}", is_missing, f"{how}, which is a guess"))
         return out, tuple(notes)
 
@@ -233,7 +233,7 @@ class RunArguments:
             if dated is not None and self.time_unit != "s":
                 raise DataError(
                     f"{parameter('time_unit', self.time_unit)} is the unit of numbers, and {self.time_label} holds "
-                    "dates; leave it out"
+                    f"dates; omit {parameter('time_unit')}"
                 )
             times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label)
             lengths = {self.time_label: times.size, **lengths}

@@ -65,7 +65,7 @@ def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -
     if not inputs:
         raise DataError(
             f"{parameter('reference', reference)}: the model has no input of run {runs[0].name!r} that could "
-            "depend on it; leave it out, or add the input to the equation"
+            "depend on it; omit this argument, or add the input to the equation"
         )
     moves = [run[reference] for run in runs]
     if is_constant(moves):

@@ -161,7 +161,7 @@ class Consistency(ReportMixin):
                 out.append(make_finding("segment_not_converged", run=name))
         out += self.delays
         if any(f.code == "residuals_not_white" for r in self.results for f in r.findings):
-            out.append(make_finding("segments_not_white"))
+            out.append(make_finding("segment_residuals_not_white"))
         return tuple(out)
 
     @property

@@ -52,7 +52,7 @@ STEP_TOLERANCE_ERRORS = 1e-3
 INSTRUMENT_RANK_TOLERANCE = 1e-12
 #: Score of the best candidate under a prior, relative to that of a zero output, that is not reported.
 MAX_PRIOR_SCORE_RATIO = 0.5
-#: Minimum number of pulses per sampling interval. The estimates are those of one grid.
+#: Minimum number of pulses per sampling interval. The step is not refined.
 MIN_PULSES_PER_SAMPLE = 2
 
 
@@ -259,7 +259,7 @@ def estimate_output_error(
 
 def number_covariance(joint: JointFit, problem: FreeProblem) -> tuple[tuple[float, ...], ...] | None:
     """Return the covariance of all orders and coefficients of the model; None if one is not identifiable."""
-    jacobian = problem.number_jacobian(list(joint.coefficients.values()))
+    jacobian = problem.model_parameter_jacobian(list(joint.coefficients.values()))
     with np.errstate(invalid="ignore", over="ignore"):
         # Covariances of non-identifiable directions are NaN or overflow.
         spread = jacobian @ joint.covariance @ jacobian.T

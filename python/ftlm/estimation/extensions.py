@@ -51,10 +51,11 @@ from ftlm.validation.residual_tests import (
 )
 
 #: Minimum decrease of the Schwarz criterion that is reported. A decrease of 10 is very strong evidence (Kass and
-#: Raftery, doi:10.1080/01621459.1995.10476572). Three times that is asked, because the best of several is chosen.
+#: Raftery, doi:10.1080/01621459.1995.10476572). The threshold is three times that, because the best of several
+#: extensions is chosen.
 MIN_CRITERION_DECREASE = 30.0
-#: Minimum further decrease of the criterion at which an extension replaces one above it in the list. Some give the
-#: same samples, for example feedthrough of a first-order plant and an input that was logged one row late.
+#: Minimum further decrease of the criterion at which an extension replaces one above it in the list. Some are nearly
+#: equivalent on sampled data, for example feedthrough of a first-order plant and an input that was logged one row late.
 MIN_CRITERION_GAP = 10.0
 #: Total number of samples to which extensions are fitted, from the start of each run.
 MAX_EXTENSION_SAMPLES = 6000
@@ -687,13 +688,14 @@ def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset],
                 numbers = {"gain": own_gain, "error": own_error, "other_gain": gain, "other_error": error}
                 words = {"taken": _name_start(*own_setting), "other": _name_start(initial, offset), "ratio": ratio}
                 about = {"run": ", ".join(r.name for r in runs), "output": pair[0], "input": pair[1]}
-                worst = distance, make_finding("initial_state_not_identifiable", **about, **numbers, **words)
+                worst = distance, make_finding("gain_depends_on_initial_conditions", **about, **numbers, **words)
     return [worst[1]] if worst else []
 
 
 def _name_start(initial: Initial, offset: Offset) -> str:
-    """Return initial conditions as text, such as "in motion with a nonzero level"."""
-    return ("at rest" if initial == "rest" else "in motion") + (" with a nonzero level" if offset == "level" else "")
+    """Return initial conditions as text, such as "nonzero initial conditions and an output level"."""
+    zero = "zero" if initial == "rest" else "nonzero"
+    return f"{zero} initial conditions" + (" and an output level" if offset == "level" else "")
 
 
 def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple[float, float]]:

@@ -105,7 +105,7 @@ class FreeProblem:
             out[name] = sign * float(np.prod([free[f] for f in factors]))
         return out
 
-    def number_jacobian(self, coefficients: Sequence[float]) -> Floats:
+    def model_parameter_jacobian(self, coefficients: Sequence[float]) -> Floats:
         """Return the Jacobian of the model's orders and coefficients (rows) by the free parameters (columns).
 
         Rows are, for each equation, alpha, then order and coefficient of each term, then the friction coefficient if

@@ -511,7 +511,7 @@ class GeneticAlgorithm:
         population = whole_number(self.population)
         if population is None or not 8 <= population <= 100_000:
             raise ModelError(
-                f"{setting('population')} {self.population!r} is out of range; give a whole number from 8 to 100000"
+                f"{setting('population')} {self.population!r} is out of range; give an integer from 8 to 100000"
             )
         if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
             raise ModelError(

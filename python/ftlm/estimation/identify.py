@@ -21,7 +21,7 @@ from ftlm.estimation.estimators import feedback_bias
 from ftlm.estimation.extensions import run_extension_tests
 from ftlm.estimation.fit import Fit
 from ftlm.estimation.free_parameters import FreeProblem
-from ftlm.estimation.initial_condition_selection import Hypotheses, fit_with_offset_decision
+from ftlm.estimation.initial_condition_selection import InitialConditionFits, fit_with_offset_decision
 from ftlm.estimation.methods import EstimationMethod, OutputError, method_with_options, resolve_method
 from ftlm.estimation.model_checks import (
     dead_channel_findings,
@@ -76,7 +76,7 @@ SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
 #: Findings of extensions that have a mean, which the test of an offset finds as well.
 HAVE_MEAN_CODES = ("square_fits", "offset_missing", "drift_fits", "friction_fits")
 #: Share of the work of an identification that decides about the start of its runs.
-HYPOTHESES_SHARE = 0.7
+INITIAL_CONDITIONS_SHARE = 0.7
 
 
 @check_arguments
@@ -206,15 +206,18 @@ def _fit_runs(
             raise ModelError(f"the method {estimator.name!r} fitted a {type(fit).__name__}; return a Fit")
         return fit
 
-    light, hypotheses = getattr(estimator, "hypothesis", None), Hypotheses(estimate, may_add_offset)
+    light, initial_condition_fits = (
+        getattr(estimator, "hypothesis", None),
+        InitialConditionFits(estimate, may_add_offset),
+    )
     if light is not None:
         course = ShareTracker(progress)
-        hypotheses = Hypotheses(
-            partial(estimate, method=light, report=course.subtask(HYPOTHESES_SHARE, 0.9)),
+        initial_condition_fits = InitialConditionFits(
+            partial(estimate, method=light, report=course.subtask(INITIAL_CONDITIONS_SHARE, 0.9)),
             may_add_offset,
             lambda request, joint: estimate(request, report=course.subtask(1.0, 1.0), fitted=joint),
         )
-    return fit_with_offset_decision(runs, structure, estimate, hypotheses)
+    return fit_with_offset_decision(runs, structure, estimate, initial_condition_fits)
 
 
 def identify_pieces(

@@ -1,4 +1,4 @@
-"""Selection of the initial conditions and offsets of a fit: from rest or in motion, with a level or a constant."""
+"""Selection of zero or nonzero initial conditions, and of an output level or an equation constant, of a fit."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from ftlm.simulation.initial_conditions import START_SETTINGS, rest_evidence
 from ftlm.structure.structure import History, Initial, Offset, Structure
 from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO
 
-#: Initial terms of fits with a level.
+#: Initial conditions that are tried together with an output level.
 LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
-#: Offsets of fits in motion of runs that looked like rest.
+#: Offsets that are tried with nonzero initial conditions, if the first samples suggested rest.
 MOTION_OFFSETS: tuple[Literal["none"], Literal["level"]] = ("none", "level")
-#: Mean of an output, in its standard deviations, from which on it shows a level.
+#: Minimum ratio of the mean of an output to its standard deviation that suggests a level.
 LEVEL_DEVIATIONS = 3.0
-#: Residuals of an output, in its standard deviations, from which on a fit has failed.
+#: Ratio of residuals to the standard deviation of an output above which a fit has failed.
 MAX_RESIDUAL_SHARE = 0.5
 #: Maximum number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
@@ -46,7 +46,7 @@ MAX_OFFSET_TEST_SAMPLES = 400_000
 
 
 def fit_with_offset_decision(
-    runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit], hypotheses: Hypotheses
+    runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit], fits: InitialConditionFits
 ) -> Fit:
     """Return the fit of a structure; ``offset="auto"`` adds a constant per equation if it is significant.
 
@@ -56,18 +56,18 @@ def fit_with_offset_decision(
     optimum.
     """
     if structure.offset != "auto":
-        fit = _fit_with_level_decision(structure, hypotheses)
+        fit = _fit_with_level_decision(structure, fits)
         if structure.initial != "auto" or structure.offset != "none":
             return fit
-        return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit, hypotheses.fits)])
+        return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit, fits.joint_fits)])
     try:
         request = replace(structure, offset="constant")
     except ModelError as error:
-        # A given initial term has the power of t to which an offset integrates.
+        # The response to the constant is collinear with an initial term of the user: both have the same power of t.
         return _with_offset_decision(estimate(replace(structure, offset="none")), f"none: {error}")
-    twin = constant_input(runs, structure)
-    if twin is not None:
-        words = f"none: {twin} is constant on every run, from which an offset is not separately identifiable"
+    constant_name = constant_input(runs, structure)
+    if constant_name is not None:
+        words = f"none: {constant_name} is constant on every run, from which an offset is not separately identifiable"
         return _with_offset_decision(estimate(replace(structure, offset="none")), words)
     fit = estimate(request)
     if fit.task.structure.offset == "level":
@@ -80,8 +80,8 @@ def fit_with_offset_decision(
 
 
 @dataclass(frozen=True)
-class Hypotheses:
-    """Functions that fit a structure with different initial conditions, and complete the fit that is chosen.
+class InitialConditionFits:
+    """Fits of one structure under several initial conditions, and functions that make and complete them.
 
     Parameters
     ----------
@@ -92,23 +92,23 @@ class Hypotheses:
     complete
         Function that adds all confidence intervals to a joint fit of a structure; None if :attr:`estimate` already
         gives them.
-    fits
+    joint_fits
         Last joint fit of each pair of initial conditions and offset.
     """
 
     estimate: Callable[[Structure], Fit]
     may_add_offset: bool
     complete: Callable[[Structure, JointFit | None], Fit] | None = None
-    fits: dict[tuple[Initial, Offset], JointFit] = field(default_factory=dict)
+    joint_fits: dict[tuple[Initial, Offset], JointFit] = field(default_factory=dict)
 
     def fit(self, structure: Structure) -> Fit:
         """Return the fit of a structure from automatic initial guesses."""
         fit = self.estimate(structure)
         if fit.joint is not None:
-            self.fits[fit.joint.initial, structure.offset] = fit.joint
+            self.joint_fits[fit.joint.initial, structure.offset] = fit.joint
         return fit
 
-    def take(self, structure: Structure, fit: Fit) -> Fit:
+    def with_intervals(self, structure: Structure, fit: Fit) -> Fit:
         """Return the chosen fit with all requested confidence intervals."""
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
@@ -125,46 +125,46 @@ class Hypotheses:
         near = refit_after_screening(joint, runs, request, accepts)
         if near is None:
             return None
-        self.fits[near.initial, request.offset] = near
+        self.joint_fits[near.initial, request.offset] = near
         return (
             None if not accepts(near) else replace(fit, joint=replace(near, starts=joint.starts, origin=joint.origin))
         )
 
 
-def _fit_with_level_decision(structure: Structure, hypotheses: Hypotheses) -> Fit:
+def _fit_with_level_decision(structure: Structure, fits: InitialConditionFits) -> Fit:
     """Return the fit of a structure, with a constant level added to each output if the runs prefer one."""
-    fit = hypotheses.fit(structure)
-    constant = _fit_with_constant(fit, structure, hypotheses)
+    fit = fits.fit(structure)
+    constant = _fit_with_constant(fit, structure, fits)
     if constant is not None:
         return constant
-    restart = _fit_in_motion(fit, structure, hypotheses)
+    restart = _fit_in_motion(fit, structure, fits)
     if restart is not None:
         return restart
-    # In a non-linear model a constant has no constant sensitivity: it determines where a body rests.
+    # The test of an offset assumes a linear model. In a non-linear model a constant also moves the equilibrium.
     if fit.task.structure.offset != "none" or not structure.is_linear:
-        return hypotheses.take(structure, fit)
+        return fits.with_intervals(structure, fit)
     suggests_level = _suggests_level(fit)
     is_level_tried = suggests_level or _may_hide_level(fit)
-    level = _fit_with_level(fit, structure, hypotheses, has_level=suggests_level) if is_level_tried else None
+    level = _fit_with_level(fit, structure, fits, has_level=suggests_level) if is_level_tried else None
     if level is not None:
         return level
     test = fit_offset_test(fit) if sum(run.length for run in fit.task.runs) <= MAX_OFFSET_TEST_SAMPLES else None
     offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
     if offset_findings and _has_estimated_initial_conditions(fit) and not is_level_tried:
-        level = _fit_with_level(fit, structure, hypotheses, has_level=False)
+        level = _fit_with_level(fit, structure, fits, has_level=False)
         if level is not None:
             return level
-    fit = hypotheses.take(structure, fit)
+    fit = fits.with_intervals(structure, fit)
     return replace(fit, findings=[*fit.findings, *offset_findings])
 
 
-def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
+def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
     """Return the fit with a constant in the equations; None if a level suffices or the constant is no improvement.
 
     No output level describes the response of an integrating or non-linear plant to the offset of an input sensor.
     The fit has its own initial guesses, because a fit without the constant may be at a wrong local optimum.
     """
-    automatic = structure.initial == "auto" and structure.offset == "none" and hypotheses.may_add_offset
+    automatic = structure.initial == "auto" and structure.offset == "none" and fits.may_add_offset
     if fit.joint is None or not automatic or fit.task.structure.offset != "none":
         return None
     level_suffices = structure.is_linear and not structure.integrates
@@ -172,7 +172,7 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
         return None
     request = replace(structure, offset="constant")
     try:
-        candidate = hypotheses.fit(request)
+        candidate = fits.fit(request)
     except FtlmError:
         return None
     joint = candidate.joint
@@ -180,12 +180,12 @@ def _fit_with_constant(fit: Fit, structure: Structure, hypotheses: Hypotheses) -
     margin = 0.0 if structure.is_linear else -START_SETTINGS.history_margin
     if joint is None or joint.unstable_optimum is not None or not fits_better(joint, fit.joint, margin):
         return None
-    whole = _fit_in_motion(candidate, request, hypotheses) or hypotheses.take(request, candidate)
+    whole = _fit_in_motion(candidate, request, fits) or fits.with_intervals(request, candidate)
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs)}
     return replace(whole, findings=[*whole.findings, make_finding("constant_estimated", **about)])
 
 
-def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fit | None:
+def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
     """Return a fit with unknown initial values if the runs clearly refute rest despite quiet first samples.
 
     A few quiet samples do not distinguish slow motion from rest. If the residuals of the fit from rest are white, rest
@@ -204,7 +204,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
         # A constant input gives no evidence of rest.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
-    offsets = MOTION_OFFSETS if structure.offset == "none" and hypotheses.may_add_offset else (structure.offset,)
+    offsets = MOTION_OFFSETS if structure.offset == "none" and fits.may_add_offset else (structure.offset,)
     for offset in offsets:
         request = replace(structure, initial="caputo", offset=offset)
 
@@ -212,7 +212,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
             return fit_score(candidate, joint) < most
 
         try:
-            other = hypotheses.refit(request, fit, is_better)
+            other = fits.refit(request, fit, is_better)
         except FtlmError:
             continue
         if other is None or other.joint is None or other.joint.unstable_optimum is not None:
@@ -221,19 +221,19 @@ def _fit_in_motion(fit: Fit, structure: Structure, hypotheses: Hypotheses) -> Fi
             least, candidate = fit_score(other.joint, joint), (request, other)
     if candidate is None:
         return None
-    whole = hypotheses.take(*candidate)
+    whole = fits.with_intervals(*candidate)
     start_finding = make_finding("rest_rejected", run=", ".join(r.name for r in runs))
     return replace(whole, findings=[*whole.findings, start_finding])
 
 
-def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, has_level: bool) -> Fit | None:
+def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, *, has_level: bool) -> Fit | None:
     """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
 
     The likelihoods of two fits are compared under the noise color of the fit with the larger residuals. If the output
     means suggest a level, the optimum moves far and automatic initial guesses are used. Otherwise the fit starts from
     the optimum without a level.
     """
-    if fit.joint is None or not hypotheses.may_add_offset:
+    if fit.joint is None or not fits.may_add_offset:
         return None
     best = fit.joint
     candidate: tuple[Structure, Fit] | None = None
@@ -247,20 +247,20 @@ def _fit_with_level(fit: Fit, structure: Structure, hypotheses: Hypotheses, *, h
         try:
             fresh = has_level and candidate is None
             near = fit if candidate is None else candidate[1]
-            level = hypotheses.fit(request) if fresh else hypotheses.refit(request, near, is_preferred)
+            level = fits.fit(request) if fresh else fits.refit(request, near, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):
                 # The optimum under other initial conditions is not near any optimum under these.
-                level = hypotheses.fit(request)
+                level = fits.fit(request)
         except FtlmError:
             continue
         if level is not None and level.joint is not None and is_preferred(level.joint):
             best, candidate, margin = level.joint, (request, level), 0.0
     if candidate is None:
         return None
-    whole = hypotheses.take(*candidate)
+    whole = fits.with_intervals(*candidate)
     was = "rested" if best.initial == "rest" else "moved"
     about = {"run": ", ".join(r.name for r in fit.task.runs), "output": ", ".join(fit.model.outputs), "was": was}
-    # Another run may start otherwise.
+    # The saved model keeps the requested initial conditions, because other runs may start differently.
     model = replace(whole.model, structure=replace(whole.model.structure, initial=structure.initial))
     return replace(whole, model=model, findings=[*whole.findings, make_finding("level_estimated", **about)])
 

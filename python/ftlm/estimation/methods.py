@@ -55,11 +55,13 @@ def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
     """Raise ModelError if the runs or the structure do not allow an autoregressive noise model."""
     label = parameter("noise", "ar")
     if len(structure.outputs) > 1:
-        raise ModelError(f"{label} is of one output, not of {', '.join(structure.outputs)}; fit each one")
+        raise ModelError(
+            f"{label} supports one output, and the structure has {', '.join(structure.outputs)}; fit each one"
+        )
     if not structure.is_linear or structure.limits:
         raise ModelError(
-            f"{label} filters inputs and output alike, and friction, non-linear terms and limits do not commute with "
-            "it; leave it out"
+            f"{label} requires a linear model without saturations and dead zones, because its filter does not commute "
+            f"with them; omit {label}"
         )
     if any(run.sample_times is not None for run in runs):
         raise ModelError(f"{label} needs uniform samples; resample the runs, or leave it out")

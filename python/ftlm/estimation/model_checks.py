@@ -71,11 +71,11 @@ MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
 #: An end of the multistart is a second optimum if its log likelihood is smaller by no more than this, and a value
 #: differs by more than so many standard errors.
 SECOND_OPTIMUM_LOG_LIKELIHOOD, SECOND_OPTIMUM_ERRORS = 2.0, 3.0
-#: Maximum sum of squared differences of the residuals of one and the same model, in units of their variance.
+#: Two optima are the same model if the squared differences of their residuals sum to less, in units of the variance.
 SAME_MODEL_POWER = 1e-2
-#: Maximum coarse cost of a candidate that may end in a second optimum, relative to the best.
+#: Maximum cost on the coarse grid, relative to the best candidate, of candidates from which a second optimum is sought.
 MAX_SECOND_COST_RATIO = 1.05
-#: Maximum number of evaluations from a candidate to its optimum.
+#: Maximum number of evaluations of the search for a second optimum.
 MAX_SECOND_EVALUATIONS = 60
 #: Samples of the first parts of all runs, on which second optima of longer records are looked for first, and fewest of
 #: one run.

@@ -524,8 +524,9 @@ def refit_after_screening(
     """Return the refit of a linear structure with other initial conditions or offsets; None if screened out or failed.
 
     First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The residuals,
-    multiplied by a share, are an optimistic estimate of those of a complete fit. If `accepts` accepts them, a fit on
-    the same grid follows, and if it accepts that, with `refine`, one with a refined step.
+    multiplied by `CONVERGED_RESIDUAL_SHARE` or `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of a
+    complete fit. If `accepts` rejects them, the result is None. Otherwise the structure is fitted on the same grid,
+    and, with `refine` and if `accepts` accepts that fit, again with a refined step.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]

@@ -201,7 +201,7 @@ def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]
     spans_text = ", ".join(f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in spans_of_change.items())
     last = max(row.rank for row in alike)
     every = ", all that are kept," if alike[-1] is distinct[-1][0] and len(distinct) > 1 else ""
-    code = "ranks_not_distinguished" if decided else "ranking_not_significant"
+    code = "tied_orders_close" if decided else "tied_orders_far_apart"
     return [make_finding(code, parameter=", ".join(spans_of_change), last=last, every=every, shown=spans_text)]
 
 

@@ -16,7 +16,7 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats
 
-#: Minimum highest order of an equation, and smallest gap between it and the order of an own term.
+#: Lower limit of the order of an equation, and minimum difference between it and the orders of other output terms.
 MIN_HIGHEST_ORDER, MIN_ORDER_GAP = 0.01, 0.005
 
 

@@ -24,11 +24,11 @@ from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, Comparison, simu
 #: Length of a piece in time constants of the fastest growing mode, that of shorter runs, and fewest samples. By
 #: its end an error of the model has grown by e^5, or e^2.5.
 PIECE_TIME_CONSTANTS, MIN_PIECE_TIME_CONSTANTS, MIN_PIECE_SAMPLES = 5.0, 2.5, 20
-#: Maximum growth of a mode over the fewest samples of a piece, as an exponent.
+#: Maximum exponent a T of the growth exp(a T) of a mode over the shortest piece.
 MAX_GROWTH_EXPONENT = 15.0
-#: Minimum number of pieces that are evidence, and most that are simulated, spread evenly.
+#: Minimum number of pieces for a decision, and maximum number that are simulated, spread evenly.
 MIN_PIECES, MAX_PIECES = 5, 40
-#: Maximum residual of the pieces, relative to the deviations of their outputs, of a model of the plant.
+#: Maximum residual of the pieces, relative to the standard deviations of their outputs, of an acceptable model.
 MAX_PIECE_RESIDUAL = 0.3
 #: Findings on plants that no simulation of a whole run follows.
 SPLIT_CODES = ("plant_needs_pieces", "plant_unstable_in_pieces")

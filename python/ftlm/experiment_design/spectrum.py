@@ -108,7 +108,7 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
     coupling = fit.problem.structure.coupling
     own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
     _, coefficients, _ = fit.problem.split(fit.values)
-    chain = fit.problem.number_jacobian(coefficients)
+    chain = fit.problem.model_parameter_jacobian(coefficients)
     # The other outputs in an equation are simulated or measured, depending on the coupling.
     drives = (
         gains

@@ -277,7 +277,7 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
     if unit_option is not None:
         raise DataError(
             f"{parameter('time_unit', unit_option)} is the unit of numbers, and {label} holds dates or times of day; "
-            "leave it out"
+            f"omit {parameter('time_unit')}"
         )
     seconds = column.timestamps.seconds(label, selection.layout.dates)
     order = date_order_assumption(column, selection.layout.dates)

@@ -21,8 +21,8 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import error_text
 
-#: Version of the schema of model files; files of other versions are refused.
-MODEL_SCHEMA = 2
+#: Version of the schema of model files. Files of other versions, which no release wrote, are refused.
+MODEL_SCHEMA = 13
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):

@@ -85,11 +85,9 @@ class OrderCertificate:
     def findings(self) -> tuple[Finding, ...]:
         """Findings on the simulation at the best orders, which the certificate of the equation error does not cover."""
         if self.unstable_poles > 0:
-            return (
-                make_finding("certified_simulation_unbounded", poles=int(self.unstable_poles), nr=self.free_run_nr),
-            )
+            return (make_finding("best_orders_unstable", poles=int(self.unstable_poles), nr=self.free_run_nr),)
         if self.free_run_nr > MAX_FREE_RUN_NR:
-            return (make_finding("certified_simulation_poor", nr=self.free_run_nr),)
+            return (make_finding("best_orders_poor_fit", nr=self.free_run_nr),)
         return ()
 
     @property
@@ -283,7 +281,7 @@ class SearchResult:
         """Findings on the table: orders at a limit of their interval, and equivalent rows."""
         edges = [make_finding("order_on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
         if 0 < self.free_runs < self.candidates:
-            edges.append(make_finding("simulations_incomplete", count=self.free_runs, candidates=self.candidates))
+            edges.append(make_finding("candidates_not_simulated", count=self.free_runs, candidates=self.candidates))
         distinct, rows = len(self.distinct_rows), len(self.table)
         if distinct == rows:
             return tuple(edges)

@@ -382,7 +382,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         surface = output_error_landscape(result)
     else:
         if not result.searches or result.task is None:
-            raise ModelError("this identification searched no order grid; give one to draw its scores")
+            raise ModelError("the identification has no order search; identify with an order grid to draw its scores")
         name = next(iter(result.searches)) if output is None else output
         if name not in result.searches:
             raise ModelError(f"there is no search {name!r}; there are {', '.join(result.searches)}")

@@ -149,8 +149,8 @@ def control(
 
 def _of_both_joints(controller: Controller) -> Controller:
     """Return a controller that takes time, angles and reference; raise ModelError for a PID of one joint."""
-    if isinstance(controller, Lqg) and controller.observer.realisation.input in MOTOR_INPUTS:
-        second = controller.observer.realisation.input == MOTOR_INPUTS[1]
+    if isinstance(controller, Lqg) and controller.observer.realization.input in MOTOR_INPUTS:
+        second = controller.observer.realization.input == MOTOR_INPUTS[1]
         return JointControllers(None, controller) if second else JointControllers(controller)
     if isinstance(controller, (Lqg, DiscretePid)):
         raise ModelError(

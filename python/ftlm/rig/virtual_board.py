@@ -92,7 +92,8 @@ class VirtualBoard:
         self._rate = 0.0
         if not isinstance(self.inject, (tuple, list)):
             raise ModelError(
-                f"inject = {short_repr(self.inject)} is not a tuple; give (name, channel, time [s], number) of faults"
+                f"inject = {short_repr(self.inject)} is not a sequence of faults; give one (name, channel, time [s], "
+                "value) for each fault"
             )
         for fault in self.inject:
             _checked_injection(fault)
@@ -308,9 +309,9 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
 
 
 def _checked_injection(fault: object) -> tuple[str, int, float, float]:
-    """Return an injected fault as (name, channel, time [s], number); raise ModelError if it is invalid."""
+    """Return an injected fault as (name, channel, time [s], value); raise ModelError if it is invalid."""
     if not isinstance(fault, (tuple, list)) or len(fault) != 4:
-        raise ModelError(f"inject has {short_repr(fault)}; give (name, channel, time [s], number)")
+        raise ModelError(f"inject has {short_repr(fault)}; give (name, channel, time [s], value)")
     name, channel, time_s, number = fault
     check_choice("the injected fault", name, FAULT_INJECTIONS)
     count, meaning = _FAULT_CHANNELS.get(name, 1), FAULT_INJECTIONS[name]

@@ -175,7 +175,7 @@ class EquationParser:
             if token is None:
                 start = at + len(readable[at:]) - len(readable[at:].lstrip())
                 at_character = f"{text[start]!r} at character {start + 1}"
-                raise ModelError(f"equation {text!r}: {at_character} has no meaning there; leave it out")
+                raise ModelError(f"equation {text!r}: unexpected {at_character}; remove it")
             kind = str(token.lastgroup)
             self._tokens.append((kind, token[kind], token.start(kind)))
             at = token.end()
@@ -214,7 +214,7 @@ class EquationParser:
         kind, value, at = self._peek()
         found = value if kind == "end" else repr(value)
         if kind == "symbol" and value in ",:'":
-            return self._error(f"{value!r} at character {at + 1} has no meaning there")
+            return self._error(f"unexpected {value!r} at character {at + 1}; remove it")
         if value == "D" or (expectation == "the name of a signal" and self._position > 0 and self._peek(-1)[1] == "D"):
             return self._error(
                 f"expected {expectation} at character {at + 1}, found {found}; D is the derivative in an equation: "

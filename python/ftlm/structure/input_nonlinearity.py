@@ -92,7 +92,9 @@ class InputNonlinearity:
         )
         if isinstance(self.value, (tuple, list)):
             if len(self.value) != 2:
-                raise ModelError(f"{words} = {self.value!r} has another size; give a number, or (least, largest)")
+                raise ModelError(
+                    f"{words} = {self.value!r} has {len(self.value)} values; give one, or (minimum, maximum)"
+                )
             low, high = (real_number(f"{words}", v) for v in self.value)
             if not 0 <= low < high < math.inf:
                 raise ModelError(

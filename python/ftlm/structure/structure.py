@@ -450,7 +450,9 @@ class Structure:
             free.pop(name, None)
             if isinstance(delay, (tuple, list)):
                 if len(delay) != 2:
-                    raise ModelError(f"delay of {name} = {delay!r} has another size; give seconds, or (least, largest)")
+                    raise ModelError(
+                        f"delay of {name} = {delay!r} has {len(delay)} values; give seconds, or (minimum, maximum)"
+                    )
                 free[name] = (delay[0], delay[1])
             else:
                 fixed[name] = delay

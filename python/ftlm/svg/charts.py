@@ -532,7 +532,8 @@ class CorrelationMap(Figure):
         if np.any(beyond):
             row, column = divmod(int(np.argmax(beyond)), len(names))
             raise DataError(
-                f"the correlation of {names[row]} and {names[column]} is {matrix[row, column]}; give at most 1"
+                f"the correlation of {names[row]} and {names[column]} is {matrix[row, column]}, outside [-1, 1]; "
+                "give a correlation matrix, not a covariance"
             )
 
     @cached_property

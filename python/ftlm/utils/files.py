@@ -302,10 +302,10 @@ class JsonFormat(Generic[F]):
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return
         if head.format == f"ftlm-{self.what}" and head.schema != self.schema:
-            by = f" by {short_repr(head.written_by, MAX_NAME_CHARACTERS)}" if head.written_by else ""
+            by = f" (written by {short_repr(head.written_by, MAX_NAME_CHARACTERS)})" if head.written_by else ""
             raise DataError(
-                f"{file} is a {self.what} of schema {short_repr(head.schema)}, written{by}, and ftlm {__version__} "
-                f"reads schema {self.schema}; read it with the version that wrote it, or write it again"
+                f"{file} is a {self.what} file of schema {short_repr(head.schema)}{by}, and ftlm {__version__} reads "
+                f"schema {self.schema}; read it with the version that wrote it, or compute the {self.what} again"
             )
 
 

@@ -94,7 +94,7 @@ def check_seed(seed: object) -> int:
     except TypeError:
         number = -1
     if number < 0:
-        raise ModelError(f"{setting('seed')} {short_repr(seed)} is not a seed; give a whole number from 0 on")
+        raise ModelError(f"{setting('seed')} {short_repr(seed)} is not a seed; give an integer of at least 0")
     return number
 
 

@@ -39,7 +39,7 @@ INPUT_CLIP, OUTPUT_CLIP, RESIDUAL_CLIP = 3.0, 5.0, 12.0
 ROBUST_SIGMAS, ROBUST_ITERATIONS = 2.0, 4
 #: Share of an innovation that outputs explain, prediction error and ratio from which no coincidence explains as much.
 CERTAIN_SHARE, ROUGH_SHARE, CERTAIN_RATIO = 0.5, 2e-3, 5.0
-#: Minimum rows x share x (prediction error)^2 that could move an estimate by a part of its standard error.
+#: Minimum of rows x explained share x (relative prediction error)^2. Below it feedback hardly biases an estimate.
 MIN_FEEDBACK_POWER = 0.01
 #: Shares of the largest possible input noise that are tried; number of shifts in time that serve as placebos, and
 #: ratio of the statistic to the largest of theirs from which feedback counts as found.

@@ -45,7 +45,7 @@ NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
 MAX_REST_VELOCITY_RATIO = 0.01
 #: Slope at 0 of the tanh that replaces the sign of a measured velocity, times the largest velocity.
 SIGN_TANH_SLOPE = 100.0
-#: Minimum value of the other sign, relative to the largest value, of a velocity that changes its direction.
+#: Minimum peak of a velocity against its main direction, relative to its peak, that counts as a reversal.
 MIN_REVERSAL_RATIO = 0.01
 #: Singular values of sensitivities, relative to the largest one, below which they count as rounding errors.
 SENSITIVITY_RANK_TOLERANCE = 1e-10

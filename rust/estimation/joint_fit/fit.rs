@@ -391,7 +391,7 @@ fn select_on_part(
     select_best_candidate(sought.free, contenders, &whole)
 }
 
-/// True if one of the candidates, as it is, has a lower cost on a grid than the optimum `best`.
+/// True if one of the candidates, without further optimization, has a lower cost on a grid than the optimum `best`.
 fn has_better(candidates: &[Candidate], best: &Candidate, grid: &Objective<'_>) -> Result<bool> {
     for candidate in candidates {
         if grid.evaluate(&candidate.result.iterate)?.is_some_and(|evaluation| evaluation.cost < best.result.cost) {

@@ -61,8 +61,8 @@ pub fn prefer_stable<'a>(
     let mut first = search.short_fits(&best, reached)?;
     let unit = grid.time_scaling();
     for one in known_orders(free) {
-        // A stable optimum with one order fixed is a candidate for the full equation. Those of the multistart are among
-        // its candidates already.
+        // A stable optimum with one order fixed is a candidate for the full equation. The optima of the multistart with
+        // one order fixed are among the candidates already.
         let narrow = StableSearch { free: &one.free, grid: constrained.with_problem(&one.free.problem) };
         let fits = narrow.short_fits(&one.restrict(&best, &unit), &[])?;
         first.extend(fits.iter().map(|fit| one.embed(fit, free)));

@@ -21,8 +21,8 @@ use crate::recording::{Recordings, Sampling};
 
 /// Ratio of the best cost to the noise floor above which problems with one free order get a multistart of their own.
 pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
-/// Intervals of the first part of a long record, and of the whole record decimated, on which initial guesses of integer
-/// orders are found.
+/// Number of sampling intervals of the first part of a long record, and of the decimated record, on which initial
+/// guesses of problems of integer orders are found.
 const GUESS_INTERVALS: usize = 2000;
 /// Intervals of long records on which problems of integer orders are fitted for their initial guesses.
 pub const SELECTION_INTERVALS: usize = 6000;
