@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::initial_guesses::OrderGrids;
 use super::multistart::{
     leading_part, run_friction_multistart, run_multistart, run_nonlinear_multistart, select_survivors,
-    InitialGuessSource, MultistartContext, SELECTION_INTERVALS,
+    split_unfinished, InitialGuessSource, MultistartContext, FIRST_BUDGET_EVALUATIONS, SELECTION_INTERVALS,
 };
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
 use super::parameter_set::ParameterSet;
@@ -34,6 +34,9 @@ const MIN_NOISE_DEVIATION: f64 = 1e-300;
 /// Maximum number of evaluations of each survivor of the multistart on all samples, or on the first part of a long
 /// record.
 const MAX_FINAL_EVALUATIONS: usize = 60;
+/// Ratio of the cost per residual on all samples to that on the first part above which the other survivors are tried on
+/// all samples.
+const MAX_COST_RISE: f64 = 2.0;
 
 /// Standard deviation of an output, and an initial guess of its noise standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -379,13 +382,19 @@ fn select_on_part(
         let winner = select_best_candidate(sought.free, contenders, &part).and_then(|best| {
             let place = &best.result.iterate;
             let problem = sought.free.problem_at(place, true, &[]);
-            Ok(best.with_result(whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?))
+            let end = whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?;
+            Ok((best.cost_per_residual(), best.with_result(end)))
         });
-        // On all samples its simulation may overflow, or another survivor may be better before any optimization.
+        // On all samples its simulation may overflow, or be much worse than that of another survivor.
         match winner {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
-            Ok(best) if !has_better(contenders, &best, &whole)? => return Ok(best),
-            _ => {}
+            Ok((partial, best)) => {
+                let rises = best.cost_per_residual() > MAX_COST_RISE * partial;
+                if !rises || !has_better(contenders, &best, &whole)? {
+                    return Ok(best);
+                }
+            }
+            Err(_) => {}
         }
     }
     select_best_candidate(sought.free, contenders, &whole)
@@ -403,15 +412,26 @@ fn has_better(candidates: &[Candidate], best: &Candidate, grid: &Objective<'_>) 
 
 /// Best survivor on a grid, with equal weights of all outputs.
 fn select_best_candidate(free: &ParameterSet, contenders: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
-    let mut ends = Vec::new();
+    let fit = |runner: &Candidate, evaluations| {
+        let place = &runner.result.iterate;
+        near.minimize_in(&free.problem_at(place, false, &[]), place, evaluations)
+    };
+    let mut short = Vec::new();
     let mut last = None;
     for runner in contenders {
-        let place = &runner.result.iterate;
-        match near.minimize_in(&free.problem_at(place, false, &[]), place, MAX_FINAL_EVALUATIONS) {
-            Ok(attempt) => ends.push(runner.with_result(attempt)),
+        match fit(runner, FIRST_BUDGET_EVALUATIONS) {
+            Ok(attempt) => short.push(runner.with_result(attempt)),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             // No finite simulation on this grid; other survivors may have one.
             Err(error) => last = Some(error),
+        }
+    }
+    let (unfinished, mut ends) = split_unfinished(short);
+    for runner in unfinished {
+        match fit(&runner, MAX_FINAL_EVALUATIONS) {
+            Ok(attempt) => ends.push(runner.with_result(attempt)),
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            Err(_) => ends.push(runner),
         }
     }
     let attempts: Vec<&OptimizationResult> = ends.iter().map(|runner| &runner.result).collect();

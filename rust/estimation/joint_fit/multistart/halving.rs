@@ -8,7 +8,7 @@ use crate::estimation::joint_fit::objective::{Objective, RELATIVE_COST_TOLERANCE
 use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::estimation::joint_fit::problem::Candidate;
 use crate::estimation::joint_fit::progress::ProgressListener;
-use crate::estimation::output_error::{Experiment, MinimizationSettings};
+use crate::estimation::output_error::{Experiment, MinimizationSettings, Status};
 use crate::parallel::Stop;
 
 /// Number of evaluations of every candidate in the first budget. Candidates near the best then get
@@ -163,6 +163,18 @@ fn zero_vanishing_coefficients(free: &ParameterSet, start: &Candidate, mut ended
 pub(in crate::estimation::joint_fit) fn sort_by_cost(mut runners: Vec<Candidate>) -> Vec<Candidate> {
     runners.sort_by(|a, b| a.cost_per_residual().total_cmp(&b.cost_per_residual()));
     runners
+}
+
+/// Candidates of a short fit that continue, and the others.
+///
+/// Candidates do not continue if they have ended, or if they cost more than one that has converged.
+pub(in crate::estimation::joint_fit) fn split_unfinished(runners: Vec<Candidate>) -> (Vec<Candidate>, Vec<Candidate>) {
+    let converged = runners.iter().filter(|runner| runner.result.has_converged());
+    let least = converged.map(Candidate::cost_per_residual).fold(f64::INFINITY, f64::min);
+    let continues = |runner: &Candidate| {
+        runner.result.status == Status::Exhausted && runner.cost_per_residual() <= (1.0 + SAME_COST_TOLERANCE) * least
+    };
+    runners.into_iter().partition(continues)
 }
 
 /// Survivors that continue on all samples: the best distinct optima within the cost ratio.

@@ -3,8 +3,8 @@
 use super::coarse_grid::{coarse_sampling, leading_part};
 use super::halving::{
     competitive_candidates, is_same_iterate, is_same_optimum, merge_duplicates, select_survivors, sort_by_cost,
-    RungExecutor, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO, MIN_SURVIVORS,
-    PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS,
+    split_unfinished, RungExecutor, FIRST_BUDGET_EVALUATIONS, MAX_FINAL_SURVIVORS, MAX_SURVIVOR_COST_RATIO,
+    MIN_SURVIVORS, PRESCREEN_EVALUATIONS, SECOND_BUDGET_EVALUATIONS,
 };
 use super::nested_models::{
     fixed_order_problems, integer_order_problems, reduced_problems, FixedOrderProblem, ReducedProblem,
@@ -363,8 +363,11 @@ impl<'a> MultistartState<'a> {
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
         let reached = merge_duplicates(&self.candidates, is_same_optimum);
         let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
-        let candidates = self.laps.run(self.free, &self.coarse, survivors, SECOND_BUDGET_EVALUATIONS)?;
-        let mut candidates = rank_candidates(&self.coarse, self.half, candidates)?;
+        let short = self.laps.run(self.free, &self.coarse, survivors, FIRST_BUDGET_EVALUATIONS)?;
+        let (unfinished, ended) = split_unfinished(short);
+        let mut candidates = self.laps.run(self.free, &self.coarse, &unfinished, SECOND_BUDGET_EVALUATIONS)?;
+        candidates.extend(ended);
+        let mut candidates = rank_candidates(&self.coarse, self.half, sort_by_cost(candidates))?;
         candidates.extend_from_slice(rest);
         Ok((candidates, self.coarse))
     }
