@@ -166,13 +166,18 @@ impl<'a> FitProblem<'a> {
         self.grid(weights, sampling, refine)
     }
 
+    /// Cost per residual of the noise of the outputs, with their equal weights.
+    fn noise_floor(&self) -> f64 {
+        let share = |size: &OutputScale| (size.noise / (COARSE_RESIDUAL_RATIO * size.deviation)).powi(2);
+        mean(&self.sizes.iter().map(share).collect::<Vec<_>>())
+    }
+
     /// Run the multistart; return its candidates, best first.
     ///
     /// # Errors
     /// As the source, the initial guesses and the listener; [`Error::Interrupted`].
     pub fn run_multistart(&self, threads: usize, pace: &mut FitProgress<'_>) -> Result<Vec<Candidate>> {
-        let share = |size: &OutputScale| (size.noise / (COARSE_RESIDUAL_RATIO * size.deviation)).powi(2);
-        let floor = mean(&self.sizes.iter().map(share).collect::<Vec<_>>());
+        let floor = self.noise_floor();
         let weights: Vec<f64> = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
         let shared = std::cell::RefCell::new(pace);
         let listener =
@@ -379,7 +384,7 @@ fn select_on_part(
     let whole = sought.equally_weighted_grid(sampling, refine)?;
     if let Some(intervals) = leading_part(sought.free, sought.source, SELECTION_INTERVALS)? {
         let part = sought.equally_weighted_grid(Sampling { leading_intervals: Some(intervals), ..sampling }, refine)?;
-        let winner = select_best_candidate(sought.free, contenders, &part).and_then(|best| {
+        let winner = select_best_candidate(sought, contenders, &part).and_then(|best| {
             let place = &best.result.iterate;
             let problem = sought.free.problem_at(place, true, &[]);
             let end = whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?;
@@ -397,7 +402,7 @@ fn select_on_part(
             Err(_) => {}
         }
     }
-    select_best_candidate(sought.free, contenders, &whole)
+    select_best_candidate(sought, contenders, &whole)
 }
 
 /// True if one of the candidates, without further optimization, has a lower cost on a grid than the optimum `best`.
@@ -411,7 +416,8 @@ fn has_better(candidates: &[Candidate], best: &Candidate, grid: &Objective<'_>) 
 }
 
 /// Best survivor on a grid, with equal weights of all outputs.
-fn select_best_candidate(free: &ParameterSet, contenders: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
+fn select_best_candidate(sought: FitProblem<'_>, contenders: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
+    let free = sought.free;
     let fit = |runner: &Candidate, evaluations| {
         let place = &runner.result.iterate;
         near.minimize_in(&free.problem_at(place, false, &[]), place, evaluations)
@@ -426,7 +432,7 @@ fn select_best_candidate(free: &ParameterSet, contenders: &[Candidate], near: &O
             Err(error) => last = Some(error),
         }
     }
-    let (unfinished, mut ends) = split_unfinished(short);
+    let (unfinished, mut ends) = split_unfinished(short, sought.noise_floor());
     for runner in unfinished {
         match fit(&runner, MAX_FINAL_EVALUATIONS) {
             Ok(attempt) => ends.push(runner.with_result(attempt)),

@@ -26,6 +26,8 @@ pub(super) const MAX_SURVIVOR_COST_RATIO: f64 = 3.0;
 /// Ratio to its initial guess below which a coefficient counts as 0. In logarithmic coordinates an optimization stops
 /// at e^-20.
 const ZERO_COEFFICIENT_RATIO: f64 = 1e-8;
+/// Ratio of the cost per residual to the noise floor up to which an optimum leaves only noise.
+const MAX_NOISE_COST_RATIO: f64 = 1.2;
 /// Relative difference of two costs below which they can belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
 /// Relative difference of all parameters, or absolute difference of the orders, below which two candidates coincide.
@@ -167,13 +169,17 @@ pub(in crate::estimation::joint_fit) fn sort_by_cost(mut runners: Vec<Candidate>
 
 /// Candidates of a short fit that continue, and the others.
 ///
-/// Candidates do not continue if they have ended, or if they cost more than one that has converged.
-pub(in crate::estimation::joint_fit) fn split_unfinished(runners: Vec<Candidate>) -> (Vec<Candidate>, Vec<Candidate>) {
+/// Candidates do not continue if they have ended. If one has converged and leaves only noise, those that cost more do
+/// not continue either. `floor` is the noise floor of the cost per residual.
+pub(in crate::estimation::joint_fit) fn split_unfinished(
+    runners: Vec<Candidate>,
+    floor: f64,
+) -> (Vec<Candidate>, Vec<Candidate>) {
     let converged = runners.iter().filter(|runner| runner.result.has_converged());
     let least = converged.map(Candidate::cost_per_residual).fold(f64::INFINITY, f64::min);
-    let continues = |runner: &Candidate| {
-        runner.result.status == Status::Exhausted && runner.cost_per_residual() <= (1.0 + SAME_COST_TOLERANCE) * least
-    };
+    let limit = if least <= MAX_NOISE_COST_RATIO * floor { (1.0 + SAME_COST_TOLERANCE) * least } else { f64::INFINITY };
+    let continues =
+        |runner: &Candidate| runner.result.status == Status::Exhausted && runner.cost_per_residual() <= limit;
     runners.into_iter().partition(continues)
 }
 

@@ -364,7 +364,7 @@ impl<'a> MultistartState<'a> {
         let reached = merge_duplicates(&self.candidates, is_same_optimum);
         let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
         let short = self.laps.run(self.free, &self.coarse, survivors, FIRST_BUDGET_EVALUATIONS)?;
-        let (unfinished, ended) = split_unfinished(short);
+        let (unfinished, ended) = split_unfinished(short, self.course.floor);
         let mut candidates = self.laps.run(self.free, &self.coarse, &unfinished, SECOND_BUDGET_EVALUATIONS)?;
         candidates.extend(ended);
         let mut candidates = rank_candidates(&self.coarse, self.half, sort_by_cost(candidates))?;
