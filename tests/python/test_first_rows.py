@@ -12,6 +12,7 @@ from scipy.stats import beta
 
 import arm_measured
 import ftlm
+from ftlm.estimation.nuisance_parameters import refit_after_screening
 from ftlm.estimation.output_error import fit_output_error
 from ftlm.simulation.initial_conditions import rest_evidence
 from measured import needs_data
@@ -465,6 +466,21 @@ def test_a_start_that_cannot_be_told_gives_both_gains(name, start):
     assert "1.374 ± 0.049" in said[0].text
     # A start that is given is no question.
     assert "gain_depends_on_initial_conditions" not in codes(given)
+
+
+def test_a_fit_under_other_initial_conditions_is_not_repeated(monkeypatch):
+    requests = []
+
+    def refit(joint, runs, structure, *others, **options):
+        requests.append((structure.initial, structure.offset))
+        return refit_after_screening(joint, runs, structure, *others, **options)
+
+    monkeypatch.setattr("ftlm.estimation.extensions.refit_after_screening", refit)
+    # The run in motion was fitted with Caputo's terms before a level was tried.
+    found = ftlm.identify(panel_record("two lags", "prbs", "level", 311), ftlm.equation("D y = -q y + b u"))
+    assert found.settings["offset"] == "level"
+    assert requests
+    assert ("caputo", "none") not in requests
 
 
 @pytest.mark.parametrize("name", ["two lags", "fractional and a lag"])

@@ -22,7 +22,7 @@ from ftlm import cli
 from ftlm.data.run import Run
 from ftlm.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.progress import Progress
-from ftlm.utils.files import check_free, write_atomically
+from ftlm.utils.files import check_ending, check_free, write_atomically
 from ftlm.utils.formatting import columns, wrap_text
 from ftlm.utils.parameters import use_interface
 from ftlm.utils.resources import duration_bounds, estimate_duration
@@ -312,7 +312,8 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
         }
         try:
             for name, ending in outputs.items():
-                _check_ending(arguments[name], ending)
+                if ending and arguments[name] is not None:
+                    check_ending(arguments[name], ending)
             if outputs:
                 check_free(*(arguments[name] for name in outputs), force=arguments["force"])
             work(**arguments, **option_records)
@@ -430,12 +431,6 @@ def _to_json_value(value: Any) -> Any:
 
 #: File extensions of figures.
 FIGURE_FORMATS = ("png", "pdf", "svg")
-
-
-def _check_ending(path: str | None, ending: str) -> None:
-    """Raise ModelError for a file name without a required extension; None is ignored."""
-    if path is not None and ending and Path(path).suffix.lower() != ending:
-        raise ModelError(f"{path} does not end in {ending}; use this extension")
 
 
 def figure_kind(path: str | None) -> str:

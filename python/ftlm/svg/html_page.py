@@ -18,10 +18,9 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from ftlm._core import __version__
-from ftlm.errors import ModelError
 from ftlm.svg.figure import Figure
 from ftlm.svg.line_chart import chart_css
-from ftlm.utils.files import write_atomically
+from ftlm.utils.files import check_ending, write_atomically
 from ftlm.utils.formatting import Cell, number
 
 #: Columns from which a table has small type, so that the paper's fifteen columns fit a laptop screen.
@@ -224,12 +223,11 @@ def write_page(
     Raises
     ------
     ModelError
-        If the file name does not end in .html or .htm.
+        If the file name does not end in .html.
     DataError
         If the file exists and ``force`` is False, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in (".html", ".htm"):
-        raise ModelError(f"{path} does not end in .html; use this extension")
+    check_ending(path, ".html")
     script, digest = _script()
     page = (
         templates("ftlm.svg")

@@ -17,7 +17,7 @@ import msgspec
 import msgspec.toml
 
 from ftlm._core import __version__
-from ftlm.errors import DataError
+from ftlm.errors import DataError, ModelError
 from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import error_text, nearest, short_repr
@@ -131,6 +131,12 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
             os.close(descriptor)
     PACKAGE_LOGGER.info("written: %s (%d bytes)", file, len(content))
     return file
+
+
+def check_ending(path: str | os.PathLike[str], ending: str) -> None:
+    """Raise ModelError for a file to write whose name does not end in an extension such as ``".html"``."""
+    if Path(path).suffix.lower() != ending:
+        raise ModelError(f"{path} does not end in {ending}; use this extension")
 
 
 def _move_exclusively(beside: Path, file: Path) -> None:

@@ -254,6 +254,33 @@ mod tests {
     }
 
     #[test]
+    fn candidates_stop_only_beside_an_optimum_that_leaves_noise() {
+        let ended = |cost: f64, status| {
+            let mut candidate = candidate_at(cost, 1.0);
+            candidate.result.status = status;
+            candidate
+        };
+        let reached = || {
+            [
+                (1.0, Status::Converged),
+                (1.0005, Status::Exhausted),
+                (1.5, Status::Exhausted),
+                (0.5, Status::Exhausted),
+                (2.0, Status::Stalled),
+            ]
+            .map(|(cost, status)| ended(cost, status))
+            .to_vec()
+        };
+        let costs = |floor: f64| {
+            let (unfinished, others) = split_unfinished(reached(), floor);
+            assert_eq!(unfinished.len() + others.len(), 5);
+            unfinished.iter().map(|candidate| candidate.result.cost).collect::<Vec<_>>()
+        };
+        assert_eq!(costs(1.0), [1.0005, 0.5]);
+        assert_eq!(costs(0.1), [1.0005, 1.5, 0.5]);
+    }
+
+    #[test]
     fn candidate_beyond_the_limit_hides_no_later_one() {
         // The order comes from a finer grid; the cost of the last one is within the ratio nevertheless.
         let reached = [candidate_at(1.0, 0.5), candidate_at(3.5, 1.0), candidate_at(2.0, 1.5)];

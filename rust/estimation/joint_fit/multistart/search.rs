@@ -105,44 +105,36 @@ fn integer_order_multistart(
         Objective::new((&free.problem, course.source, course.stop), weights, sampling, false)
     };
     let grid = objective(Sampling { leading_intervals, ..Sampling::default() })?;
-    let samplings = guess_samplings(free, course.source, leading_intervals)?;
     let mut starts = Vec::new();
-    for sampling in &samplings {
-        match course.starts.integer_order_optima(free, &objective(*sampling)?)? {
-            Some(optima) => starts.extend(optima),
-            // Another part of the record can still determine the equation.
-            None if samplings.len() > 1 => {}
-            None => return Ok(None),
-        }
+    for sampling in guess_samplings(free, course.source, leading_intervals)? {
+        starts.extend(course.starts.integer_order_optima(free, &objective(sampling)?)?.unwrap_or_default());
     }
-    if starts.is_empty() && samplings.len() > 1 {
+    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
+    let mut starts = merge_duplicates(&laps.run(free, &grid, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
+    if starts.is_empty() {
         let Some(optima) = course.starts.integer_order_optima(free, &grid)? else { return Ok(None) };
         starts = optima;
     }
-    let laps = RungExecutor { starts: starts.len(), threads: course.threads, listener: course.listener };
-    if samplings.len() > 1 {
-        starts = merge_duplicates(&laps.run(free, &grid, &starts, PRESCREEN_EVALUATIONS)?, is_same_iterate);
-    }
+    let laps = RungExecutor { starts: starts.len(), ..laps };
     let candidates = laps.run(free, &grid, &starts, SECOND_BUDGET_EVALUATIONS)?;
     Ok((!candidates.is_empty()).then_some(candidates))
 }
 
-/// Samplings of the record on which initial guesses of integer orders are found: of a long record its first part with
-/// all samples, for fast poles and delays, and the whole decimated, for slow poles. Otherwise all samples.
+/// Samplings of a long record on which initial guesses of integer orders are found: its first part with all samples, for
+/// fast poles and delays, and the whole decimated, for slow poles. Empty for short records.
 fn guess_samplings(
     free: &ParameterSet,
     source: &Recordings,
     leading_intervals: Option<usize>,
 ) -> Result<Vec<Sampling>> {
-    let all = Sampling { leading_intervals, ..Sampling::default() };
-    let Some(first) = leading_part(free, source, GUESS_INTERVALS)? else { return Ok(vec![all]) };
+    let Some(first) = leading_part(free, source, GUESS_INTERVALS)? else { return Ok(Vec::new()) };
     let intervals = source.runs().iter().map(|run| run.len().saturating_sub(1)).min().unwrap_or(0);
     let decimation = leading_intervals.unwrap_or(usize::MAX).min(intervals) / first;
-    Ok(if decimation < 2 {
-        vec![all]
-    } else {
-        vec![Sampling { leading_intervals: Some(first), ..all }, Sampling { decimation, ..all }]
-    })
+    if decimation < 2 {
+        return Ok(Vec::new());
+    }
+    let leading = Sampling { leading_intervals: Some(first), ..Sampling::default() };
+    Ok(vec![leading, Sampling { leading_intervals, decimation, ..Sampling::default() }])
 }
 
 /// Convert the error of an invalid model to None.
