@@ -658,7 +658,7 @@ def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset],
         # Another finding states the evidence of rest, or that rest is assumed.
         return []
     if joint.exact_outputs(runs) == set(joint.noise):
-        # The squares of rounding errors compare nothing.
+        # A ratio of rounding errors is meaningless.
         return []
     own_setting = joint.initial if joint.initial == "rest" else "caputo", structure.offset
 

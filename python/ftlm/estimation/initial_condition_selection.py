@@ -1,4 +1,4 @@
-"""Selection of zero or nonzero initial conditions, and of an output level or an equation constant, of a fit."""
+"""Selection of the initial conditions of a fit, and of its offset: an output level or a constant in the equation."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from ftlm.structure.structure import History, Initial, Offset, Structure
 from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO
 
 #: Initial conditions that are tried together with an output level.
-LEVEL_STARTS: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
+INITIAL_CONDITIONS_WITH_LEVEL: tuple[Literal["rest"], Literal["caputo"]] = ("rest", "caputo")
 #: Offsets that are tried with nonzero initial conditions, if the first samples suggested rest.
-MOTION_OFFSETS: tuple[Literal["none"], Literal["level"]] = ("none", "level")
+OFFSETS_IN_MOTION: tuple[Literal["none"], Literal["level"]] = ("none", "level")
 #: Minimum ratio of the mean of an output to its standard deviation that suggests a level.
-LEVEL_DEVIATIONS = 3.0
-#: Ratio of residuals to the standard deviation of an output above which a fit has failed.
-MAX_RESIDUAL_SHARE = 0.5
+MIN_LEVEL_MEAN_RATIO = 3.0
+#: Ratio of the residuals to the standard deviation of an output that suggests a level.
+MIN_LEVEL_RESIDUAL_RATIO = 0.5
 #: Maximum number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
 MAX_OFFSET_TEST_SAMPLES = 400_000
@@ -48,15 +48,16 @@ MAX_OFFSET_TEST_SAMPLES = 400_000
 def fit_with_offset_decision(
     runs: Sequence[Run], structure: Structure, estimate: Callable[[Structure], Fit], fits: InitialConditionFits
 ) -> Fit:
-    """Return the fit of a structure; ``offset="auto"`` adds a constant per equation if it is significant.
+    """Return the fit of a structure, and decide on its initial conditions and its offset.
 
-    `estimate` fits a structure without further decisions.
+    `estimate` serves ``offset="auto"``, which adds a constant per equation if it is significant; `fits` serves every
+    other offset.
 
     The structure with the constant is fitted first, because a fit that lacks a necessary constant may end at any wrong
     optimum.
     """
     if structure.offset != "auto":
-        fit = _fit_with_level_decision(structure, fits)
+        fit = _fit_with_start_decision(structure, fits)
         if structure.initial != "auto" or structure.offset != "none":
             return fit
         return replace(fit, findings=[*fit.findings, *undetermined_start_findings(fit, fits.joint_fits)])
@@ -75,13 +76,13 @@ def fit_with_offset_decision(
     test = fit_offset_test(fit)
     if test is not None and test.exceeds():
         return _with_offset_decision(fit, test.decision)
-    decision = "none: its test has no finite simulation" if test is None else test.decision
+    decision = "none: the simulation of its test is not finite" if test is None else test.decision
     return _with_offset_decision(estimate(replace(structure, offset="none")), decision)
 
 
 @dataclass(frozen=True)
 class InitialConditionFits:
-    """Fits of one structure under several initial conditions, and functions that make and complete them.
+    """Functions that fit one structure under several initial conditions, and the last joint fit under each.
 
     Parameters
     ----------
@@ -113,9 +114,9 @@ class InitialConditionFits:
         return fit if self.complete is None else self.complete(structure, fit.joint)
 
     def refit(self, structure: Structure, fit: Fit, accepts: Callable[[JointFit], bool]) -> Fit | None:
-        """Return a fit of a structure with other initial conditions, started from an existing optimum.
+        """Return a refit under other initial conditions, from the optimum of a fit if :attr:`complete` is given.
 
-        The result is None if `accepts` rejects the fit.
+        The result is None if `accepts` rejects the refit.
         """
         joint, runs = fit.joint, fit.task.runs
         if joint is None or self.complete is None:
@@ -131,8 +132,8 @@ class InitialConditionFits:
         )
 
 
-def _fit_with_level_decision(structure: Structure, fits: InitialConditionFits) -> Fit:
-    """Return the fit of a structure, with a constant level added to each output if the runs prefer one."""
+def _fit_with_start_decision(structure: Structure, fits: InitialConditionFits) -> Fit:
+    """Return the fit of a structure, with a constant, nonzero initial conditions or levels if they are significant."""
     fit = fits.fit(structure)
     constant = _fit_with_constant(fit, structure, fits)
     if constant is not None:
@@ -145,13 +146,13 @@ def _fit_with_level_decision(structure: Structure, fits: InitialConditionFits) -
         return fits.with_intervals(structure, fit)
     suggests_level = _suggests_level(fit)
     is_level_tried = suggests_level or _may_hide_level(fit)
-    level = _fit_with_level(fit, structure, fits, has_level=suggests_level) if is_level_tried else None
+    level = _fit_with_level(fit, structure, fits, is_suggested=suggests_level) if is_level_tried else None
     if level is not None:
         return level
     test = fit_offset_test(fit) if sum(run.length for run in fit.task.runs) <= MAX_OFFSET_TEST_SAMPLES else None
     offset_findings = unrequested_offset_findings(test, fit.model.outputs) or _history_offset_findings(fit)
     if offset_findings and _has_estimated_initial_conditions(fit) and not is_level_tried:
-        level = _fit_with_level(fit, structure, fits, has_level=False)
+        level = _fit_with_level(fit, structure, fits, is_suggested=False)
         if level is not None:
             return level
     fit = fits.with_intervals(structure, fit)
@@ -186,11 +187,10 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
 
 
 def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
-    """Return a fit with unknown initial values if the runs clearly refute rest despite quiet first samples.
+    """Return a fit with nonzero initial conditions if the residuals of the fit from rest reject rest, else None.
 
-    A few quiet samples do not distinguish slow motion from rest. If the residuals of the fit from rest are white, rest
-    is kept. If they oscillate, the fit with initial values is chosen only if its residuals are white. None if rest is
-    kept.
+    A few quiet samples do not distinguish slow motion from rest. White residuals keep rest. If the residuals are not
+    white but have no slow component, those of the new fit must be white.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.offset in ("none", "constant") and structure.is_linear
@@ -204,7 +204,7 @@ def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -
         # A constant input gives no evidence of rest.
         return None
     least, candidate = fit_score(joint, joint) - START_SETTINGS.history_margin, None
-    offsets = MOTION_OFFSETS if structure.offset == "none" and fits.may_add_offset else (structure.offset,)
+    offsets = OFFSETS_IN_MOTION if structure.offset == "none" and fits.may_add_offset else (structure.offset,)
     for offset in offsets:
         request = replace(structure, initial="caputo", offset=offset)
 
@@ -226,12 +226,12 @@ def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -
     return replace(whole, findings=[*whole.findings, start_finding])
 
 
-def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, *, has_level: bool) -> Fit | None:
+def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, *, is_suggested: bool) -> Fit | None:
     """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
 
-    The likelihoods of two fits are compared under the noise color of the fit with the larger residuals. If the output
-    means suggest a level, the optimum moves far and automatic initial guesses are used. Otherwise the fit starts from
-    the optimum without a level.
+    Information criteria are compared under the noise color of the fit with the larger residuals. With `is_suggested`,
+    the optimum moves far, and automatic initial guesses are used. Otherwise the fit starts from the optimum without a
+    level.
     """
     if fit.joint is None or not fits.may_add_offset:
         return None
@@ -242,10 +242,10 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     def is_preferred(joint: JointFit) -> bool:
         return fits_better(joint, best, margin)
 
-    for initial in LEVEL_STARTS:
+    for initial in INITIAL_CONDITIONS_WITH_LEVEL:
         request = replace(structure, initial=initial, offset="level")
         try:
-            fresh = has_level and candidate is None
+            fresh = is_suggested and candidate is None
             near = fit if candidate is None else candidate[1]
             level = fits.fit(request) if fresh else fits.refit(request, near, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):
@@ -276,9 +276,9 @@ def _suggests_level(fit: Fit) -> bool:
         return False
     for output, noise in joint.noise.items():
         values = [drop_missing(run[output]) for run in fit.task.runs]
-        if any(abs(float(np.mean(y))) > LEVEL_DEVIATIONS * float(np.std(y)) for y in values):
+        if any(abs(float(np.mean(y))) > MIN_LEVEL_MEAN_RATIO * float(np.std(y)) for y in values):
             return True
-        if noise > MAX_RESIDUAL_SHARE * max(float(np.std(y)) for y in values):
+        if noise > MIN_LEVEL_RESIDUAL_RATIO * max(float(np.std(y)) for y in values):
             return True
     return False
 

@@ -526,7 +526,7 @@ def refit_after_screening(
     First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The residuals,
     multiplied by `CONVERGED_RESIDUAL_SHARE` or `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of a
     complete fit. If `accepts` rejects them, the result is None. Otherwise the structure is fitted on the same grid,
-    and, with `refine` and if `accepts` accepts that fit, again with a refined step.
+    and, with `refine` and if `accepts` accepts that fit, again with a refined step. `accepts` may reject the result.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]
@@ -534,7 +534,7 @@ def refit_after_screening(
     loss: Loss = "squares" if joint.robust is None else "huber"
     begin = start_from_values(problem, joint.values_by_name)
     try:
-        # Twice the log-likelihood increases by less than this in one step.
+        # Limit of the increase of twice the log-likelihood in one step, per sample.
         tolerance = SCREENING_LIKELIHOOD_TOLERANCE / joint.samples
         screening = grid.minimize(begin, MAX_SCREENING_EVALUATIONS, plain=True, tolerance=tolerance)
         share = CONVERGED_RESIDUAL_SHARE if screening.has_converged else SCREENING_RESIDUAL_SHARE

@@ -36,7 +36,7 @@ const MIN_NOISE_DEVIATION: f64 = 1e-300;
 const MAX_FINAL_EVALUATIONS: usize = 60;
 /// Ratio of the cost per residual on all samples to that on the first part above which the other survivors are tried on
 /// all samples.
-const MAX_COST_RISE: f64 = 2.0;
+const MAX_COST_RATIO: f64 = 2.0;
 
 /// Standard deviation of an output, and an initial guess of its noise standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -166,7 +166,7 @@ impl<'a> FitProblem<'a> {
         self.grid(weights, sampling, refine)
     }
 
-    /// Cost per residual of the noise of the outputs, with their equal weights.
+    /// Cost per residual of white noise alone, with equal weights of the outputs.
     fn noise_floor(&self) -> f64 {
         let share = |size: &OutputScale| (size.noise / (COARSE_RESIDUAL_RATIO * size.deviation)).powi(2);
         mean(&self.sizes.iter().map(share).collect::<Vec<_>>())
@@ -373,8 +373,8 @@ fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -
     Ok((runner.with_result(attempt), grid))
 }
 
-/// Best survivor of the multistart on all samples. For long records, only the best survivor on their first part is
-/// fitted to all samples.
+/// Best survivor of the multistart, fitted to all samples. For long records it is selected on their first part, unless
+/// its cost rises or its fit fails on all samples.
 fn select_on_part(
     sought: FitProblem<'_>,
     contenders: &[Candidate],
@@ -394,8 +394,8 @@ fn select_on_part(
         match winner {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Ok((partial, best)) => {
-                let rises = best.cost_per_residual() > MAX_COST_RISE * partial;
-                if !rises || !has_better(contenders, &best, &whole)? {
+                let rises = best.cost_per_residual() > MAX_COST_RATIO * partial;
+                if !rises || !is_beaten(&best, contenders, &whole)? {
                     return Ok(best);
                 }
             }
@@ -405,8 +405,8 @@ fn select_on_part(
     select_best_candidate(sought, contenders, &whole)
 }
 
-/// True if one of the candidates, without further optimization, has a lower cost on a grid than the optimum `best`.
-fn has_better(candidates: &[Candidate], best: &Candidate, grid: &Objective<'_>) -> Result<bool> {
+/// True if one of the candidates, without further optimization, has a lower cost on a grid than `best`.
+fn is_beaten(best: &Candidate, candidates: &[Candidate], grid: &Objective<'_>) -> Result<bool> {
     for candidate in candidates {
         if grid.evaluate(&candidate.result.iterate)?.is_some_and(|evaluation| evaluation.cost < best.result.cost) {
             return Ok(true);

@@ -20,8 +20,8 @@ use crate::signal::statistics::mean;
 const COMPARISON_SEGMENTS: f64 = 20.0;
 /// 99 % quantile of Student's t distribution with [`COMPARISON_SEGMENTS`] − 1 degrees of freedom.
 const STUDENT_T_QUANTILE_99: f64 = 2.54;
-/// Ratio of the residuals above which the better optimum is chosen without a test: instability can show up only at the
-/// end of a run.
+/// Ratio of the residuals above which the better optimum is chosen without a test: an instability may appear in the last
+/// segment alone.
 const DECISIVE_RESIDUAL_RATIO: f64 = 2.0;
 /// Maximum number of stable candidates of the multistart that are tried.
 const MAX_STABLE_CANDIDATES: usize = 3;
@@ -35,9 +35,9 @@ pub struct StabilityComparison {
     /// True if the unstable optimum is the result, because it fits significantly better or no stable one exists.
     pub keeps_unstable: bool,
     /// Relative excess of the root mean square residual of the stable optimum. It is infinite without a stable optimum,
-    /// and negative if the unstable model was not an optimum.
+    /// and negative if the stable one fits better.
     pub residual_excess: f64,
-    /// True if the stable one lies on the stability limit and is no local optimum.
+    /// True if the stable one has not converged, usually because it lies on the stability limit.
     pub at_stability_limit: bool,
 }
 
@@ -130,7 +130,7 @@ fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
     .collect()
 }
 
-/// Candidate with all autoregressive coefficients negative, and the indices of the changed coefficients.
+/// Candidate with negative coefficients of all output terms on the right-hand side, and the indices of those changed.
 ///
 /// Equations of an order up to 2 are then stable.
 ///
@@ -147,7 +147,7 @@ pub fn dissipative_candidate(free: &ParameterSet, runner: &Candidate) -> (Candid
             turned.push(free.orders.len() + k);
         }
     }
-    (candidate_at(runner, place, "all own terms pulling back"), turned)
+    (candidate_at(runner, place, "stable signs of the coefficients"), turned)
 }
 
 /// One candidate per autoregressive coefficient, with that coefficient at 0, and the index of the coefficient.
@@ -221,7 +221,7 @@ impl StableSearch<'_, '_> {
             let optimum = ignore_failure(self.minimize(end, &fixed, EVALUATIONS_PER_CANDIDATE))?;
             best = optimum.filter(|optimum| optimum.cost_per_residual() < best.cost_per_residual()).unwrap_or(best);
         }
-        // With a fixed coefficient it converged in fewer parameters than the fit has.
+        // Convergence with a fixed coefficient is not that of all parameters.
         best.result.status = status;
         Ok(best)
     }

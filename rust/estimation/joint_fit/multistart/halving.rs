@@ -26,7 +26,7 @@ pub(super) const MAX_SURVIVOR_COST_RATIO: f64 = 3.0;
 /// Ratio to its initial guess below which a coefficient counts as 0. In logarithmic coordinates an optimization stops
 /// at e^-20.
 const ZERO_COEFFICIENT_RATIO: f64 = 1e-8;
-/// Ratio of the cost per residual to the noise floor up to which an optimum leaves only noise.
+/// Ratio of the cost per residual to the noise floor up to which the residuals count as noise.
 const MAX_NOISE_COST_RATIO: f64 = 1.2;
 /// Relative difference of two costs below which they can belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
@@ -169,8 +169,8 @@ pub(in crate::estimation::joint_fit) fn sort_by_cost(mut runners: Vec<Candidate>
 
 /// Candidates of a short fit that continue, and the others.
 ///
-/// Candidates do not continue if they have ended. If one has converged and leaves only noise, those that cost more do
-/// not continue either. `floor` is the noise floor of the cost per residual.
+/// A candidate continues if its budget is exhausted. If another has converged at the noise floor, its cost must not
+/// exceed the cost of that one. `floor` is the noise floor of the cost per residual.
 pub(in crate::estimation::joint_fit) fn split_unfinished(
     runners: Vec<Candidate>,
     floor: f64,

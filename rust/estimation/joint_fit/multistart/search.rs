@@ -21,10 +21,10 @@ use crate::recording::{Recordings, Sampling};
 
 /// Ratio of the best cost to the noise floor above which problems with one free order get a multistart of their own.
 pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
-/// Number of sampling intervals of the first part of a long record, and of the decimated record, on which initial
-/// guesses of problems of integer orders are found.
+/// Approximate number of intervals, over all runs, of each of the two samplings of a long record on which initial guesses
+/// of integer orders are found.
 const GUESS_INTERVALS: usize = 2000;
-/// Intervals of long records on which problems of integer orders are fitted for their initial guesses.
+/// Leading intervals of a long record, over all runs, on which problems of integer orders and survivors are fitted.
 pub const SELECTION_INTERVALS: usize = 6000;
 
 /// Source of initial guesses.
@@ -120,8 +120,8 @@ fn integer_order_multistart(
     Ok((!candidates.is_empty()).then_some(candidates))
 }
 
-/// Samplings of a long record on which initial guesses of integer orders are found: its first part with all samples, for
-/// fast poles and delays, and the whole decimated, for slow poles. Empty for short records.
+/// Samplings on which initial guesses of integer orders are found. A long record has two: its first part, for fast poles
+/// and delays, and the whole record, decimated, for slow poles. A short record has none: all its samples serve.
 fn guess_samplings(
     free: &ParameterSet,
     source: &Recordings,
@@ -351,7 +351,7 @@ impl<'a> MultistartState<'a> {
         Ok(())
     }
 
-    /// Promote the survivors to the second budget; duplicates and candidates far behind do not continue.
+    /// Fit the survivors again, the unfinished ones with the second budget, and rank them before the other candidates.
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
         let reached = merge_duplicates(&self.candidates, is_same_optimum);
         let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
