@@ -180,24 +180,24 @@ def test_a_layout_and_the_banks_of_all_its_equations_count_together(monkeypatch,
         search(LAW, [run], **options)
 
 
-HELD = """
-def held():
-    # What getrusage tells of a process begins with what its parent held.
-    with open("/proc/self/status") as told:
-        return int(next(line for line in told if line.startswith("VmHWM")).split()[1])
+PEAK_MEMORY = """
+def peak_memory():
+    # getrusage counts the peak of the parent process too; /proc counts this process only.
+    with open("/proc/self/status") as status:
+        return int(next(line for line in status if line.startswith("VmHWM")).split()[1])
 """
 TOO_LARGE = (
-    HELD
+    PEAK_MEMORY
     + """
 import numpy as np, ftlm
 run = ftlm.Run.from_arrays(inputs={"u": np.ones(65537)}, outputs={"y": np.arange(65537.0)}, step=0.05)
 equation = ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest")
-before = held()
+before = peak_memory()
 try:
     ftlm.search_orders(run, equation, ftlm.order_grid(increment=0.005), coefficients="least-squares", m=1 << 16)
 except ftlm.ModelError as error:
     print(error)
-print(held() - before)
+print(peak_memory() - before)
 """
 )
 
@@ -214,16 +214,16 @@ def test_what_is_too_large_is_refused_before_it_is_allocated(monkeypatch):
 
 
 LONG = (
-    HELD
+    PEAK_MEMORY
     + """
 import numpy as np, sys, ftlm
 with np.load(sys.argv[1]) as kept:
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": kept["u"]}, outputs={"y": kept["y"]})
 structure = ftlm.equation("D^alpha y = a y + b u")
 ftlm.identify(run.window(0, 5), structure, threads=1)
-before = held()
+before = peak_memory()
 found = ftlm.identify(run, structure, threads=1)
-print(found.orders["alpha"], held() - before)
+print(found.orders["alpha"], peak_memory() - before)
 """
 )
 
@@ -248,13 +248,13 @@ INTEGRATE = """
 import resource
 import numpy as np
 from ftlm import kernels
-def held():
+def peak_memory():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 x = np.ones((10_000, 2048))
 kernels.integrate(x[:64], 0.5, step=0.1)
-before = held()
+before = peak_memory()
 out = kernels.integrate(x, 0.5, step=0.1)
-print(held() - before - out.nbytes)
+print(peak_memory() - before - out.nbytes)
 """
 
 

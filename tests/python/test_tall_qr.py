@@ -89,8 +89,12 @@ def spent():
     # Processor time [ns] of each other thread, once all of them sleep.
     while True:
         tasks = [task for task in Path("/proc/self/task").iterdir() if task.name != own]
-        if all((task / "stat").read_text().rsplit(")", 1)[1].split()[0] == "S" for task in tasks):
-            return {task.name: int((task / "schedstat").read_text().split()[0]) for task in tasks}
+        try:
+            if all((task / "stat").read_text().rsplit(")", 1)[1].split()[0] == "S" for task in tasks):
+                return {task.name: int((task / "schedstat").read_text().split()[0]) for task in tasks}
+        except (FileNotFoundError, ProcessLookupError):
+            # A worker of the fit ended between the listing and the reading: look again.
+            pass
         time.sleep(0.05)
 
 rng = np.random.default_rng(0)
