@@ -34,6 +34,7 @@ COUNTS = {
     "Recording.experiment": (0, 1 << 12),
     "OutputSimulation.samples": (0, 1 << 12),
     "OutputSimulation.refine": (2, 1 << 12),
+    "OutputSimulation.fit_past_inputs": (4, 1 << 12),
     "OutputSimulation.fit_initial_states": (1, 16),
 }
 
@@ -458,6 +459,9 @@ class Sound:
     def is_white(self):
         return self.normal(60), self.one(5, 25)
 
+    def variance_inflation(self):
+        return (self.normal(self.one(3, 60)),)
+
     def portmanteau(self):
         return [self.normal(50), self.normal(40)], self.one(5, 20)
 
@@ -526,6 +530,11 @@ class Sound:
     def output_simulation_refine(self):
         target, (_, terms) = self.output_simulation_samples()
         return target, (terms, 1e-3, 1 << 11, self.one(8, 1 << 14), 1 << 30)
+
+    def output_simulation_fit_past_inputs(self):
+        target, _ = self.output_simulation_samples()
+        exponents = self.one([[0.0, 0.5, 1.0]], [[0.0, 1.0]])
+        return target, (exponents, [[0.0]], self.one(True, False), 1e-3, 1 << 11, self.one(8, 1 << 14), 1 << 30)
 
     def output_simulation_exact_samples(self):
         run, _, _, _ = self.output_simulation_new()

@@ -84,6 +84,7 @@ __all__ = [
     "toeplitz_solve",
     "trace_errors",
     "triangular_factor",
+    "variance_inflation",
     "whitening_filter",
 ]
 
@@ -496,6 +497,7 @@ def arx_model(
 def autocovariances(series: Sequence[_Floats], most: int) -> tuple[_Vector, _Vector]: ...
 def portmanteau(series: Sequence[_Floats], lags: int) -> float: ...
 def is_white(series: _Floats, lags: int) -> bool: ...
+def variance_inflation(series: _Floats) -> float: ...
 def chi_squared(degrees: float, quantile: float) -> float: ...
 
 # ------------------------------------------------------------------------------------------------------------ friction
@@ -567,6 +569,18 @@ class OutputSimulation:
         memory: int,
         stop: Stop | None = None,
     ) -> tuple[tuple[_Matrix, list[list[tuple[float, float]]]], int, _Vector]: ...
+    def fit_past_inputs(
+        self,
+        /,
+        exponents: Sequence[Sequence[float]],
+        free: Sequence[Sequence[float]],
+        has_level: bool,
+        tolerance: float,
+        max_pulses: int,
+        long_record_intervals: int,
+        memory: int,
+        stop: Stop | None = None,
+    ) -> list[list[tuple[float, float]]] | None: ...
     def fit_initial_states(
         self, /, start: _Initial, every: int, stop: Stop | None = None
     ) -> list[list[tuple[float, float]]]: ...

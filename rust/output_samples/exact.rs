@@ -42,13 +42,14 @@ impl OutputSimulation {
         let (exponent_list, units, has_level) = match initial {
             InitialTerms::Given(terms) => (terms, Vec::new(), false),
             InitialTerms::Fitted { exponents, has_level } => (&rest, self.unit_terms(exponents)?, *has_level),
+            InitialTerms::UnitResponses { exponents } => (&rest, self.unit_terms(exponents)?, false),
         };
         check_length("initial terms", rest.len(), exponent_list.len())?;
         let exponents = exponent_list.iter().flatten().map(|term| term.0).chain(units.iter().map(|unit| unit.1));
         if !self.has_state_space() || !exponents.into_iter().all(|e| e >= 0.0 && is_integer(e)) {
             return Ok(None);
         }
-        let Some(outputs) = self.respond(exponent_list, true, stop)? else { return Ok(None) };
+        let Some(mut outputs) = self.respond(exponent_list, true, stop)? else { return Ok(None) };
         if (units.is_empty() && !has_level) || !outputs.iter().flatten().all(|v| v.is_finite()) {
             return Ok(Some(OutputSamples { outputs, initial: exponent_list.clone() }));
         }
@@ -60,6 +61,10 @@ impl OutputSimulation {
         let Some(columns) = units.iter().map(unit).collect::<Option<Result<Vec<_>>>>().transpose()? else {
             return Ok(None);
         };
+        if matches!(initial, InitialTerms::UnitResponses { .. }) {
+            outputs.extend(columns.into_iter().flatten());
+            return Ok(Some(OutputSamples { outputs, initial: rest }));
+        }
         fit_initial_terms(&self.recording.compared_rows(1)?, outputs, &units, columns, has_level).map(Some)
     }
 

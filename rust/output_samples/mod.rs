@@ -3,10 +3,11 @@
 //! Samples follow from the pulse means of the outputs before them, and direct feedthrough from the values of the inputs
 //! at the samples. Initial terms are given, or fitted to the measured samples. The step is halved until Richardson
 //! extrapolation has converged; the responses of long records are refined only where they change. Integer orders on
-//! uniform samples need no grid.
+//! uniform samples need no grid. Initial terms that represent past inputs have a prior.
 
 mod exact;
 mod initial_terms;
+mod past_inputs;
 mod refinement;
 mod richardson;
 mod simulation;

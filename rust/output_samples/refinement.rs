@@ -14,7 +14,7 @@ use crate::signal::nonuniform::interpolate_gaps;
 
 /// Pulses per sampling interval of the coarsest grid. With at least two, a sample does not depend on a jump of a
 /// zero-order-hold input at its time.
-const FIRST_REFINEMENT: usize = 2;
+pub(super) const FIRST_REFINEMENT: usize = 2;
 /// Ratio of the end times of successive pieces of a response. The shortest piece has [`MIN_PIECE_INTERVALS`]. With this
 /// ratio, halving the step on a piece costs as much as the whole response on the coarser grid.
 const PIECE_RATIO: usize = 8;
@@ -93,7 +93,7 @@ impl OutputSimulation {
             let last = intervals.saturating_mul(2 * every) > options.max_pulses;
             let OutputSamples { outputs, initial: terms } = match self.samples(every, initial) {
                 // An autoregressive coefficient c meets 1 = c h^α / Γ(α + 2) on one step, not on two.
-                Err(error) if error.kind() == Kind::Model && failures != 1 => self.unknown_samples(),
+                Err(error) if error.kind() == Kind::Model && failures != 1 => self.unknown_samples(initial),
                 long_samples => long_samples?,
             };
             let finite = outputs.iter().flatten().all(|v| v.is_finite());
@@ -120,17 +120,23 @@ impl OutputSimulation {
     fn bytes_per_pulse(&self, initial: &InitialTerms) -> usize {
         let units = match initial {
             InitialTerms::Given(_) => 0,
-            InitialTerms::Fitted { exponents, .. } => exponents.iter().map(Vec::len).sum(),
+            InitialTerms::Fitted { exponents, .. } | InitialTerms::UnitResponses { exponents } => {
+                exponents.iter().map(Vec::len).sum()
+            }
         };
         let n = self.equations.len();
         size_of::<f64>() * (2 * self.recording.channels().len() + (10 * n + 2 * units + 8) * n)
     }
 
     /// Samples that are all NaN, for a grid on which the equations are singular.
-    fn unknown_samples(&self) -> OutputSamples {
+    fn unknown_samples(&self, initial: &InitialTerms) -> OutputSamples {
         let count = self.times.as_ref().map_or(self.recording.len(), Vec::len);
         let n = self.equations.len();
-        OutputSamples { outputs: vec![vec![f64::NAN; count]; n], initial: vec![Vec::new(); n] }
+        let blocks = match initial {
+            InitialTerms::UnitResponses { exponents } => 1 + exponents.iter().map(Vec::len).sum::<usize>(),
+            _ => 1,
+        };
+        OutputSamples { outputs: vec![vec![f64::NAN; count]; n * blocks], initial: vec![Vec::new(); n] }
     }
 }
 
@@ -265,6 +271,11 @@ impl<'a> SampleResponses<'a> {
                 let values: Vec<f64> = terms.iter().flatten().map(|term| term.1).collect();
                 Ok(OutputSamples { outputs: self.superpose(responses, 0, &values), initial: terms.clone() })
             }
+            InitialTerms::UnitResponses { .. } => {
+                let mut outputs = self.superpose(responses, 0, &vec![0.0; self.units.len()]);
+                outputs.extend_from_slice(&responses[n * (self.inputs.len() + self.first_samples().count())..]);
+                Ok(OutputSamples { outputs, initial: vec![Vec::new(); n] })
+            }
             InitialTerms::Fitted { has_level, .. } => {
                 let driven = self.superpose(responses, 0, &vec![0.0; self.units.len()]);
                 if self.units.is_empty() && !has_level {
@@ -293,7 +304,7 @@ fn refine_long_record(
     }
     let exponents = match initial {
         InitialTerms::Given(terms) => terms.iter().map(|own| own.iter().map(|term| term.0).collect()).collect(),
-        InitialTerms::Fitted { exponents, .. } => exponents.clone(),
+        InitialTerms::Fitted { exponents, .. } | InitialTerms::UnitResponses { exponents } => exponents.clone(),
     };
     let Some(responses) = SampleResponses::new(simulation, simulation.unit_terms(&exponents)?, stop) else {
         return Ok(None);

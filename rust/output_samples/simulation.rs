@@ -42,6 +42,12 @@ pub enum InitialTerms {
         /// True if each output also has an unknown level.
         has_level: bool,
     },
+    /// Separate responses instead of their sum: the outputs from rest are followed by the outputs per unit of each term,
+    /// without inputs.
+    UnitResponses {
+        /// Exponents by equation.
+        exponents: Vec<Vec<f64>>,
+    },
 }
 
 /// Model with known orders and coefficients on a recording.
@@ -277,15 +283,22 @@ impl OutputSimulation {
                 return Ok(OutputSamples { outputs, initial: terms.clone() });
             }
             InitialTerms::Fitted { exponents, has_level } => (self.unit_terms(exponents)?, *has_level),
+            InitialTerms::UnitResponses { exponents } => (self.unit_terms(exponents)?, false),
         };
         let rest = vec![Vec::new(); self.equations.len()];
         let (means, responses) = grid.rest_and_units(&units)?;
-        let driven = grid.samples(&means, &rest, true)?;
-        if (units.is_empty() && !has_level) || !driven.iter().flatten().all(|v| v.is_finite()) {
+        let mut driven = grid.samples(&means, &rest, true)?;
+        let is_separate = matches!(initial, InitialTerms::UnitResponses { .. });
+        let is_finite = driven.iter().flatten().all(|v| v.is_finite());
+        if !is_separate && ((units.is_empty() && !has_level) || !is_finite) {
             return Ok(OutputSamples { outputs: driven, initial: rest });
         }
         let columns = units.iter().zip(responses).map(|(unit, means)| grid.unit_samples(*unit, &means));
         let columns = columns.collect::<Result<Vec<_>>>()?;
+        if is_separate {
+            driven.extend(columns.into_iter().flatten());
+            return Ok(OutputSamples { outputs: driven, initial: rest });
+        }
         fit_initial_terms(&self.recording.compared_rows(every)?, driven, &units, columns, has_level)
     }
 

@@ -47,8 +47,8 @@ mod _core {
     #[pymodule_export]
     use crate::python::joint_fit::{
         arx_model, autocovariances, chi_squared, cost_surface, covariance_of, fit_covariance, is_white, joint_fit,
-        joint_multistart, long_run_covariance, portmanteau, prediction_ratio, profile_intervals, whitening_filter,
-        JointMultistart, JointProblem,
+        joint_multistart, long_run_covariance, portmanteau, prediction_ratio, profile_intervals, variance_inflation,
+        whitening_filter, JointMultistart, JointProblem,
     };
 
     #[pymodule_export]

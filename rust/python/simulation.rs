@@ -170,8 +170,11 @@ pub fn kink_correction<'py>(
     Ok(PyArray1::from_vec(py, lacking))
 }
 
-/// Tuple of samples of the outputs as rows, and (exponent, coefficient) of the initial terms by equation.
-type SamplesTuple<'py> = (Bound<'py, PyArray2<f64>>, Vec<Vec<(f64, f64)>>);
+/// (exponent, coefficient) of the initial terms by equation.
+type TermsList = Vec<Vec<(f64, f64)>>;
+
+/// Tuple of samples of the outputs as rows, and the initial terms.
+type SamplesTuple<'py> = (Bound<'py, PyArray2<f64>>, TermsList);
 
 fn samples_tuple<'py>(py: Python<'py>, found: OutputSamples) -> PyResult<SamplesTuple<'py>> {
     Ok((stack_rows(py, &found.outputs)?, found.initial))
@@ -276,6 +279,30 @@ impl OutputSimulation {
         Ok((samples_tuple(py, samples.samples)?, samples.refinement, PyArray1::from_vec(py, samples.change)))
     }
 
+    /// Initial terms that represent past inputs, as (exponent, coefficient) by equation: the posterior mean under a prior
+    /// on these inputs. `exponents` and `free` are the exponents of all terms and of those without a prior, by equation.
+    /// None if a response is not finite.
+    #[pyo3(signature = (exponents, free, has_level, tolerance, max_pulses, long_record_intervals, memory, stop=None))]
+    #[allow(clippy::too_many_arguments)]
+    fn fit_past_inputs(
+        &self,
+        py: Python<'_>,
+        exponents: List<List<f64>>,
+        free: List<List<f64>>,
+        has_level: bool,
+        tolerance: f64,
+        max_pulses: usize,
+        long_record_intervals: usize,
+        memory: usize,
+        stop: Option<&Stop>,
+    ) -> PyResult<Option<TermsList>> {
+        let (inner, exponents, free) = (Arc::clone(&self.inner), to_vectors(exponents), to_vectors(free));
+        let options = Refinement { tolerance, max_pulses, long_record_intervals, memory };
+        run_interruptible(py, usize::MAX, stop, move |stop| {
+            inner.fit_past_inputs(&exponents, &free, has_level, options, stop)
+        })
+    }
+
     /// Fit the initial terms of a model with friction or non-linear terms on a grid; return (exponent, coefficient) by
     /// equation.
     #[pyo3(signature = (start, every, stop=None))]
@@ -285,7 +312,7 @@ impl OutputSimulation {
         start: InitialArg,
         every: usize,
         stop: Option<&Stop>,
-    ) -> PyResult<Vec<Vec<(f64, f64)>>> {
+    ) -> PyResult<TermsList> {
         let (inner, initial) = (Arc::clone(&self.inner), initial(start)?);
         run_interruptible(py, usize::MAX, stop, move |stop| inner.fit_initial_states(initial, every, stop))
     }

@@ -134,6 +134,28 @@ pub fn autocovariances(series: &[&[f64]], most: usize) -> (Vec<f64>, Vec<f64>) {
     (sums, pairs)
 }
 
+/// Variance of a sum of the values of a series relative to that for white noise, at least 1 (Bartlett window).
+///
+/// The window has 4 N^(1/3) lags. The series has no missing samples.
+///
+/// ```
+/// let slow: Vec<f64> = (0..1000).map(|t| f64::from(t / 10 % 2)).collect();
+/// assert_eq!(ftlm::signal::statistics::variance_inflation(&[1.0]), 1.0);
+/// assert!(ftlm::signal::statistics::variance_inflation(&slow) > 1.5);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub fn variance_inflation(series: &[f64]) -> f64 {
+    let lags = ((4.0 * (series.len() as f64).powf(1.0 / 3.0)) as usize).min(series.len().saturating_sub(1));
+    if lags < 2 {
+        return 1.0;
+    }
+    let (covariances, pairs) = autocovariances(&[series], lags - 1);
+    let power = covariances[0] * pairs[0];
+    let weighted = (1..lags).map(|lag| (1.0 - lag as f64 / lags as f64) * covariances[lag] * pairs[lag]);
+    1.0_f64.max(1.0 + 2.0 * weighted.sum::<f64>() / if power > 0.0 { power } else { 1.0 })
+}
+
 /// Series minus its mean; 0 at missing samples.
 fn subtract_mean(values: &[f64]) -> Vec<f64> {
     let finite: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();

@@ -27,6 +27,7 @@ mod levenberg_marquardt;
 mod metrics;
 mod nonuniform_samples;
 mod output_error;
+mod output_samples;
 mod plants;
 mod pulse_means;
 mod rig;

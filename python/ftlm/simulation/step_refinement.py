@@ -25,17 +25,23 @@ from ftlm.simulation.output_samples import (
     OutputSamples,
     Terms,
     add_levels,
+    initial_names,
     measured_samples,
     named_terms,
     nonuniform_sample_times,
     output_simulation,
     with_initial_conditions,
 )
-from ftlm.simulation.past_inputs import LONG_RECORD_INTERVALS, fit_history
 from ftlm.structure.structure import History
 from ftlm.utils.resources import memory_limit, stop_flag
 from ftlm.utils.statistics import is_white
 from ftlm.utils.validation import Floats
+
+#: Minimum number of intervals of a long record. Below it, refinement of the whole grid costs no more.
+LONG_RECORD_INTERVALS = 1 << 14
+#: Change on halving the step at which the refinement of a response to past inputs terminates, relative to its largest
+#: value.
+RESPONSE_CHANGE = 1e-5
 
 
 def simulate_refined(
@@ -122,7 +128,7 @@ def _simulate_refined(
     if exact is not None:
         return OutputSamples(exact[0], named_terms(model, exact[1]), 1, np.zeros(len(model.outputs)))
     if initial is None and isinstance(resolve_initial_conditions(run, model.structure), History):
-        terms = fit_history(core, model, run, terms, run.time if times is None else times, max_m) or terms
+        terms = _fit_past_inputs(core, model, terms, max_m) or terms
     # Given to the core, initial terms are powers of time alone.
     levels = {o: dict(own).get(LEVEL_EXPONENT, 0.0) for o, own in zip(model.outputs, terms[1], strict=True)}
     powers = (terms[0], [[term for term in own if term[0] != LEVEL_EXPONENT] for own in terms[1]], terms[2])
@@ -133,6 +139,22 @@ def _simulate_refined(
         return OutputSamples(outputs, named_terms(model, initial_values), refinement, change)
     initial_terms = {o: {**own, LEVEL_EXPONENT: 0.0} for o, own in named_terms(model, initial_values).items()}
     return OutputSamples(*add_levels(model, levels, outputs, initial_terms), refinement, change)
+
+
+def _fit_past_inputs(
+    core: _core.OutputSimulation, model: Model, terms: InitialTermsTuple, max_m: int
+) -> InitialTermsTuple | None:
+    """Return initial terms that represent past inputs, under a prior on these inputs; None if a response is not finite.
+
+    `terms` are the names of the initial terms. Initial values by Caputo's definition have no prior.
+    """
+    names = initial_names(model, "caputo")
+    free = [[exponent for output, exponent in names if output == o] for o in model.outputs]
+    exponents = [sorted({*ours, *(e for e, _ in own)}) for ours, own in zip(free, terms[1], strict=True)]
+    history = core.fit_past_inputs(
+        exponents, free, terms[2], RESPONSE_CHANGE, max_m, LONG_RECORD_INTERVALS, memory_limit(), stop_flag()
+    )
+    return None if history is None else (False, history, False)
 
 
 def exact_samples(

@@ -22,11 +22,6 @@ def projections(columns: Floats, row: Floats) -> Floats:
     return np.asarray(np.einsum("ij,i->j", columns, row))
 
 
-def linear_combinations(columns: Floats, amounts: Floats) -> Floats:
-    """Return the sum of the columns multiplied by amounts; for a matrix of amounts, one sum for each of its columns."""
-    return np.asarray(np.einsum("ij,j...->i...", columns, amounts))
-
-
 def vector_norm(row: Floats) -> float:
     """Return the Euclidean norm of a vector."""
     return float(np.sqrt(dot(row, row)))

@@ -140,11 +140,7 @@ def chi_squared_99(degrees: int) -> float:
 
 def variance_inflation(series: Floats) -> float:
     """Return the variance of a sum of the series' values relative to that for white noise, at least 1 (Bartlett)."""
-    lags = min(int(4 * series.size ** (1.0 / 3.0)), series.size - 1)
-    if lags < 2:
-        return 1.0
-    correlations = autocorrelations([series], lags - 1)[0][1:]
-    return max(1.0, 1.0 + 2.0 * float(np.sum((1.0 - np.arange(1, lags) / lags) * correlations)))
+    return _core.variance_inflation(series)
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:

@@ -11,5 +11,5 @@ pub use problem::JointProblem;
 pub use profile::{cost_surface, profile_intervals};
 pub use residuals::{
     arx_model, autocovariances, chi_squared, covariance_of, fit_covariance, is_white, long_run_covariance, portmanteau,
-    prediction_ratio, whitening_filter,
+    prediction_ratio, variance_inflation, whitening_filter,
 };

@@ -158,6 +158,14 @@ pub fn portmanteau(py: Python<'_>, series: List<PyReadonlyArray1<'_, f64>>, lags
     })
 }
 
+/// Variance of a sum of the values of a series relative to that for white noise, at least 1.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn variance_inflation(py: Python<'_>, series: PyReadonlyArray1<'_, f64>) -> PyResult<f64> {
+    let series = copy_vector("series", &series)?;
+    run_interruptible(py, series.len(), None, move |_| Ok(statistics::variance_inflation(&series)))
+}
+
 /// Return true if the autocorrelations of a series are consistent with white noise.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]

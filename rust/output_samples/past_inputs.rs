@@ -1,0 +1,289 @@
+//! Initial terms that represent the past inputs of a run, under a Gaussian prior on these inputs.
+//!
+//! Before the first sample, each equation has an unknown zero-mean Gaussian input. It is piecewise constant on octaves
+//! of time, over [`PAST_LENGTHS`] lengths of the run. Its variance, relative to the response to the inputs of the run,
+//! maximizes the marginal likelihood (empirical Bayes). Without the prior, free initial terms would absorb errors of the
+//! model. Initial values by Caputo's definition and levels of the outputs have no prior.
+
+use std::sync::Arc;
+
+use super::initial_terms;
+use super::refinement::{Refinement, FIRST_REFINEMENT};
+use super::richardson::{add_multiple, combine, Rows};
+use super::simulation::{InitialTerms, OutputSimulation, Terms};
+use crate::equation::{Equation, Structure, Term};
+use crate::error::{check_length, Error, Kind, Result};
+use crate::linalg::dense::{minimum_norm_solution, singular_values, SingularValues};
+use crate::linalg::orthogonal::{norm, project_out};
+use crate::parallel::Stop;
+use crate::recording::{Channel, Recording, Role};
+use crate::signal::block_pulse::Intersample;
+use crate::signal::nonuniform::interpolate;
+use crate::signal::statistics::{inner, mean, variance_inflation};
+
+/// Length of the past that is modeled, in lengths of the run.
+const PAST_LENGTHS: usize = 4;
+/// Standard deviations of past inputs to choose from. With 1, their response at the first sample is as large as the root
+/// mean square of the response to the inputs of the run.
+const PAST_INPUT_SIZES: [f64; 6] = [0.0, 0.03, 0.1, 0.3, 1.0, 3.0];
+/// Ratio to the largest singular value below which a singular value of responses is rounding.
+const MIN_SINGULAR_VALUE_RATIO: f64 = 1e-10;
+
+/// Columns of weighted samples that initial terms are fitted with.
+struct WeightedColumns {
+    /// Columns of unit norm.
+    columns: Rows,
+    /// Norm of each column before the division by it.
+    norms: Vec<f64>,
+    /// Column numbers of the terms without a prior.
+    free: Vec<usize>,
+}
+
+impl OutputSimulation {
+    /// Return the posterior mean of the initial terms that represent past inputs: (exponent, coefficient) by equation.
+    ///
+    /// `exponents` are those of all powers of time by equation, `free` those without a prior. With `has_level`, the level
+    /// of each output is a further term without a prior, with the exponent ∞. None if a response is not finite.
+    ///
+    /// # Errors
+    /// As [`OutputSimulation::refine`]; [`Error::Length`] for exponents of another number of equations.
+    ///
+    /// ```
+    /// use ftlm::equation::{Equation, Structure, Term};
+    /// use ftlm::output_samples::{InitialTerms, OutputSimulation, Refinement};
+    /// use ftlm::parallel::Stop;
+    /// use ftlm::recording::{Channel, Recording, Role};
+    /// // D^0.5 y = −y after a unit step of an unknown input, which lasted 2 s and ended at the first sample.
+    /// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 0, order: 0.0 }] };
+    /// let options = Refinement { tolerance: 1e-6, max_pulses: 1 << 14, long_record_intervals: 1 << 14, memory: 1 << 30 };
+    /// let decay = |t: f64| t.exp() * libm::erfc(t.sqrt());
+    /// let y: Vec<f64> = (0..200).map(|k| 0.05 * f64::from(k)).map(|t| decay(t) - decay(t + 2.0)).collect();
+    /// let run = Recording::new("run", 0.05, None, vec![Channel::new("y", y.clone(), Role::Output)], vec![0])?;
+    /// let simulation = OutputSimulation::new(run.into(), vec![Equation::new(structure, vec![-1.0])?], Vec::new(), None)?;
+    /// let exponents = [vec![0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0]];
+    /// let terms = simulation.fit_past_inputs(&exponents, &[vec![0.0]], false, options, &Stop::default())?;
+    /// let fit = simulation.refine(&InitialTerms::Given(terms.unwrap_or_default()), options, &Stop::default())?.samples;
+    /// assert!(fit.outputs[0].iter().zip(&y).all(|(fitted, y)| (fitted - y).abs() < 2e-3));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn fit_past_inputs(
+        &self,
+        exponents: &[Vec<f64>],
+        free: &[Vec<f64>],
+        has_level: bool,
+        options: Refinement,
+        stop: &Stop,
+    ) -> Result<Option<Terms>> {
+        let n = self.equations.len();
+        check_length("exponents without a prior", n, free.len())?;
+        let units = self.unit_terms(exponents)?;
+        let initial = InitialTerms::UnitResponses { exponents: exponents.to_vec() };
+        let responses = self.refine(&initial, options, stop)?.samples.outputs;
+        let Some(past) = self.past_responses(options, stop)? else { return Ok(None) };
+        if !responses.iter().flatten().all(|v| v.is_finite()) {
+            return Ok(None);
+        }
+        let measured = self.recording.compared_rows(FIRST_REFINEMENT)?;
+        let weights: Vec<f64> = measured.iter().map(|row| initial_terms::weight(row)).collect();
+        // Weighted samples of all outputs at which an output was measured.
+        let weighted = |rows: &[Vec<f64>]| -> Vec<f64> {
+            let of = |((row, output), weight)| {
+                let measured = std::iter::zip::<&Vec<f64>, &Vec<f64>>(row, output).filter(|(_, y)| !y.is_nan());
+                measured.map(move |(v, _): (&f64, &f64)| weight * v)
+            };
+            rows.iter().zip(&measured).zip(&weights).flat_map(of).collect()
+        };
+        let mut blocks = responses.chunks(n);
+        let driven = blocks.next().unwrap_or_default();
+        let mut names = units.clone();
+        let mut columns: Vec<Vec<f64>> = blocks.map(&weighted).collect();
+        for i in 0..if has_level { n } else { 0 } {
+            names.push((i, f64::INFINITY));
+            columns.push(weighted(
+                &(0..n).map(|j| vec![f64::from(u8::from(i == j)); measured[j].len()]).collect::<Rows>(),
+            ));
+        }
+        let norms: Vec<f64> = columns.iter().map(|column| norm(column)).collect();
+        let used: Vec<usize> = (0..names.len()).filter(|&k| norms[k] > 0.0).collect();
+        let is_free = |(i, exponent): (usize, f64)| exponent.is_infinite() || free[i].contains(&exponent);
+        let terms = WeightedColumns {
+            columns: used.iter().map(|&k| columns[k].iter().map(|v| v / norms[k]).collect()).collect(),
+            norms: used.iter().map(|&k| norms[k]).collect(),
+            free: (0..used.len()).filter(|&k| is_free(names[used[k]])).collect(),
+        };
+        let is_driven = driven.iter().flatten().any(|v| *v != 0.0);
+        let target = weighted(&combine(&measured, &driven.to_vec(), |y, v| y - v));
+        let groups = past.iter().map(|octaves| {
+            let first =
+                |rows: &Rows| rows.iter().zip(&weights).map(|(row, weight)| (weight * row[0]).powi(2)).sum::<f64>();
+            (octaves.iter().map(first).sum(), octaves.iter().map(|rows| weighted(rows)).collect())
+        });
+        let values = terms.fit(&target, is_driven.then(|| weighted(driven)), &groups.collect::<Vec<_>>())?;
+        let mut found = vec![Vec::new(); n];
+        for (&k, value) in used.iter().zip(values) {
+            found[names[k].0].push((names[k].1, value));
+        }
+        Ok(Some(found))
+    }
+
+    /// Responses of all outputs to unit inputs, by equation and octave of past time, at the compared samples. None if a
+    /// response is not finite.
+    fn past_responses(&self, options: Refinement, stop: &Stop) -> Result<Option<Vec<Vec<Rows>>>> {
+        let (n, rows) = (self.equations.len(), self.recording.len());
+        let past = PAST_LENGTHS * rows;
+        let octaves = std::iter::successors(Some(1), |k| Some(2 * k)).take_while(|k| *k < past);
+        let octaves: Vec<usize> = std::iter::once(0).chain(octaves).chain([past]).collect();
+        let rest = InitialTerms::Given(vec![Vec::new(); n]);
+        let mut responses = Vec::with_capacity(n);
+        for driven in 0..n {
+            let simulation = self.unit_step(driven, rows + past)?;
+            let steps = match simulation.exact_samples(&rest, stop) {
+                Ok(None) => simulation.refine(&rest, options, stop).map(|refined| refined.samples.outputs),
+                Ok(Some(samples)) => Ok(samples.outputs),
+                Err(error) => Err(error),
+            };
+            let steps = match steps {
+                Err(error) if !matches!(error.kind(), Kind::Interrupted | Kind::Internal) => return Ok(None),
+                steps => steps?,
+            };
+            if !steps.iter().flatten().all(|v| v.is_finite()) {
+                return Ok(None);
+            }
+            let shifted: Vec<Rows> =
+                octaves.iter().map(|&k| steps.iter().map(|row| self.samples_after(row, k)).collect()).collect();
+            responses.push(shifted.windows(2).map(|pair| combine(&pair[1], &pair[0], |new, old| new - old)).collect());
+        }
+        Ok(Some(responses))
+    }
+
+    /// Values of uniform samples, `rows` sampling intervals after the sample times of the simulation.
+    fn samples_after(&self, samples: &[f64], rows: usize) -> Vec<f64> {
+        let Some(times) = &self.times else { return samples[rows..rows + self.recording.len()].to_vec() };
+        let grid: Vec<f64> = (0..samples.len()).map(|k| self.recording.step() * k as f64).collect();
+        let later: Vec<f64> = times.iter().map(|time| time + self.recording.step() * rows as f64).collect();
+        later.iter().map(|time| interpolate(*time, &grid, samples)).collect()
+    }
+
+    /// Simulation of a unit step in one equation, from rest, without the inputs of the run.
+    fn unit_step(&self, driven: usize, rows: usize) -> Result<Self> {
+        let outputs = self.recording.outputs();
+        let own = |signal: usize, i: usize| {
+            let output = outputs.iter().position(|output| *output == signal);
+            output.filter(|&output| output == i || self.recording.is_coupled)
+        };
+        let equation = |(i, item): (usize, &Equation)| {
+            let given = item.structure.terms.iter().zip(&item.coefficients);
+            let given = given.filter_map(|(term, c)| own(term.signal, i).map(|signal| (Term { signal, ..*term }, *c)));
+            let forcing = (i == driven).then_some((Term { signal: outputs.len(), order: 0.0 }, 1.0));
+            let (terms, coefficients) = given.chain(forcing).unzip();
+            Equation::new(Structure { output: i, order: item.structure.order, terms }, coefficients)
+        };
+        let output = |signal: &usize| {
+            let channel = &self.recording.channels()[*signal];
+            Channel { is_filtered: channel.is_filtered, ..Channel::new(&channel.name, vec![0.0; rows], Role::Output) }
+        };
+        let forcing = Channel::new("past input", vec![1.0; rows], Role::Input(Intersample::Hold));
+        let channels: Vec<Channel> = outputs.iter().map(output).chain([forcing]).collect();
+        let filter = self.recording.filter.clone().filter(|_| channels.iter().any(|channel| channel.is_filtered));
+        let mut recording =
+            Recording::new(self.recording.name(), self.recording.step(), None, channels, (0..outputs.len()).collect())?;
+        recording.filter = filter;
+        recording.is_coupled = self.recording.is_coupled;
+        let equations = self.equations.iter().enumerate().map(equation).collect::<Result<Vec<_>>>()?;
+        Self::new(Arc::new(recording), equations, Vec::new(), None)
+    }
+}
+
+impl WeightedColumns {
+    /// Coefficients of all terms in a target. `driven` are the weighted samples of the response to the inputs, `groups`
+    /// the sum of squares of the first samples and the octave responses of each equation.
+    fn fit(&self, target: &[f64], driven: Option<Vec<f64>>, groups: &[(f64, Rows)]) -> Result<Vec<f64>> {
+        let space = decompose(&self.columns)?;
+        let free: Rows = self.free.iter().map(|&k| self.columns[k].clone()).collect();
+        let basis = if free.is_empty() { Vec::new() } else { significant(decompose(&free)?).0 };
+        let without = |mut column: Vec<f64>| {
+            project_out(&basis, &mut column);
+            column
+        };
+        let remainder = without(target.to_vec());
+        // If no input changes, only the past moves the output.
+        let reference = driven.map_or_else(|| remainder.clone(), without);
+        let size = mean(&reference.iter().map(|v| v * v).collect::<Vec<_>>());
+        let (left, values, right) = {
+            let whole = space.right.clone();
+            let (left, values) = significant(space);
+            let right: Rows = whole.into_iter().take(values.len()).collect();
+            (left, values, right)
+        };
+        // Coefficients of the terms that reproduce the response to each octave.
+        let mixing: Rows = (groups.iter())
+            .flat_map(|(first, octaves)| {
+                let scale = if *first > 0.0 { (size / first).sqrt() } else { 0.0 };
+                octaves.iter().map(move |octave| (scale, octave))
+            })
+            .map(|(scale, octave)| {
+                let amounts = left.iter().zip(&values).map(|(u, value)| scale * inner(u, octave) / value);
+                sum_of_multiples(&right, &amounts.collect::<Vec<_>>(), self.columns.len())
+            })
+            .collect();
+        let shapes: Rows =
+            mixing.iter().map(|amounts| without(sum_of_multiples(&self.columns, amounts, target.len()))).collect();
+        let mut values = sum_of_multiples(&mixing, &posterior_mean(&shapes, &remainder)?, self.columns.len());
+        let explained = sum_of_multiples(&self.columns, &values, target.len());
+        let left: Vec<f64> = target.iter().zip(explained).map(|(y, v)| y - v).collect();
+        let offsets = minimum_norm_solution(&free, &left, MIN_SINGULAR_VALUE_RATIO).ok_or_else(not_decomposed)?;
+        self.free.iter().zip(offsets).for_each(|(&k, value)| values[k] += value);
+        Ok(values.iter().zip(&self.norms).map(|(value, norm)| value / norm).collect())
+    }
+}
+
+/// Posterior mean of the coefficients of columns in a target, under independent normal priors of one variance.
+///
+/// The variance of the prior maximizes the marginal likelihood. What the columns do not explain is noise, whose variance
+/// is increased for autocorrelation.
+fn posterior_mean(columns: &[Vec<f64>], target: &[f64]) -> Result<Vec<f64>> {
+    let SingularValues { left, values, right } = decompose(columns)?;
+    let along: Vec<f64> = left.iter().map(|u| inner(u, target)).collect();
+    let explained = sum_of_multiples(&left, &along, target.len());
+    let noise: Vec<f64> = target.iter().zip(explained).map(|(y, v)| y - v).collect();
+    let variance = mean(&noise.iter().map(|v| v * v).collect::<Vec<_>>()) * variance_inflation(&noise);
+    let ratios =
+        |of: &dyn Fn(f64) -> f64| -> Vec<f64> { along.iter().zip(&values).map(|(a, value)| a * of(*value)).collect() };
+    if variance.is_nan() || variance <= 0.0 {
+        let exact = ratios(&|value| if value > 0.0 { 1.0 / value } else { 0.0 });
+        return Ok(sum_of_multiples(&right, &exact, columns.len()));
+    }
+    let power = |size: f64, value: f64| (size * value).powi(2);
+    let cost = |size: &f64| -> f64 {
+        let terms = along
+            .iter()
+            .zip(&values)
+            .map(|(a, value)| a * a / (variance + power(*size, *value)) + (power(*size, *value) / variance).ln_1p());
+        terms.sum()
+    };
+    let best = PAST_INPUT_SIZES.into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).unwrap_or(0.0);
+    let means = ratios(&|value| best * best * value / (variance + power(best, value)));
+    Ok(sum_of_multiples(&right, &means, columns.len()))
+}
+
+/// Singular values of columns of equal length.
+fn decompose(columns: &[Vec<f64>]) -> Result<SingularValues> {
+    singular_values(columns).ok_or_else(not_decomposed)
+}
+
+fn not_decomposed() -> Error {
+    Error::Internal { what: "singular values of responses to past inputs that do not converge".into() }
+}
+
+/// Left singular vectors and singular values above rounding.
+fn significant(all: SingularValues) -> (Rows, Vec<f64>) {
+    let least = MIN_SINGULAR_VALUE_RATIO * all.values.first().copied().unwrap_or(0.0);
+    all.left.into_iter().zip(all.values).filter(|(_, value)| *value > least).unzip()
+}
+
+/// Sum of multiples of columns of a given length.
+fn sum_of_multiples(columns: &[Vec<f64>], amounts: &[f64], length: usize) -> Vec<f64> {
+    let mut sum = vec![0.0; length];
+    columns.iter().zip(amounts).for_each(|(column, amount)| add_multiple(&mut sum, *amount, column));
+    sum
+}
