@@ -1,6 +1,7 @@
-//! Regression under autoregressive noise by generalized least squares, and the likelihood ratio of two of them.
+//! Generalized least squares under autoregressive noise, and the likelihood ratio of two nested regressions.
 //!
-//! Predictions one step ahead are compared, because a random walk has a mean as large as itself, but white increments.
+//! Only one-step-ahead predictions are compared. The mean of a random walk is as large as the walk itself, but its
+//! increments are white.
 
 use std::ops::Range;
 
@@ -9,24 +10,27 @@ use crate::linalg::dense::{minimum_norm_solution, triangular_factor};
 use crate::parallel::Stop;
 use crate::signal::statistics::inner;
 
-/// Maximum number of alternations between the fit of the noise and the regression under that noise.
+/// Maximum number of alternations between the fit of the noise model and the fit of the regression.
 const MAX_ALTERNATIONS: usize = 4;
-/// Samples of the shortest run for each lag of an autoregression.
+/// Number of samples that the shortest run must have per lag of the autoregression.
 const SAMPLES_PER_LAG: usize = 10;
-/// Rows of the lagged residuals that are stored at a time.
+/// Number of rows of lagged residuals per block of the QR factorization.
 const BLOCK_ROWS: usize = 1 << 14;
-/// Singular values of whitened columns, relative to the largest one, below which they are collinear.
+/// Singular value, relative to the largest one, below which whitened regression columns count as collinear.
 const RANK_TOLERANCE: f64 = 1e-10;
 
-/// Twice the logarithm of the likelihood ratio of two nested regressions under autoregressive noise, at least 0.
+/// Return twice the log-likelihood ratio of two nested regressions under autoregressive noise, at least 0.
 ///
-/// `residuals` are regressed on the columns `few` and `many`, each set orthonormal. `outputs` are the samples of each
-/// run by output; the noise of each output has at most `most` lags. The order of the noise is chosen for each set alone,
-/// because an autoregression of high order can imitate a missing column. The larger order limits both final fits, which
-/// predict the same samples. O(k² N) for k columns or lags.
+/// `residuals` (N samples) are regressed on the columns `few` and on the columns `many`. Each set of columns is
+/// orthonormal. `outputs` contains, for each output, the index range of each run in `residuals`. Each output has its
+/// own autoregressive noise of at most `most` lags. The noise order is first selected for each set of columns
+/// separately, because an autoregression of high order can imitate a missing column. The larger of the two orders then
+/// limits both final fits, so that they predict the same samples. The cost is O(k² N) for k columns or lags.
 ///
 /// # Errors
-/// [`Error::Length`] for a column of another length, [`Error::Interrupted`].
+/// [`Error::Length`] if a column has another length than `residuals`, or if a range ends beyond the residuals.
+/// [`Error::Internal`] if the singular values of the whitened columns do not converge. [`Error::Interrupted`] after a
+/// stop request.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -69,10 +73,11 @@ pub fn prediction_ratio(
     Ok((fit(few, &common)?.0 - fit(many, &common)?.0).max(0.0))
 }
 
-/// Noise criterion after regression on columns, summed over outputs, and the order of the noise of each output.
+/// Return the noise criterion after regression on `columns`, summed over outputs, and the noise order of each output.
 ///
-/// Generalized least squares and the fit of autoregressions alternate until the criterion no longer decreases. `limits`
-/// are the largest order of each output and the first predicted sample of each run.
+/// The criterion is that of [`Autoregression`]. Generalized least squares and the fit of the autoregressions alternate
+/// until the criterion no longer decreases. `limits` contains the maximum noise order of each output. This number is
+/// also the index of the first predicted sample in each run.
 fn noise_criterion(
     columns: &[Vec<f64>],
     residuals: &[f64],
@@ -115,23 +120,25 @@ fn add_multiple(sum: &mut [f64], factor: f64, values: &[f64]) {
     sum.iter_mut().zip(values).for_each(|(sum, v)| *sum += factor * v);
 }
 
-/// Autoregression without a constant.
+/// Autoregressive model of a series, without a constant term.
 struct Autoregression {
-    /// Whitening filter 1, a₁, …, aₙ.
+    /// Whitening filter 1, a₁, …, aₙ: the weights of the current sample and of the n previous ones.
     filter: Vec<f64>,
-    /// Standard deviation of the prediction errors.
+    /// Standard deviation of the one-step prediction errors, in the unit of the series.
     deviation: f64,
-    /// Samples times the logarithm of the innovation variance, and a penalty of the order.
+    /// Number of samples times the log innovation variance, plus twice the order, plus a penalty.
     criterion: f64,
 }
 
 impl Autoregression {
-    /// Autoregression of lower criterion: of the series, or of their increments, whose root is fixed at 1.
+    /// Fit an autoregression to the series and one to their increments, and return the one with the lower criterion.
     ///
-    /// Both are fitted by least squares from sample `most` of each series on. Orders minimize Akaike's criterion, because
-    /// white noise on a random walk needs many lags. The criterion of the series is larger by the logarithm of the number
-    /// of samples: an estimated root near 1 is biased downward, so that a random walk would pass for stationary noise
-    /// about a mean. Series are not centered, because their mean is what is tested.
+    /// The model of the increments has a root fixed at 1 (a random walk). Both models are fitted by least squares and
+    /// predict the samples of each series from index `most` on. The order minimizes Akaike's criterion, because white
+    /// noise on a random walk needs many lags. The model of the series itself is penalized by the logarithm of the
+    /// number of samples. Without this penalty, a random walk would pass for stationary noise about a mean, because an
+    /// estimated root near 1 is biased downward. The series are not centered, because their mean is the quantity under
+    /// test.
     #[allow(clippy::cast_precision_loss)]
     fn fit(series: &[&[f64]], most: usize) -> Self {
         let size = most + 1;
@@ -139,7 +146,8 @@ impl Autoregression {
         for values in series {
             for start in (most..values.len()).step_by(BLOCK_ROWS) {
                 let end = (start + BLOCK_ROWS).min(values.len());
-                // Lags first, the predicted sample last: each order is a part of one triangular factor.
+                // The columns are the lags and then the predicted sample, so that one triangular factor contains the
+                // fit of every order.
                 let column = |j: usize| {
                     let lag = if j < most { j + 1 } else { 0 };
                     let above = (0..size).map(|i| factor[i * size + j]);
@@ -166,10 +174,12 @@ impl Autoregression {
         }
     }
 
-    /// Autoregression of the order that minimizes count·log(variance) + 2·order + `penalty`.
+    /// Return the autoregression of the order that minimizes count·log(variance) + 2·order + `penalty`.
     ///
-    /// The triangular factor has the lags first and the predicted sample last: regression on the first k columns leaves
-    /// the last column from row k on. `difference` is the filter that the series passed before, and part of the result.
+    /// `factor` is a triangular factor (size × size, row-major) whose columns are the lags and then the predicted
+    /// sample. After regression on the first k lags, the residual is the last column from row k on. The series have
+    /// already passed the filter `difference`. The returned filter is the product of `difference` and the estimated
+    /// filter.
     #[allow(clippy::cast_precision_loss)]
     fn of_best_order(factor: &[f64], size: usize, count: usize, difference: &[f64], penalty: f64) -> Self {
         let last: Vec<f64> = (0..size).map(|i| factor[i * size + size - 1]).collect();
@@ -190,7 +200,7 @@ impl Autoregression {
         self.filter.len() - 1
     }
 
-    /// Prediction errors of a series in their standard deviations, from a sample on.
+    /// Return the prediction errors of the samples from index `first` on, divided by their standard deviation.
     fn whiten(&self, series: &[f64], first: usize) -> Vec<f64> {
         let error = |t: usize| self.filter.iter().enumerate().map(|(k, a)| a * series[t - k]).sum::<f64>();
         (first..series.len()).map(|t| error(t) / self.deviation).collect()
@@ -212,7 +222,7 @@ mod tests {
         let fit = Autoregression::fit(&[&walk], 10);
         assert!(fit.filter.iter().sum::<f64>().abs() < 1e-12);
         assert!((fit.deviation - (1.0_f64 / 12.0).sqrt()).abs() < 0.02);
-        // The prediction errors of a walk are its increments in their standard deviation.
+        // The prediction errors of a random walk are its increments divided by their standard deviation.
         let errors = fit.whiten(&walk, 20);
         let mean_square = inner(&errors, &errors) / 481.0;
         assert!(errors.len() == 481 && (mean_square - 1.0).abs() < 0.1);

@@ -1,4 +1,4 @@
-//! Equation-error least squares at given orders, by QR of the regressors.
+//! Equation-error least squares at given orders, by QR factorization of the regressors.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, Error, Result};
@@ -6,40 +6,45 @@ use crate::linalg::dense;
 use crate::linalg::small::back_substitute;
 use crate::regressors::Record;
 
-/// Relative norm of a column outside the span of the previous ones below which it is linearly dependent.
+/// Norm of a unit column outside the span of the previous ones below which it counts as linearly dependent.
 const RANK_TOLERANCE: f64 = 1e-12;
 
 /// Least-squares estimate of one equation.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Estimate {
-    /// One per term; fixed coefficients as given.
+    /// Coefficients, one per term. A fixed coefficient has the given value.
     pub coefficients: Vec<f64>,
-    /// Coefficients of the initial terms, per record, in the sequence of the exponents; 0 if excluded.
+    /// Coefficients of the initial terms by record, in the sequence of `exponents`; 0 for an excluded term.
     pub initial: Vec<Vec<f64>>,
-    /// Exponents of the initial terms.
+    /// Exponents of the initial terms (powers of time).
     pub exponents: Vec<f64>,
-    /// (record, position) of the initial terms excluded as linearly dependent.
+    /// Initial terms excluded as linearly dependent, as pairs of record index and exponent index.
     pub dropped: Vec<(usize, usize)>,
 }
 
-/// Regression of an equation over several records: stacked columns and target.
+/// Regression of an equation over several records, which are stacked in columns and target.
 pub struct Regression {
-    /// Free terms, then the initial terms of each record.
+    /// Columns of the free terms, then of the initial terms of each record.
     pub columns: Vec<Vec<f64>>,
-    /// y minus the terms with fixed coefficients.
+    /// Output minus the terms with fixed coefficients.
     pub target: Vec<f64>,
-    /// Index of each record's first row, then the total number of rows.
+    /// Index of the first row of each record, then the total number of rows.
     pub starts: Vec<usize>,
     exponents: Vec<f64>,
     fixed: Vec<Option<f64>>,
 }
 
 impl Regression {
-    /// Build the regressors I^{α−ν} s of an equation, and t^e per record.
+    /// Return the regression of an equation on given records.
+    ///
+    /// The regressors are the signals of the terms, each integrated with order α − ν, and the powers of time of each
+    /// record. α is the order of the equation, and ν that of the term.
     ///
     /// # Errors
-    /// [`Error::Length`] if `fixed` does not match the terms or there is no record; as [`Structure::check`].
+    /// [`Error::Length`] if `fixed` does not have one entry per term or there is no record. [`Error::NotFinite`] if a
+    /// fixed coefficient is not finite. [`Error::OutOfRange`] for an invalid order or exponent. [`Error::Structure`]
+    /// for a signal that does not exist.
     pub fn new(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Self> {
         check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
         if records.is_empty() {
@@ -80,16 +85,18 @@ impl Regression {
         Ok(Self { columns, target, starts, exponents, fixed: fixed.to_vec() })
     }
 
-    /// Number of free coefficients of terms.
+    /// Number of free coefficients of the terms.
     #[must_use]
     pub fn free_count(&self) -> usize {
         self.fixed.iter().filter(|f| f.is_none()).count()
     }
 
-    /// Convert a solution (free coefficients, then initial terms by record) to an [`Estimate`].
+    /// Convert a solution (free coefficients, then coefficients of the initial terms by record) to an [`Estimate`].
+    ///
+    /// `dropped` contains the indices of excluded columns.
     ///
     /// # Errors
-    /// [`Error::Length`] for a solution of another length; [`Error::Structure`] for a dropped column that is no initial
+    /// [`Error::Length`] for a solution of another length. [`Error::Structure`] if an excluded column is not an initial
     /// term.
     pub fn estimate(&self, solution: &[f64], dropped: &[usize]) -> Result<Estimate> {
         let first = self.free_count();
@@ -111,10 +118,13 @@ impl Regression {
 
 /// Fit the coefficients of an equation to one or several records, each with its own initial terms.
 ///
-/// `fixed` contains the values of the fixed coefficients. O(k² Σm).
+/// `fixed` has one entry per term: the value of a fixed coefficient, None for a free one. The cost is O(k² Σm) for k
+/// columns and records of m pulses.
 ///
 /// # Errors
-/// [`Error::Singular`] with the first linearly dependent free term; [`Error::Length`].
+/// [`Error::Singular`] with the index of the first linearly dependent free term. [`Error::Length`] if `fixed` does not
+/// have one entry per term or there is no record. [`Error::NotFinite`] if a fixed coefficient is not finite.
+/// [`Error::OutOfRange`] for an invalid order or exponent. [`Error::Structure`] for a signal that does not exist.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -139,12 +149,14 @@ pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], ini
     regression.estimate(&solution, &dropped)
 }
 
-/// Solve argmin ‖target − Σ x_k column_k‖ by QR.
+/// Minimize ‖target − Σ x_k column_k‖ over the coefficients x_k by QR factorization.
 ///
-/// The first `needed` columns must be linearly independent. Later dependent columns are excluded (x = 0) and returned.
+/// The first `needed` columns must be linearly independent. Later dependent columns are excluded, with coefficient 0.
+/// Return the coefficients and the indices of the excluded columns.
 ///
 /// # Errors
-/// [`Error::Singular`] with the index of the first linearly dependent column.
+/// [`Error::Singular`] with the index of the first dependent column among the needed ones. [`Error::Length`] if a
+/// column has another length than the target.
 pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec<f64>, Vec<usize>)> {
     let k = columns.len();
     columns.iter().try_for_each(|column| check_length("column", target.len(), column.len()))?;

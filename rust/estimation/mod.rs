@@ -1,4 +1,4 @@
-//! Estimators of coefficients at given orders, and of orders and coefficients together.
+//! Estimators: coefficients at given orders, and orders and coefficients together.
 
 pub mod generalized_least_squares;
 pub mod instrumental_variables;

@@ -1,9 +1,10 @@
-//! Multi-innovation least squares (paper (42)–(44)): the recursion as published, and its exact closed form.
+//! Multi-innovation least squares, eqs. (42)–(44) of the paper: the recursion as published, and its exact closed form.
 //!
-//! One step of (44) with the p newest rows is a block step of recursive least squares. After all rows the recursion has
-//! minimized Σ w_i (m_i − q_iᵀX)² + (X − X₀)ᵀK₀⁻¹(X − X₀) with w_i = min(p, M − i + 1), because a row is used in every
-//! step in which it is one of the p newest. Apart from the last rows, the innovation length p therefore only weights
-//! the data relative to the prior.
+//! Eq. (44) estimates X in m = Q X with rows m_i = q_iᵀX. One step with the p newest rows is a block step of recursive
+//! least squares. After all M rows, the recursion has minimized Σ w_i (m_i − q_iᵀX)² + (X − X₀)ᵀK₀⁻¹(X − X₀). X₀ is the
+//! initial estimate and K₀ its covariance. The weight is w_i = min(p, M − i + 1), because a row is used in every step
+//! in which it is one of the p newest. Apart from the last rows, the innovation length p therefore only weights the
+//! data relative to the prior.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, Error, Result};
@@ -13,29 +14,29 @@ use crate::linalg::small::{Recursion, SlidingGram};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
-/// Row basis of the recursion.
+/// Basis of the rows of the regression.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RowBasis {
-    /// Haar coefficients, coarse to fine, as in the paper; m a power of two.
+    /// Haar coefficients, from coarse to fine, as in the paper. The number of pulses must be a power of two.
     Haar,
-    /// Pulse means in the sequence of time.
+    /// Block-pulse means in the sequence of time.
     Time,
 }
 
 /// Prior covariance K₀ of the coefficients, a diagonal matrix.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Prior {
-    /// Covariance of every coefficient.
+    /// The same covariance for every coefficient.
     Absolute(f64),
-    /// Prior covariance of a coefficient times the sum of squares of its column. It does not depend on units.
+    /// Covariance of a coefficient times the sum of squares of its column. This product does not depend on units.
     Relative(f64),
 }
 
 impl Prior {
-    /// Prior that changes coefficients only where the data hardly determine them.
+    /// Weak prior, which affects only coefficients that the data hardly determine.
     pub const WEAK: Self = Self::Relative(1e10);
 
-    /// Return the inverse prior covariance of the coefficient of a column whose sum of squares is given.
+    /// Return the inverse prior covariance of a coefficient whose column has the sum of squares `squares`.
     #[must_use]
     pub fn precision(self, squares: f64) -> f64 {
         match self {
@@ -44,7 +45,7 @@ impl Prior {
         }
     }
 
-    /// Return the inverse prior covariance of each column's coefficient.
+    /// Return the inverse prior covariance of the coefficient of each column.
     fn precisions(self, columns: &[Vec<f64>]) -> Vec<f64> {
         columns.iter().map(|column| self.precision(column.iter().map(|v| v * v).sum())).collect()
     }
@@ -63,12 +64,12 @@ impl Prior {
     }
 }
 
-/// Settings of the recursion (44) of the paper.
+/// Settings of the recursion, eq. (44) of the paper.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Innovation {
-    /// Innovation length p ≥ 1.
+    /// Innovation length p ≥ 1: number of newest rows in each step.
     pub length: usize,
-    /// Initial covariance K₀ > 0.
+    /// Prior covariance K₀ of the coefficients.
     pub prior: Prior,
     /// Basis of the rows.
     pub row_basis: RowBasis,
@@ -91,17 +92,21 @@ impl Innovation {
         self.prior.check()
     }
 
-    /// Weight of row i of m (from 0): the number of steps that use it.
+    /// Weight of row `i` (from 0) of `m` rows: the number of steps that use it.
     #[must_use]
     pub fn weight(&self, i: usize, m: usize) -> usize {
         self.length.min(m - i)
     }
 }
 
-/// Final estimate of the recursion in closed form, by QR of the weighted rows stacked on the prior.
+/// Return the final estimate of the recursion in closed form.
+///
+/// It follows from a QR factorization of the weighted rows and the rows of the prior.
 ///
 /// # Errors
-/// Settings out of range, m not a power of two with the Haar basis, [`Error::Length`].
+/// [`Error::OutOfRange`] for invalid settings or orders. [`Error::NotPowerOfTwo`] if the Haar basis is used and the
+/// number of pulses is not a power of two. [`Error::Length`] if `fixed` does not have one entry per term or there is no
+/// record. [`Error::Singular`] if a free term is zero.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -137,8 +142,9 @@ pub fn closed_form(
     regression.estimate(&solution, &dropped)
 }
 
-/// Least-squares solution of the weighted rows and of prior rows with the inverse covariances `prior`; also the
-/// linearly dependent columns. The first `needed` columns must be independent.
+/// Return the least-squares solution of the weighted rows and the prior rows, and the linearly dependent columns.
+///
+/// `prior` contains the inverse prior covariances. The first `needed` columns must be independent.
 fn weighted_solution(
     (columns, target, starts): (&[impl AsRef<[f64]>], &[f64], &[usize]),
     length: usize,
@@ -147,7 +153,7 @@ fn weighted_solution(
 ) -> Result<(Vec<f64>, Vec<usize>)> {
     let columns = columns.iter().map(|column| column.as_ref().to_vec()).collect();
     let (columns, target) = weighted_rows(columns, target.to_vec(), starts, length, prior);
-    // With a prior no column but a zero one under a relative prior is linearly dependent in exact arithmetic.
+    // With a prior, only a zero column under a relative prior is linearly dependent in exact arithmetic.
     let (solution, dropped) = least_squares::solve(&columns, &target, 0)?;
     match dropped.iter().find(|&&column| column < needed) {
         Some(&index) => Err(Error::Singular { index, count: columns.len() }),
@@ -155,7 +161,7 @@ fn weighted_solution(
     }
 }
 
-/// Rows times the square roots of their weights, with the rows of the prior below them.
+/// Return the rows times the square roots of their weights, followed by the rows of the prior.
 fn weighted_rows(
     mut columns: Vec<Vec<f64>>,
     mut target: Vec<f64>,
@@ -182,14 +188,14 @@ fn weighted_rows(
     (columns, target)
 }
 
-/// Multi-innovation estimate of X in m = Q X in closed form, (44) of the paper. It starts from X₀ = 0 with a prior
-/// covariance of each coefficient.
+/// Return the multi-innovation estimate of X in m = Q X in closed form, eq. (44) of the paper.
 ///
-/// `columns` are those of Q. O(M k²).
+/// `columns` are the columns of Q, and `target` is m with M elements. The initial estimate is X₀ = 0, with a prior
+/// covariance of each coefficient. The cost is O(M k²) for k columns.
 ///
 /// # Errors
-/// An innovation length of 0, a prior covariance that is not positive and finite, values that are not finite,
-/// [`Error::Length`].
+/// [`Error::OutOfRange`] if the innovation length is 0, or a prior covariance is not positive and finite.
+/// [`Error::NotFinite`] if a value is not finite. [`Error::Length`] if the lengths do not match.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -210,10 +216,14 @@ pub fn estimate(
     Ok(weighted_solution((columns, target, &starts), length, &prior, columns.len())?.0)
 }
 
-/// Coefficients after every step of the paper's recursion (44) on m = Q X. The last ones equal [`estimate`]. O(M k³).
+/// Return the coefficients after every step of the recursion, eq. (44) of the paper, on m = Q X.
+///
+/// The steps are concatenated, with k coefficients each. The last coefficients equal [`estimate`]. The cost is O(M k³)
+/// for M rows and k columns.
 ///
 /// # Errors
-/// As [`estimate`], and [`Error::Diverged`] if rounding makes the covariance indefinite.
+/// [`Error::OutOfRange`], [`Error::NotFinite`] and [`Error::Length`] as for [`estimate`]. [`Error::Diverged`] if
+/// rounding makes the covariance indefinite. [`Error::Interrupted`] after a stop request.
 pub fn path(
     columns: &[impl AsRef<[f64]>],
     target: &[f64],
@@ -225,7 +235,10 @@ pub fn path(
     run_recursion((columns, target, &[0, target.len()]), length, &prior, stop)
 }
 
-/// Coefficients after every step of the recursion through records whose first rows are `starts`.
+/// Return the coefficients after every step of the recursion, with all steps concatenated.
+///
+/// `starts` contains the first row of each record, then the number of rows. `prior` contains the inverse prior
+/// covariances.
 fn run_recursion(
     (columns, target, starts): (&[impl AsRef<[f64]>], &[f64], &[usize]),
     length: usize,
@@ -251,7 +264,7 @@ fn run_recursion(
     Ok(trace)
 }
 
-/// Check a problem; return the inverse prior covariances.
+/// Return the inverse prior covariances, or an error if a length, a setting or a value is invalid.
 fn check_problem(
     columns: &[impl AsRef<[f64]>],
     target: &[f64],
@@ -270,12 +283,14 @@ fn check_problem(
     Ok(prior_covariance.iter().map(|covariance| 1.0 / covariance).collect())
 }
 
-/// Run the paper's recursion (44) from X₀ = 0. Return the last estimate and the coefficients after every step.
+/// Run the recursion, eq. (44) of the paper, from X₀ = 0 over all records in sequence.
 ///
-/// The steps run through the records in sequence. An innovation never spans two records. O(k³) per step.
+/// Return the last estimate and the coefficients after every step. An innovation never spans two records. The cost is
+/// O(k³) per step for k columns.
 ///
 /// # Errors
-/// As [`closed_form`], and [`Error::Diverged`] if rounding makes the covariance indefinite.
+/// The errors of [`closed_form`]: settings or orders out of range, lengths that do not match. [`Error::Diverged`] if
+/// rounding makes the covariance indefinite.
 pub fn recursion(
     records: &[Record],
     structure: &Structure,

@@ -8,10 +8,11 @@ use crate::linalg::orthogonal::{extend_orthonormal, norm, project_out};
 use crate::regressors::Record;
 use crate::series::{reciprocal, Buffers, Kernel};
 
-/// Relative norm of a response to an initial term outside the span of the other responses, below which it is linearly
-/// dependent.
+/// Relative norm of a response outside the span of the other responses below which it counts as dependent on them.
+///
+/// The responses are those to the initial terms.
 const RANK_TOLERANCE: f64 = 1e-12;
-/// Relative norm of a column after projection, below which its coefficient is solved together with the initial terms.
+/// Relative norm of a column after projection below which its coefficient is solved together with the initial terms.
 const MIN_REMAINING_NORM_RATIO: f64 = 1e-6;
 
 /// Best fit of an equation with fixed autoregressive terms.
@@ -19,7 +20,7 @@ const MIN_REMAINING_NORM_RATIO: f64 = 1e-6;
 pub struct FixedPoleEstimate {
     /// Norm of the output error relative to the norm of the output.
     pub error: f64,
-    /// One per term of the structure; fixed coefficients as given.
+    /// Coefficients, one per term of the structure. A fixed coefficient has the given value.
     pub coefficients: Vec<f64>,
 }
 
@@ -34,14 +35,19 @@ struct RecordSpectra {
 
 /// Fit an equation by output error for several sets of fixed autoregressive coefficients.
 ///
-/// `structure` contains the terms of other signals, `own` the integration orders of the autoregressive terms, and each
-/// point their coefficients. Terms and initial terms follow by linear least squares. A result is None if the response
-/// overflows or a free term is linearly dependent.
+/// `structure` contains the terms of other signals than the output. `own` contains the integration orders of the
+/// autoregressive terms, and each point contains their coefficients. The coefficients of the other terms and of the
+/// initial terms follow by linear least squares. There is one result per point. It is None if the response overflows or
+/// a free term is linearly dependent.
 ///
-/// Integrals of signals, powers of t and kernels are computed once. O(points · columns · m log m).
+/// Integrals of signals, powers of time and kernels are computed once. The cost is O(points · columns · m log m) for
+/// records of m pulses.
 ///
 /// # Errors
-/// As [`Regression::new`]; an order of `own` out of range; a point with a wrong number of coefficients.
+/// [`Length`](crate::error::Error::Length) if `fixed` or a point has a wrong number of coefficients, or if there is no
+/// record. [`NotFinite`](crate::error::Error::NotFinite) if a fixed coefficient is not finite.
+/// [`OutOfRange`](crate::error::Error::OutOfRange) for an invalid order or exponent.
+/// [`Structure`](crate::error::Error::Structure) for a signal that does not exist.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -100,7 +106,9 @@ fn record_spectra(regression: &Regression, own: &[f64], r: usize, record: &Recor
     }
 }
 
-/// Fit at one point: responses of each record, then elimination of the initial terms.
+/// Fit at one point: compute the responses of each record, then eliminate the initial terms.
+///
+/// `size` is the norm of the measured output. Return None if a response overflows or a free term is linearly dependent.
 fn fit_point(
     parts: &[RecordSpectra],
     fixed: &[Option<f64>],
@@ -150,8 +158,9 @@ fn fit_point(
     Ok(Some(FixedPoleEstimate { error: missed / size, coefficients }))
 }
 
-/// Fit the coefficients of the columns together with initial terms of each record. Return them and the norm of the
-/// residuals; None if the regressors are linearly dependent.
+/// Fit the coefficients of the columns together with the initial terms of each record.
+///
+/// Return the coefficients and the norm of the residuals; None if the regressors are linearly dependent.
 fn solve_with_initial_terms(
     columns: Vec<Vec<f64>>,
     target: Vec<f64>,
@@ -183,7 +192,7 @@ fn solve_with_initial_terms(
     Some((x, norm(&missed)))
 }
 
-/// Append the columns of the initial terms, each zero outside its record.
+/// Append the columns of the initial terms. Each of them is zero outside its record.
 fn append_initial_terms(mut columns: Vec<Vec<f64>>, starts: &[Vec<Vec<f64>>], lengths: &[usize]) -> Vec<Vec<f64>> {
     let rows = lengths.iter().sum();
     let mut from = 0;

@@ -1,10 +1,11 @@
-//! Multi-innovation recursion (44) sample by sample, with constant time per sample.
+//! Multi-innovation recursion, eq. (44) of the paper, sample by sample, with constant time per sample.
 //!
-//! A new row needs the fractional integrals of every signal at the newest pulse, which depend on all past samples. The
-//! newest two pulses enter by the exact kernel, paper (32). Older pulses enter through a sum of exponentials, exact to
-//! rounding. An integral of an order above 1 is the running integral of an integral of that order minus one. A row
-//! costs O((signals + terms)·rates + k³), independent of the innovation length and of the length of the run. Earlier
-//! rows may be forgotten exponentially. A stream with nonzero initial conditions has powers of t as additional terms.
+//! A new row requires the fractional integrals of every signal at the newest pulse, which depend on all past samples.
+//! The newest two pulses enter by the exact kernel, eq. (32) of the paper. Older pulses enter through a sum of
+//! exponentials, which is exact to rounding. An integral of an order above 1 is the running integral of an integral of
+//! that order minus one. A row costs O((signals + terms)·rates + k³) for k coefficients. This does not depend on the
+//! innovation length and on the length of the run. Earlier rows may be forgotten exponentially. A stream with nonzero
+//! initial conditions has powers of time as additional terms.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
@@ -14,22 +15,24 @@ use crate::fractional::kernels::{block_pulse_kernel, PowerMeans};
 use crate::linalg::small::{Recursion, SlidingGram};
 use crate::simd::{self, dot};
 
-/// Relative accuracy of the sum of exponentials, at the rounding level of the batch form.
+/// Relative accuracy of the sum of exponentials, which is the rounding level of a computation on the whole record.
 const MEMORY_TOLERANCE: f64 = 2e-15;
 
-/// History of one signal: exponential states of all pulses except the newest two, and the last pulse.
+/// History of one signal: exponential states of all pulses except the newest two, and the mean of the last pulse.
 #[derive(Debug, Clone)]
 struct SignalHistory {
     states: Vec<f64>,
     last: f64,
 }
 
-/// Weights of the pulses in an integral at the newest pulse, for an order of at most 1. For a higher order they are the
-/// weights in its last increment.
+/// Weights of the pulses in an integral at the newest pulse, for an order of at most 1.
+///
+/// For a higher order, they are the weights in the last increment of the integral.
 #[derive(Debug, Clone)]
 struct PulseWeights {
     /// Weights of the newest pulse and of the previous one.
     recent: [f64; 2],
+    /// Weights of the exponential states of older pulses.
     history: Vec<f64>,
 }
 
@@ -45,7 +48,7 @@ impl PulseWeights {
 struct RunningIntegral {
     signal: usize,
     local: PulseWeights,
-    /// Weights of the integral of the order minus one, and its running sum; None for orders up to 1.
+    /// Weights of the integral of the order minus one, and the running sum of this integral; None for orders up to 1.
     inner: Option<(PulseWeights, f64)>,
     step: f64,
 }
@@ -86,7 +89,7 @@ impl RunningIntegral {
         Ok(Self { signal, local, inner: Some((means(eta - 1.0), 0.0)), step })
     }
 
-    /// Mean over the newest pulse.
+    /// Advance by one pulse and return the mean of the integral over the newest pulse.
     #[inline(always)]
     fn next(&mut self, newest: f64, past: &SignalHistory) -> f64 {
         let local = self.local.apply(newest, past);
@@ -101,7 +104,7 @@ impl RunningIntegral {
     }
 }
 
-/// Column of an initial term t^e after the integration that the whole equation needs.
+/// Regression column of an initial term t^e, integrated with the order by which the whole equation is integrated.
 #[derive(Debug, Clone)]
 struct InitialColumn {
     means: PowerMeans,
@@ -112,7 +115,7 @@ struct InitialColumn {
 #[derive(Debug, Clone)]
 struct EquationRecursion {
     output: usize,
-    /// Integral of the output. Its order is 0 unless a term has a higher order than the equation.
+    /// Integral of the output. Its order is 0, unless a term has a higher order than the equation.
     target: RunningIntegral,
     integrals: Vec<RunningIntegral>,
     initial: Vec<InitialColumn>,
@@ -120,7 +123,7 @@ struct EquationRecursion {
     recursion: Recursion,
     /// Gram matrix of the p newest rows.
     window: SlidingGram,
-    /// Fractional integrals at the newest pulse: of the output, then of each term's signal.
+    /// Fractional integrals at the newest pulse: of the output, then of the signal of each term.
     values: Vec<f64>,
     /// Newest row.
     row: Vec<f64>,
@@ -129,13 +132,13 @@ struct EquationRecursion {
 /// Options of a recursion on a stream of samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreamingOptions {
-    /// Innovation length p ≥ 1.
+    /// Innovation length p ≥ 1: number of newest rows in each step.
     pub length: usize,
     /// Prior covariance. A relative prior uses the sums of squares of the rows so far.
     pub prior: Prior,
     /// Forgetting factor in (0, 1] by which the information of all earlier rows is multiplied at every row.
     pub forgetting: f64,
-    /// Initial conditions of the stream; the exponents of t must exceed −1.
+    /// Initial conditions of the stream. Exponents of t must be above −1.
     pub initial: Initial,
 }
 
@@ -161,7 +164,7 @@ impl StreamingOptions {
     }
 }
 
-/// Multi-innovation recursion of several equations on one stream of samples, (44) of the paper.
+/// Multi-innovation recursion, eq. (44) of the paper, of several equations on one stream of samples.
 #[derive(Debug, Clone)]
 pub struct Streaming {
     inputs: Vec<bool>,
@@ -169,7 +172,7 @@ pub struct Streaming {
     share: Vec<f64>,
     pasts: Vec<SignalHistory>,
     fits: Vec<EquationRecursion>,
-    /// Last sample, empty before the first one.
+    /// Last sample of every signal; empty before the first one.
     sample: Vec<f64>,
     means: Vec<f64>,
     options: StreamingOptions,
@@ -178,13 +181,15 @@ pub struct Streaming {
 }
 
 impl Streaming {
-    /// Recursion on samples with the interval `step` \[s\], for at most `longest` pulses.
+    /// Return a recursion on samples with the interval `step` \[s\], for at most `longest` pulses.
     ///
-    /// `inputs` marks the zero-order-hold inputs; the other signals are outputs.
+    /// `inputs` flags the zero-order-hold inputs. The other signals are outputs. Each equation has its structure, and
+    /// one entry per term: the value of a fixed coefficient, or None for a free one.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for an invalid step, option or integration order; [`Error::Length`] if `fixed` does
-    /// not match the terms; [`Error::Structure`] for an unknown signal.
+    /// [`Error::OutOfRange`] for an invalid step, option or integration order. [`Error::Length`] if `fixed` does not
+    /// match the terms. [`Error::NotFinite`] if a fixed coefficient is not finite. [`Error::Structure`] for an unknown
+    /// signal.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -261,8 +266,9 @@ impl Streaming {
     /// Add one sample of every signal, in constant time.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`]; [`Error::OutOfRange`] beyond the longest run;
-    /// [`Error::Diverged`] if rounding makes the covariance indefinite.
+    /// [`Error::Length`] if there is not one value per signal. [`Error::NotFinite`] if a value is not finite.
+    /// [`Error::OutOfRange`] if the stream exceeds the longest run. [`Error::Diverged`] if rounding makes the
+    /// covariance indefinite.
     pub fn push(&mut self, sample: &[f64]) -> Result<()> {
         check_length("sample", self.inputs.len(), sample.len())?;
         check_finite("sample", sample)?;
@@ -292,25 +298,26 @@ impl Streaming {
         Ok(())
     }
 
-    /// Return the coefficients of every equation after the newest sample: first of its terms, including fixed ones,
-    /// then of its initial terms.
+    /// Return the coefficients of every equation after the newest sample.
+    ///
+    /// Those of its terms, including fixed ones, come first, then those of its initial terms.
     #[must_use]
     pub fn coefficients(&self) -> Vec<Vec<f64>> {
         self.fits.iter().map(|fit| fit.coefficients().collect()).collect()
     }
 
-    /// Number of the coefficients of all equations.
+    /// Total number of coefficients of all equations, including fixed ones.
     #[must_use]
     pub fn coefficient_count(&self) -> usize {
         self.fits.iter().map(|fit| fit.fixed.len() + fit.initial.len()).sum()
     }
 
-    /// Append the coefficients of all equations after the newest sample.
+    /// Append the coefficients of all equations after the newest sample to `out`.
     pub fn append_coefficients(&self, out: &mut Vec<f64>) {
         self.fits.iter().for_each(|fit| out.extend(fit.coefficients()));
     }
 
-    /// Number of pulses so far.
+    /// Number of pulses so far. The first sample starts the first pulse, and each further sample ends a pulse.
     #[must_use]
     pub fn pulses(&self) -> usize {
         self.pulses

@@ -1,11 +1,12 @@
 //! Joint refinement of coupled equations by instrumental variables (Jakeman and Young, Refined instrumental
 //! variable methods of recursive time-series analysis, part II, Int. J. Control 29, 1979, 621-644).
 //!
-//! An equation filtered by its own 1/D̂ still contains the noise of the other measured outputs. Filtering by the
-//! inverse of the matrix Â of all equations turns the equation errors into the output noise, which is white and
-//! independent. The residuals are weighted by its variances. The same filter on simulated outputs makes each instrument
-//! the sensitivity of the simulation to that coefficient. A fixed point of the iteration is therefore a stationary
-//! point of the weighted output error.
+//! If every equation is filtered separately by 1/D̂, the noise of the other measured outputs remains in it. D̂ is the
+//! estimated operator of an equation on its own output. The inverse of the operator matrix Â of all equations turns the
+//! equation errors into the output noise instead. This noise is assumed to be white and independent between outputs.
+//! The residuals are weighted by the inverses of its variances. With the same filter applied to simulated outputs, each
+//! instrument is the sensitivity of the simulation to one coefficient. A fixed point of the iteration is therefore a
+//! stationary point of the weighted output error.
 
 use super::prefilter::is_unstable;
 use super::solution::{
@@ -19,37 +20,38 @@ use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 use crate::series_system::System;
 
-/// Maximum number of halvings of a step that increases the cost.
+/// Maximum number of times that a step which increases the cost is halved.
 const MAX_STEP_HALVINGS: usize = 8;
 
-/// Increase of the cost (−2 log-likelihood) up to which a step is accepted. The likelihood ratio then differs from 1 by
-/// a millionth.
+/// Maximum increase of the cost (−2 log-likelihood) at which a step is still accepted.
+///
+/// Such a step changes the likelihood by less than one part in a million.
 const COST_TOLERANCE: f64 = 1e-6;
 
-/// Equations to refine: structures, fixed coefficients, exponents and exclusions of their initial terms.
+/// Records and coupled equations whose coefficients are refined jointly.
 pub struct CoupledProblem<'a> {
-    /// Records as measured.
+    /// Records with the measured signals.
     pub records: &'a [Record],
-    /// Records with noise-free substitutes for measured outputs without an equation.
+    /// The same records with noise-free substitutes for measured outputs without an equation.
     pub clean: &'a [Record],
-    /// The equations.
+    /// Structures of the equations.
     pub structures: &'a [Structure],
-    /// Values of the fixed coefficients, per equation; None if free.
+    /// Per equation, one entry per term: the value of a fixed coefficient, None for a free one.
     pub fixed: &'a [Vec<Option<f64>>],
-    /// Exponents of initial terms, per equation.
+    /// Per equation: exponents of the initial terms (powers of time).
     pub exponents: &'a [Vec<f64>],
-    /// (record, position) of excluded initial terms, per equation.
+    /// Per equation: the excluded initial terms, as pairs of record index and exponent index.
     pub dropped: &'a [Dropped],
 }
 
-/// Joint estimate of all equations.
+/// Coefficients of all equations from a joint refinement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CoupledEstimate {
     /// Per equation: coefficients of its terms, then of its initial terms record by record.
     pub solutions: Vec<Solution>,
-    /// Per equation: covariance of its free coefficients, row-major, robust to colored residuals.
+    /// Per equation: covariance matrix of the free coefficients of its terms, row-major, robust to colored residuals.
     pub covariances: Vec<Vec<f64>>,
-    /// Σ n ln(Σ ε²/n) over outputs: −2 log-likelihood with unknown noise variances.
+    /// Σ n ln(Σ ε²/n) over outputs with n output errors ε: −2 log-likelihood for unknown noise variances.
     pub cost: f64,
     /// Number of iterations.
     pub iterations: usize,
@@ -57,30 +59,31 @@ pub struct CoupledEstimate {
     pub converged: bool,
 }
 
-/// Free coefficient: (equation, term), or (equation, record, position) of an initial term.
+/// Free coefficient of a term (equation, term) or of an initial term (equation, record, exponent index).
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum FreeCoefficient {
     Term(usize, usize),
     Initial(usize, usize, usize),
 }
 
-/// Coefficients of all equations, and their covariances if requested.
+/// Solutions and row-major covariance matrices, one each per equation. The matrices are omitted unless requested.
 type StepResult = (Vec<Solution>, Vec<Vec<f64>>);
 
-/// Simulation of every record with one set of coefficients, and its cost.
+/// Simulated outputs, weights and cost at one set of coefficients.
 struct Iterate {
-    /// Outputs of the simulation, by record and equation.
+    /// Simulated outputs, indexed by record, equation and sample.
     responses: Vec<Vec<Vec<f64>>>,
-    /// Weight 1/σ² of each output.
+    /// Weight 1/σ² of each output, where σ is the standard deviation of its output error.
     weights: Vec<f64>,
     cost: f64,
 }
 
 impl CoupledProblem<'_> {
-    /// Iterate from an initial guess until convergence; the cost never increases except by rounding.
+    /// Refine the coefficients `start` until convergence; no accepted step increases the cost by more than 10⁻⁶.
     ///
-    /// None if the simulation from the initial guess diverges, so that its inverse cannot be used as a filter.
-    /// O(iterations · n · Σ (terms · m log m + n² m log² m)) for n equations.
+    /// Return None if the simulation with `start` diverges or if the inverse of the system matrix is unstable at an
+    /// iterate. The inverse then cannot be used as a filter. The computing cost is O(iterations · n · Σ (terms · m log
+    /// m + n² m log² m)) for n equations. The sum is over records of m pulses.
     ///
     /// # Errors
     /// [`crate::error::Error::Singular`] if the instruments do not identify the coefficients of all equations together.
@@ -134,7 +137,9 @@ impl CoupledProblem<'_> {
         out
     }
 
-    /// Simulate all records and compute the cost; None if an output exceeds ten times the measured amplitude.
+    /// Simulate all records and compute the cost.
+    ///
+    /// Return None if an output is not finite or exceeds ten times the amplitude of the measured output.
     #[allow(clippy::cast_precision_loss)]
     fn evaluate(&self, solutions: &[Solution]) -> Result<Option<Iterate>> {
         let equations = equations(self.structures, solutions);
@@ -162,8 +167,9 @@ impl CoupledProblem<'_> {
         Ok(Some(Iterate { responses, weights: variances.iter().map(|v| 1.0 / v).collect(), cost }))
     }
 
-    /// New coefficients of all equations, with covariances if requested; None if the inverse of the system matrix is
-    /// unstable.
+    /// Compute the coefficients of all equations after one step, with their covariances if requested.
+    ///
+    /// Return None if the inverse of the system matrix is unstable.
     fn step(
         &self,
         solutions: &[Solution],
@@ -189,7 +195,8 @@ impl CoupledProblem<'_> {
             });
             let simulated = Record::from_rows(record.step(), simulated.collect(), None)?;
             let mut buffers = Buffers::default();
-            // Response of every output in sequence, in units of the noise standard deviation of the output.
+            // Equation error `signal` of equation i, filtered to the errors of all n outputs, each in its noise
+            // standard deviation.
             let mut through = |i: usize, signal: &[f64]| -> Vec<f64> {
                 let spectrum = Kernel::new(signal);
                 let mut out = vec![0.0; n * m];

@@ -1,7 +1,7 @@
 //! Instrumental-variable estimation from several initial guesses: equation by equation, then all equations together.
 //!
-//! All given equations are simulated together. Their inputs are the signals that are no equation's output. If such a
-//! signal is measured with noise, a noise-free substitute is needed (`project`).
+//! All given equations are simulated together. A signal is an input of this simulation if it is not the output of any
+//! equation. If such a signal is measured with noise, it needs a noise-free substitute ([`project`](super::project)).
 
 use super::coupled;
 use super::prefilter::{damped_inverse, power_frequency, state_variable_filter};
@@ -14,29 +14,30 @@ use crate::regressors::Record;
 use crate::series::Kernel;
 use crate::series_system::System;
 
-/// Poles λ of the state-variable filters of the initial guesses, relative to the bandwidth of the output.
+/// Poles λ of the state-variable filters, relative to the bandwidth of the output; each yields one initial guess.
 ///
-/// Without a filter the regressors are pure integrals, in which drift outweighs the motion of long records.
+/// Without such a filter, the regressors are pure integrals, in which drift dominates if the record is long.
 const FILTER_POLE_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
 
-/// Increase of the output error above which a step is halved, at most [`MAX_STEP_HALVINGS`] times in a row.
+/// Ratio of the output error after a step to the least error found until then, above which the step is halved.
 const MAX_ERROR_RATIO: f64 = 1.2;
+/// Maximum number of consecutive step halvings.
 const MAX_STEP_HALVINGS: usize = 4;
 
-/// Relative difference of coefficients below which two solutions are the same.
+/// Relative difference of coefficients below which two solutions count as equal.
 const SAME_SOLUTION_TOLERANCE: f64 = 1e-4;
 
 /// Coefficient estimates of one equation.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct InstrumentalEstimate {
-    /// One per term; fixed coefficients as given.
+    /// Coefficients, one per term. A fixed coefficient has the given value.
     pub coefficients: Vec<f64>,
-    /// Coefficients of the initial terms, per record; 0 for a term excluded as linearly dependent.
+    /// Coefficients of the initial terms, one list per record; 0 for a term excluded as linearly dependent.
     pub initial: Vec<Vec<f64>>,
-    /// Exponents of the initial terms.
+    /// Exponents of the initial terms (powers of time).
     pub exponents: Vec<f64>,
-    /// Covariance of the free coefficients at these orders, row-major, robust to colored residuals.
+    /// Covariance matrix of the free coefficients at the given orders, row-major, robust to colored residuals.
     pub covariance: Vec<f64>,
 }
 
@@ -44,30 +45,32 @@ pub struct InstrumentalEstimate {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct InstrumentalFit {
-    /// One per equation.
+    /// Estimates, one per equation.
     pub estimates: Vec<InstrumentalEstimate>,
     /// Number of iterations.
     pub iterations: usize,
     /// True if the last step changed no coefficient by more than the tolerance; otherwise the estimates are the iterate
     /// with the least output error.
     pub converged: bool,
-    /// True if the estimated model is unstable. Its instruments then decay by the factor ρ < 1 per sample.
+    /// True if the estimated model is unstable. Its simulation is then damped by a factor ρ < 1 per sample.
     pub damped: bool,
 }
 
 /// Fit one or several equations to one or several records by refined instrumental variables.
 ///
-/// The noise-free signals of a record ([`Record::with_clean`]) replace outputs that no equation simulates. They are the
-/// first instruments of the simulated outputs. A record without them uses its measured signals. The initial guesses are
-/// two-stage least squares behind several state-variable filters. The result is the refined solution with the least output
-/// error, or the iterate with the least output error if none converges. An unstable iterate is damped (its series is
-/// evaluated at ρz, ρ < 1), which keeps the instruments bounded and free of noise.
+/// A record may contain noise-free signals ([`Record::with_clean`]). They replace the measured outputs that no equation
+/// simulates. In the first step, they are also the instruments for the simulated outputs. A record without them uses
+/// its measured signals. Each initial guess is a two-stage least-squares estimate with a different state-variable
+/// filter. The result is the refined solution with the least output error. If no refinement converges, it is the
+/// iterate with the least output error. The series of an unstable iterate are evaluated at ρz with ρ < 1, which keeps
+/// the instruments bounded and free of noise.
 ///
-/// O(iterations · Σ (terms · m log m + n² m log² m)).
+/// The cost is O(iterations · Σ (terms · m log m + n² m log² m)) for n equations. The sum is over records of m pulses.
 ///
 /// # Errors
-/// As least squares and [`InstrumentalSettings::check`]; [`Error::Singular`] if the instruments do not identify the coefficients;
-/// [`Error::Length`].
+/// [`Error::OutOfRange`] if a setting or an order is out of range. [`Error::Structure`] if a structure is invalid.
+/// [`Error::Singular`] if the instruments do not identify the coefficients. [`Error::Length`] if there is no equation
+/// or if `fixed` does not have one entry per equation. [`Error::Diverged`] if no initial guess can be simulated.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -170,14 +173,16 @@ struct CoupledProblem<'a> {
     structures: &'a [Structure],
     fixed: &'a [Vec<Option<f64>>],
     exponents: &'a [Vec<f64>],
-    /// Initial terms that are excluded, per equation.
+    /// Excluded initial terms, per equation.
     dropped: Vec<Dropped>,
-    /// Spectra that do not change between iterations, by equation and record.
+    /// Spectra that do not change between iterations, indexed by equation and record.
     spectra: Vec<Vec<EquationSpectra<'a>>>,
+    /// Spectra of terms with noise-free signals, indexed by equation, record and term; None if the measured signal is
+    /// used.
     substitutes: Vec<Vec<Vec<Option<Kernel>>>>,
 }
 
-/// Result of the refinement from one initial guess.
+/// Result of the separate refinement of every equation from one initial guess.
 struct RefinementResult {
     error: f64,
     solutions: Vec<Solution>,
@@ -210,9 +215,10 @@ impl<'a> CoupledProblem<'a> {
         Ok(Self { records, clean, structures, fixed, exponents, dropped, spectra: shelves, substitutes })
     }
 
-    /// Two-stage least squares: one step with the noise-free signals as instruments.
+    /// Return the two-stage least-squares estimate of every equation: one step with noise-free signals as instruments.
     ///
-    /// The signals pass the state-variable filter s^α/(s + λ)^⌈α⌉ with λ at `ratio` times the bandwidth of the output.
+    /// The signals pass the state-variable filter s^α/(s + λ)^⌈α⌉. α is the order of the equation, and λ is `ratio`
+    /// times the bandwidth of its output.
     fn start(&self, ratio: f64) -> Result<Vec<Solution>> {
         let mut scratch = Scratch::default();
         let mut solutions = Vec::with_capacity(self.structures.len());
@@ -266,13 +272,16 @@ impl<'a> CoupledProblem<'a> {
         }
     }
 
-    /// True if the coefficients of two solutions agree within a relative tolerance.
+    /// Return true if the term coefficients of two solutions agree within a relative tolerance.
     fn agree(&self, before: &[Solution], after: &[Solution], tolerance: f64) -> bool {
         let mut pairs = before.iter().zip(after).zip(self.structures);
         pairs.all(|((a, b), s)| has_converged(a, b, s.terms.len(), tolerance))
     }
 
-    /// Refine all equations together; None if they cannot be refined together.
+    /// Refine all equations together, starting from the coefficients `start`.
+    ///
+    /// Return None if the simulation or its inverse is unstable, or if the instruments do not identify the
+    /// coefficients.
     fn refine_together(
         &self,
         start: &[Solution],
@@ -293,6 +302,8 @@ impl<'a> CoupledProblem<'a> {
     }
 
     /// Compute one step of every equation, with instruments from one coupled simulation.
+    ///
+    /// Return the solutions and the covariance matrices, one each per equation.
     fn step(
         &self,
         solutions: &[Solution],
@@ -340,7 +351,7 @@ impl<'a> CoupledProblem<'a> {
     }
 }
 
-/// Relative output error Σ ‖y − ŷ‖²/‖y‖² over records and equations.
+/// Relative output error Σ ‖y − ŷ‖²/‖y‖² over records and equations, with measured output y and simulated output ŷ.
 fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<Vec<f64>>]) -> f64 {
     let mut total = 0.0;
     for (record, outputs) in records.iter().zip(responses) {
@@ -354,6 +365,8 @@ fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<V
 }
 
 /// Simulate all equations together on every record, with damping if they are unstable.
+///
+/// Return the outputs, indexed by record and equation, and true if the simulation of any record was damped.
 fn simulate_coupled(
     clean: &[Record],
     structures: &[Structure],
@@ -365,7 +378,8 @@ fn simulate_coupled(
     let mut out = Vec::with_capacity(clean.len());
     for (r, record) in clean.iter().enumerate() {
         let initial = initial_terms(r, structures, exponents, solutions);
-        // A response that grows with its input is no instability; one far beyond the measured range is.
+        // Growth with the input is no instability. A response above ten times the measured amplitude counts as
+        // unstable.
         let bounded = |outputs: &[Vec<f64>]| {
             outputs.iter().zip(structures).all(|(response, s)| {
                 let measured = record.signal(s.output).iter().fold(0.0_f64, |a, v| a.max(v.abs()));

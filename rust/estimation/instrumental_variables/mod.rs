@@ -2,8 +2,8 @@
 //! Garnier and Oustaloup, doi:10.1016/j.automatica.2012.12.006).
 //!
 //! Least squares on the equation error is biased because a measured output enters its own regressors with its noise.
-//! Instruments are free of noise: they follow from the inputs and the model alone. Coupled equations are refined one by
-//! one and then together. [`fit()`] runs all steps from raw records.
+//! Instruments are free of noise, because they are computed from the inputs and the model alone. Coupled equations are
+//! refined one by one and then together. [`fit()`] performs all steps, given records of measured signals.
 
 pub mod coupled;
 pub mod fit;

@@ -1,4 +1,4 @@
-//! Prefilters 1/D̂ and low-pass filters of instrumental variables, and noise-free projections of measured outputs.
+//! Prefilters and low-pass filters for instrumental variables, and noise-free projections of measured outputs.
 
 use super::solution::dot;
 use crate::equation::Filter;
@@ -11,12 +11,13 @@ use crate::regressors::Record;
 use crate::series::{self, reciprocal, Buffers, Kernel};
 use crate::signal::block_pulse::PulseMeans;
 
-/// Ratio of the peaks of the second and first half above which a response counts as unstable.
+/// Ratio of the peak magnitudes of a response, second to first half, above which it counts as unstable.
 const INSTABILITY_PEAK_RATIO: f64 = 2.0;
 
-/// Return 1/D mod z^m, or 1/D(ρz) with the largest ρ = e^{−γ/m}, γ = 0, 4, 8, …, that is stable.
+/// Return the first m coefficients of 1/D(z), damped if 1/D is unstable, and true if they are damped.
 ///
-/// The flag is true if ρ < 1.
+/// D is the series with the m coefficients `divisor`. If 1/D is unstable, the result is 1/D(ρz). The factor ρ =
+/// e^{−γ/m} is the largest one with γ = 4, 8, 16, … that makes the result stable.
 ///
 /// # Errors
 /// [`LeadingZero`](crate::error::Error::LeadingZero) if the leading coefficient of D is zero.
@@ -43,7 +44,7 @@ pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
     }
 }
 
-/// Return the coefficients of a(ρz) for the series a(z).
+/// Return the coefficients of the series a(ρz), given those of a(z) in `series`.
 fn scale_argument(rho: f64, series: &[f64]) -> Vec<f64> {
     let mut power = 1.0;
     series
@@ -64,14 +65,16 @@ pub(super) fn is_unstable(response: &[f64]) -> bool {
     later.is_infinite() || later > INSTABILITY_PEAK_RATIO * peak(first)
 }
 
-/// Frequency [rad/s] below which 90 % of a signal's power lies.
+/// Frequency \[rad/s\] below which 90 % of the power of a signal about its mean lies.
+///
+/// `step` is the sampling interval \[s\].
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
     let m = signal.len();
     let mean = signal.iter().sum::<f64>() / m.max(1) as f64;
     let power = fft::power_spectrum(signal.iter().enumerate().map(|(k, v)| {
-        // Hann window: leakage from the ends would count as high frequency.
+        // A Hann window, because leakage from the ends would count as high frequency.
         let window = 0.5 - 0.5 * libm::cos(2.0 * std::f64::consts::PI * k as f64 / m as f64);
         window * (v - mean)
     }));
@@ -81,14 +84,16 @@ pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
         sum += p;
         sum >= 0.9 * total
     });
-    // Bins of the padded transform are 1/(its length) apart; the last bin is Nyquist's frequency.
+    // The bins are equally spaced from zero to the Nyquist frequency, which is the last bin.
     let bins = power.len().saturating_sub(1).max(1) as f64;
     std::f64::consts::PI / step * at.unwrap_or(0).max(1) as f64 / bins
 }
 
-/// Second-order low-pass filter as a series, with cutoff frequency `omega` in rad/s.
+/// Return the series of a second-order low-pass filter on the pulses of a record.
 ///
-/// If all signals pass this filter, their equation is unchanged.
+/// `omega` is the cutoff frequency \[rad/s\].
+///
+/// An equation remains valid if all its signals pass this filter.
 ///
 /// # Errors
 /// An order out of range, a value that is not finite, or an invalid step ([`Filter::series`]).
@@ -98,7 +103,9 @@ pub fn low_pass(omega: f64, record: &Record) -> Result<Vec<f64>> {
     Filter { numerator, denominator }.series(record.m(), record.step())
 }
 
-/// Series of the state-variable filter s^α/(s + λ)^⌈α⌉.
+/// Return the series of the state-variable filter s^α/(s + λ)^⌈α⌉ on the pulses of a record.
+///
+/// α is `order`, and λ is `pole` \[rad/s\].
 ///
 /// # Errors
 /// An order out of range, a value that is not finite, or an invalid step ([`Filter::series`]).
@@ -113,7 +120,7 @@ pub(super) fn state_variable_filter(pole: f64, order: f64, record: &Record) -> R
     Filter { numerator: vec![(1.0, order)], denominator }.series(record.m(), record.step())
 }
 
-/// Series of the constant 1.
+/// First `m` coefficients of the constant series 1.
 pub(super) fn unit(m: usize) -> Vec<f64> {
     let mut one = vec![0.0; m];
     if let Some(first) = one.first_mut() {
@@ -122,23 +129,27 @@ pub(super) fn unit(m: usize) -> Vec<f64> {
     one
 }
 
-/// Number of resonators of [`project`] per decade and input. At their damping ratio the passbands of neighbors overlap.
+/// Number of resonators of [`project`] per decade and input. At [`RESONATOR_DAMPING`], adjacent passbands overlap.
 const RESONATORS_PER_DECADE: usize = 8;
+/// Damping ratio of the resonators of [`project`].
 const RESONATOR_DAMPING: f64 = 0.2;
 
-/// Relative norm below which the remaining columns of [`project`] are linearly dependent and excluded. The responses
-/// have almost no component along such directions, while noise has as much as along any other. Rounding errors (10⁻¹¹
-/// for columns of a thousand pulses) would determine the directions.
+/// Relative norm below which a basis column of [`project`] counts as linearly dependent on the previous columns.
+///
+/// Such a column is excluded. Its remaining direction contains almost nothing of the responses, but as much noise as
+/// any other direction. It would also be determined by rounding errors (10⁻¹¹ for columns of a thousand pulses).
 const BASIS_RANK_TOLERANCE: f64 = 1e-6;
 
-/// Return a record with noise-free substitutes ([`project`]) for all signals except the inputs.
+/// Add noise-free substitutes ([`project`]) for all signals except the inputs to a record.
+///
+/// `inputs` flags the signals that are inputs.
 ///
 /// # Errors
-/// [`Error::Structure`] without an input or for fewer than 8 pulses ([`project`]); [`Error::Interrupted`] after a stop
-/// request.
+/// [`Error::Structure`] if a signal needs a substitute and there is no input or there are fewer than 8 pulses.
+/// [`Error::Interrupted`] after a stop request.
 pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &Stop) -> Result<Record> {
     let input_signals: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
-    // One basis for all signals; none where all are inputs.
+    // All signals share one basis. It is empty if all signals are inputs.
     let basis = if input_signals.len() < record.len() {
         input_response_basis(&record, &input_signals, at_rest, stop)?
     } else {
@@ -154,9 +165,9 @@ pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &S
 
 /// Project a measured signal on the space of responses to the inputs, which removes most of its noise.
 ///
-/// The basis contains the first two integrals of each input and its responses through resonators, eight per decade.
-/// A basis of k directions passes k/m of the noise power, whatever the dynamics. Powers of t (offset, ramp) are added
-/// if the record has nonzero initial conditions.
+/// The basis contains the first two integrals of each input and the responses of resonators to them, eight per decade.
+/// A basis of k directions passes the fraction k/m of the noise power in m samples, whatever the dynamics are. Unless
+/// `at_rest` is true, the basis also contains an offset and a ramp in time.
 ///
 /// # Errors
 /// [`Error::Structure`] without an input or for a record of fewer than 8 pulses.
@@ -164,7 +175,7 @@ pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) 
     Ok(project_on_basis(&input_response_basis(record, inputs, at_rest, &Stop::default())?, record.signal(signal)))
 }
 
-/// Project a signal on an orthonormal basis.
+/// Return the orthogonal projection of a signal on the span of an orthonormal basis.
 fn project_on_basis(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; signal.len()];
     for direction in basis {
@@ -174,7 +185,9 @@ fn project_on_basis(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
     out
 }
 
-/// Orthonormal basis of the integrals of the inputs and their responses through resonators.
+/// Orthonormal basis of the integrals of the inputs and of the responses of resonators to the inputs.
+///
+/// Unless `at_rest` is true, the basis also contains an offset and a ramp.
 #[allow(clippy::cast_precision_loss)]
 fn input_response_basis(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Result<Vec<Vec<f64>>> {
     let (m, h) = (record.m(), record.step());
@@ -206,7 +219,8 @@ fn input_response_basis(record: &Record, inputs: &[usize], at_rest: bool, stop: 
         columns.extend(integrals);
         for i in 0..count {
             stop.check()?;
-            // s u and u over s² + 2ζωs + ω² are I u and I² u over 1 + 2ζω I + ω² I², up to a factor.
+            // Resonators with denominator s² + 2ζωs + ω² and numerators s and 1. With I = 1/s, their responses to u are
+            // I u and I² u, both divided by 1 + 2ζωI + ω²I².
             let omega = low * libm::pow(10.0, decades * i as f64 / (count - 1) as f64);
             let resonator =
                 once.iter().zip(&twice).map(|(a, b)| 2.0 * RESONATOR_DAMPING * omega * a + omega * omega * b);

@@ -1,8 +1,8 @@
 //! Instrumental variables for one equation: the regression of one step, and the iteration to convergence.
 //!
-//! The equation is filtered by 1/D̂, so that its error is close to the white noise of the output. The filtered
-//! regressors are correlated with instruments without noise: the inputs and the simulated output. Filter and
-//! instruments depend on the last estimate, so the step is iterated.
+//! The equation is filtered by 1/D̂, where D̂ is the estimated operator on its own output. The equation error is then
+//! close to the white noise of the output. The filtered regressors are correlated with noise-free instruments: the
+//! inputs and the simulated output. Filter and instruments depend on the last estimate, so the step is iterated.
 
 use super::prefilter::damped_inverse;
 use super::solution::{
@@ -17,19 +17,21 @@ use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
 
-/// Data of one record for one equation: spectra padded for products of two series of m terms.
+/// Signals of one record for one equation, with spectra that are padded for products of two series of m pulses.
 pub struct InstrumentSource<'a> {
-    /// Per term: kernel of I^η and its spectrum for terms of the output itself; None for other terms.
+    /// Per term of the output itself: the kernel of integration of order η, and its spectrum. None for other terms.
     pub own: Vec<Option<(&'a [f64], &'a Kernel)>>,
-    /// Per term: I^η s as measured.
+    /// Per term: spectrum of its measured signal, integrated with order η.
     pub measured: Vec<&'a Kernel>,
-    /// Per term: I^η s without noise; the same object as `measured` if there is no substitute. Unused for own terms.
+    /// Per term: spectrum of its noise-free signal, integrated with order η.
+    ///
+    /// It is the same object as in `measured` if there is no substitute. For terms of the output itself it is unused.
     pub clean: Vec<&'a Kernel>,
-    /// Initial terms.
+    /// Spectra of the initial terms.
     pub initial: Vec<&'a Kernel>,
-    /// The output's spectrum.
+    /// Spectrum of the measured output.
     pub target: &'a Kernel,
-    /// The output.
+    /// Measured output.
     pub output: &'a [f64],
 }
 
@@ -42,7 +44,7 @@ pub(super) struct EquationSpectra<'a> {
     target: Kernel,
 }
 
-/// Spectra of one term: kernel of I^η, its spectrum, and the spectrum of the measured I^η s.
+/// Spectra of one term: kernel of integration of order η, its spectrum, and that of the integrated measured signal.
 struct TermSpectra {
     signal: usize,
     eta: f64,
@@ -52,7 +54,7 @@ struct TermSpectra {
 }
 
 impl TermSpectra {
-    /// Spectrum of I^η of the given signal.
+    /// Spectrum of `signal`, integrated with the order η of this term.
     fn integral_spectrum(&self, signal: &[f64]) -> Kernel {
         if self.eta == 0.0 {
             Kernel::new(signal)
@@ -80,9 +82,9 @@ impl<'a> EquationSpectra<'a> {
         }
     }
 
-    /// Spectra of the terms of other signals than the output, with the signals of `substitute`.
+    /// Spectra of the terms, computed from the signals of `substitute`; one entry per term.
     ///
-    /// None for signals that are not `is_selected` or that equal the measured ones.
+    /// An entry is None if its signal is the output of the equation, is not selected, or equals the measured signal.
     pub(super) fn substitute_spectra(
         &self,
         substitute: &Record,
@@ -92,7 +94,7 @@ impl<'a> EquationSpectra<'a> {
         self.terms.iter().map(|t| other(t.signal).then(|| t.integral_spectrum(substitute.signal(t.signal)))).collect()
     }
 
-    /// Source of a step with the given substitute spectra; measured spectra for terms without one.
+    /// Return the data of one step, with the given substitute spectrum of each term or else its measured spectrum.
     pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> InstrumentSource<'b> {
         let own = |t: &TermSpectra| t.signal == self.output;
         let terms = || self.terms.iter();
@@ -107,7 +109,7 @@ impl<'a> EquationSpectra<'a> {
     }
 }
 
-/// Divisor D = 1 − Σ c F^η over the terms of the output itself.
+/// Divisor D = 1 − Σ c I^η over the terms of the output itself, as a series; I^η is integration of order η.
 pub(super) fn divisor(source: &InstrumentSource<'_>, coefficients: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; source.output.len()];
     for (kernel, c) in source.own.iter().zip(coefficients) {
@@ -119,7 +121,7 @@ pub(super) fn divisor(source: &InstrumentSource<'_>, coefficients: &[f64]) -> Ve
     out
 }
 
-/// Work buffers of the steps of one thread.
+/// Work buffers and stop request of the steps of one thread.
 #[derive(Default)]
 pub struct Scratch {
     buffers: Buffers,
@@ -135,10 +137,12 @@ impl Scratch {
     }
 }
 
-/// Compute new coefficients of one equation from filters 1/D̂ and simulated outputs, one of each per record.
+/// Compute new coefficients of one equation by one step of instrumental variables.
 ///
-/// `dropped` lists (record, position) of excluded initial terms. Returns the solution and, if requested, the
-/// covariance of the free coefficients.
+/// `filters` are the prefilters 1/D̂ ([`damped_inverse`]) and `responses` the simulated outputs, one each per record.
+/// `fixed` has one entry per term: the value of a fixed coefficient, None for a free one. `dropped` lists (record
+/// index, exponent index) of excluded initial terms. Return the solution and the row-major covariance matrix of the
+/// free coefficients, which is empty if not requested.
 ///
 /// # Errors
 /// [`Singular`](crate::error::Error::Singular) if the instruments do not identify the coefficients,
@@ -237,14 +241,14 @@ pub fn step(
     Ok((solution, covariance))
 }
 
-/// Regressors and target of one record after the prefilter.
+/// Prefiltered regressors and target of one record.
 struct FilteredRegression {
     phi: Vec<Vec<f64>>,
     target: Vec<f64>,
 }
 
 impl FilteredRegression {
-    /// Scores ψ e at a solution, one row per instrument.
+    /// Return the samplewise product of each instrument with the residuals at the coefficients `x`, one row each.
     fn scores(&self, instruments: &RecordInstruments, x: &[f64]) -> Vec<Vec<f64>> {
         let mut rest = self.target.clone();
         for (column, &place) in self.phi.iter().zip(&instruments.unknown_indices) {
@@ -254,7 +258,7 @@ impl FilteredRegression {
     }
 }
 
-/// First m coefficients of the product of two series.
+/// Return the first `m` coefficients of the product of two series, or an error after a stop request.
 fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Vec<f64>> {
     scratch.stop.check()?;
     let mut out = vec![0.0; m];
@@ -262,14 +266,16 @@ fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Ve
     Ok(out)
 }
 
-/// Refine one equation from an initial guess, with its output simulated from the noise-free signals of its sources.
+/// Refine one equation from an initial guess until its coefficients converge.
 ///
-/// `start` holds the coefficients of the terms, then of the initial terms record by record. Returns the last solution,
-/// the number of iterations and whether they converged.
+/// The output is simulated from the noise-free signals of the sources. `start` contains the coefficients of the terms,
+/// then those of the initial terms record by record. Return the last solution, the number of iterations, and true if
+/// the iteration converged.
 ///
 /// # Errors
-/// Instruments that do not identify the coefficients, or a stop request ([`step`]); a denominator with leading
-/// coefficient zero ([`damped_inverse`]).
+/// [`Singular`](crate::error::Error::Singular) if the instruments do not identify the coefficients.
+/// [`Interrupted`](crate::error::Error::Interrupted) after a stop request.
+/// [`LeadingZero`](crate::error::Error::LeadingZero) if the leading coefficient of the divisor is zero.
 pub fn refine(
     sources: &[InstrumentSource<'_>],
     fixed: &[Option<f64>],

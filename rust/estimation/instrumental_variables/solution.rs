@@ -2,13 +2,13 @@
 //! Garnier and Oustaloup, doi:10.1016/j.automatica.2012.12.006): settings, solutions and the long-run covariance.
 //!
 //! Least squares on the equation error is biased because a measured output enters its own regressors with its noise.
-//! Instruments are free of noise: they follow from the inputs and the model alone. Coupled equations are refined one by
-//! one and then together.
+//! Instruments are free of noise, because they are computed from the inputs and the model alone. Coupled equations are
+//! refined one by one and then together.
 
 use crate::equation::{Equation, Structure};
 use crate::error::{Error, Result};
 
-/// Maximum permitted number of iterations. An iteration that has not converged by then cycles.
+/// Maximum permitted number of iterations. An iteration that has not converged by then oscillates.
 const MAX_ITERATIONS: usize = 1000;
 
 /// Termination criteria of the iteration.
@@ -16,7 +16,7 @@ const MAX_ITERATIONS: usize = 1000;
 pub struct InstrumentalSettings {
     /// Maximum number of iterations.
     pub iterations: usize,
-    /// Relative change of every coefficient below which the iteration has converged.
+    /// Maximum relative change of a coefficient in a step at which the iteration has converged.
     pub tolerance: f64,
 }
 
@@ -27,7 +27,7 @@ impl Default for InstrumentalSettings {
 }
 
 impl InstrumentalSettings {
-    /// Check that the settings are in range.
+    /// Check that the number of iterations and the tolerance are in range.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for more than 1000 iterations, and for a tolerance that is negative or not finite.
@@ -55,19 +55,19 @@ impl InstrumentalSettings {
     }
 }
 
-/// Coefficients of the terms, then of the initial terms record by record.
+/// Coefficients of one equation: those of its terms, then those of its initial terms record by record.
 pub type Solution = Vec<f64>;
 
-/// (record, position) of the excluded initial terms.
+/// Excluded initial terms of one equation, as pairs of record index and exponent index.
 pub type Dropped = Vec<(usize, usize)>;
 
-/// Return the equations with the coefficients of the solutions.
+/// Return the equations with the given structures and the term coefficients of the solutions.
 pub(super) fn equations(structures: &[Structure], solutions: &[Solution]) -> Vec<Equation> {
     let pairs = structures.iter().zip(solutions);
     pairs.map(|(s, x)| Equation { structure: s.clone(), coefficients: x[..s.terms.len()].to_vec() }).collect()
 }
 
-/// (exponent, coefficient) of the initial terms of record r, per equation.
+/// Initial terms of record `r` as pairs (exponent, coefficient), one list per equation.
 pub(super) fn initial_terms(
     r: usize,
     structures: &[Structure],
@@ -85,7 +85,7 @@ pub(super) fn initial_terms(
         .collect()
 }
 
-/// Return true if every coefficient changed by at most `tolerance` relative to its magnitude.
+/// Return true if each of the first `terms` coefficients changed by at most `tolerance` relative to its magnitude.
 pub(super) fn has_converged(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool {
     let largest = after[..terms].iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     before[..terms].iter().zip(after).all(|(a, b)| (a - b).abs() <= tolerance * b.abs().max(1e-9 * largest))
@@ -104,7 +104,7 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + tail
 }
 
-/// Instruments of one record: columns, and the index of the free coefficient of each.
+/// Instruments of one record: columns, and for each column the index of its free coefficient.
 pub(super) struct RecordInstruments {
     pub(super) columns: Vec<Vec<f64>>,
     pub(super) unknown_indices: Vec<usize>,
@@ -116,24 +116,26 @@ impl RecordInstruments {
     }
 }
 
-/// Relative norm of an instrument outside the span of the previous ones below which it is linearly dependent.
+/// Relative norm of an instrument outside the span of the previous ones below which it counts as dependent on them.
 const RANK_TOLERANCE: f64 = 1e-13;
 
-/// Orthonormalize the instruments of all records, one column over all records for each of k free coefficients.
+/// Orthonormalize the instruments of all records in place.
 ///
-/// The result is the factor Q of a QR factorization, by the Gram–Schmidt process with reorthogonalization. The span is
-/// unchanged, so the estimate is the same. The condition number of the products of Q with the regressors is that of the
-/// regressors. Products of the instruments themselves would have its square.
+/// Each of the `k` free coefficients has one instrument, which is stacked over all records. The result is the factor Q
+/// of a QR factorization by the Gram–Schmidt process with reorthogonalization. The span is unchanged, so the estimate
+/// is the same. The products of Q with the regressors have the condition number of the regressors. The products of the
+/// original instruments with the regressors would have the square of that number.
 ///
-/// O(records · k² m), where k counts the free coefficients of one record.
+/// The cost is O(records · k² m) for k free coefficients per record of m pulses.
 ///
 /// # Errors
-/// [`Error::Singular`] if a column depends linearly on the previous ones.
+/// [`Error::Singular`] if an instrument depends linearly on the previous ones.
 pub(super) fn orthonormalize_instruments(records: &mut [RecordInstruments], k: usize) -> Result<()> {
     let mut counts = vec![0; k];
     records.iter().flat_map(|r| &r.unknown_indices).for_each(|&place| counts[place] += 1);
     let singular = |place| Error::Singular { index: place, count: k };
-    // Coefficients of a single record come first: columns of different records are already orthogonal.
+    // Coefficients of a single record come first. Their columns in different records are orthogonal without
+    // computation.
     for record in &mut *records {
         for at in (0..record.unknown_indices.len()).filter(|&at| counts[record.unknown_indices[at]] == 1) {
             let mut column = [std::mem::take(&mut record.columns[at])];
@@ -183,22 +185,22 @@ pub(super) fn orthonormalize_instruments(records: &mut [RecordInstruments], k: u
     Ok(())
 }
 
-/// Subtract `along` times a unit direction from a column; by default its whole projection.
+/// Subtract `along` times a unit direction from a column. If `along` is None, it is the dot product of the two.
 fn subtract_projection(column: &mut [f64], direction: &[f64], along: Option<f64>) {
     let along = along.unwrap_or_else(|| dot(direction, column));
     column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
 }
 
-/// Orthogonalize a column with the function `clear`, twice if its norm drops by half, and normalize it.
+/// Orthogonalize a column with the function `clear`, a second time if its norm has halved, and normalize it.
 ///
-/// Return false if the remainder is at rounding level.
+/// The column is given as one part per record. Return false if its remainder is at rounding level.
 fn orthonormalize_column(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
     let whole = stacked_norm(pieces);
     let (mut before, mut remainder) = (whole, whole);
     for _ in 0..2 {
         clear(pieces);
         remainder = stacked_norm(pieces);
-        // Rounding errors along the previous columns grow by the factor by which the column has shrunk.
+        // Rounding errors along the previous columns grow by the factor by which the norm has decreased.
         if remainder > 0.5 * before {
             break;
         }
@@ -213,8 +215,11 @@ fn stacked_norm(pieces: &[Vec<f64>]) -> f64 {
     pieces.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
 }
 
-/// Add the long-run covariance of the summed scores, with Bartlett weights (doi:10.2307/1913610), to the k × k matrix
-/// `meat`. Filtered residuals are not white if other measured outputs enter the equation.
+/// Add the long-run covariance of the summed scores to the k × k row-major matrix `meat`.
+///
+/// `scores` has one row of samples per instrument, and `places` contains the index of each instrument in the matrix.
+/// Lags have Bartlett weights (Newey and West, doi:10.2307/1913610), because filtered residuals are not white if other
+/// measured outputs enter the equation.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn add_long_run_covariance(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
     let m = scores.first().map_or(0, Vec::len);

@@ -9,31 +9,35 @@ use crate::signal::statistics::{
     WHITENESS_LAGS,
 };
 
-/// Exponent e in the number of autocovariance lags of the robust covariance, which is proportional to (number of
-/// samples)^e.
+/// Exponent e of the number of autocovariance lags in the robust covariance, 4 N^e for N samples.
 const LAG_POWER: f64 = 1.0 / 3.0;
 /// Minimum assumed fraction of the noise variance that remains in the residuals of a fit.
 const MIN_RESIDUAL_NOISE_SHARE: f64 = 0.2;
 
-/// Row-major covariance of the parameters: classical for white residuals, robust to autocorrelation otherwise.
+/// Return the row-major covariance matrix of the parameters; it is robust to autocorrelated residuals.
 ///
-/// A parameter with a component along a direction that is not identifiable has an infinite variance. With a robust loss
-/// the result is the covariance of an M-estimator: clipped residuals, divided by the share of residuals that are not
-/// clipped (Huber & Ronchetti, doi:10.1002/9780470434697, §7.6).
+/// White residuals yield the classical covariance. A parameter has an infinite variance if it has a component along a
+/// direction that is not identifiable. With a robust loss, the result is the covariance of an M-estimator (Huber &
+/// Ronchetti, doi:10.1002/9780470434697, §7.6). It is computed from clipped residuals, divided by the fraction of
+/// residuals that are not clipped.
 ///
 /// # Errors
-/// A Jacobian that is not finite, or residuals of another length ([`covariance_of_residuals`]).
+/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if the residuals have another length than its
+/// rows. [`Error::Structure`] if its singular values are not found.
 pub fn covariance(attempt: &OptimizationResult, grid: &Objective<'_>) -> Result<Vec<f64>> {
     let series: Vec<Vec<f64>> = grid.residuals(attempt).into_iter().flatten().collect();
     let shares = grid.weights.robust_weights.is_some().then(|| grid.flat_sample_weights());
     robust_covariance(&attempt.jacobian, series, shares.as_deref())
 }
 
-/// Covariance of the parameters from a Jacobian multiplied by robust weights, and unweighted residuals by run and
-/// output.
+/// Return the row-major covariance matrix of the parameters from a Jacobian and residuals.
+///
+/// `jacobian` has one row per parameter and includes the robust weights. `series` contains the residuals by run and
+/// output, without robust weights. `shares` contains the robust weight of each residual; it is None for a squared loss.
 ///
 /// # Errors
-/// A Jacobian that is not finite, or residuals of another length ([`covariance_of_residuals`]).
+/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if the residuals or `shares` have another
+/// length than its rows. [`Error::Structure`] if its singular values are not found.
 pub fn robust_covariance(jacobian: &[Vec<f64>], series: Vec<Vec<f64>>, shares: Option<&[f64]>) -> Result<Vec<f64>> {
     let squares = |series: &[Vec<f64>]| {
         let of = |e: &Vec<f64>| sum(&e.iter().map(|v| if v.is_nan() { 0.0 } else { v * v }).collect::<Vec<_>>());
@@ -63,15 +67,19 @@ fn huber_pseudo_residuals(mut series: Vec<Vec<f64>>, parameters: usize) -> Vec<V
     series
 }
 
-/// Row-major covariance from a Jacobian (one row per parameter), residuals by run and output, and their sum of squares.
-/// Residuals of missing samples are NaN.
+/// Return the row-major covariance matrix of the parameters from a Jacobian, residuals and their sum of squares.
 ///
-/// The computation uses the singular values of the Jacobian with rows scaled to unit norm; the normal equations would
-/// lose half of the digits. Singular values at rounding level count as zero, and their directions as not identifiable.
-/// Covariances with a parameter of infinite variance are NaN. O(p² m + p m log m).
+/// `jacobian` has one row per parameter. `series` contains the residuals by run and output, NaN for missing samples.
+/// `squares` is their sum of squares.
+///
+/// The computation uses the singular values of the Jacobian with rows scaled to unit norm, because the normal equations
+/// would lose half of the digits. Singular values at rounding level count as zero, and their directions as not
+/// identifiable. Covariances with a parameter of infinite variance are NaN. The cost is O(p² m + p m log m) for p
+/// parameters and m residuals.
 ///
 /// # Errors
-/// [`Error::NotFinite`] for the Jacobian, [`Error::Length`] if correlated residuals differ from it in length.
+/// [`Error::NotFinite`] if the Jacobian is not finite. [`Error::Length`] if its rows differ in length, or if
+/// autocorrelated residuals have another length. [`Error::Structure`] if its singular values are not found.
 #[allow(clippy::cast_precision_loss)]
 pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squares: f64) -> Result<Vec<f64>> {
     let (p, count) = (jacobian.len(), jacobian.first().map_or(0, Vec::len));
@@ -114,7 +122,7 @@ pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squar
         lost_share.sum::<f64>().sqrt() > turned
     };
     let mut unseen: Vec<bool> = (0..p).map(|i| significant.len() < sizes.len() && is_beyond(i)).collect();
-    // Rows of the pseudoinverse in the singular basis: the "bread" of the sandwich in factored form.
+    // Rows of the pseudoinverse in the singular basis: the outer factor ("bread") of the sandwich covariance.
     let inverse: Vec<Vec<f64>> =
         (0..p).map(|i| significant.iter().map(|&k| right[k][i] / sizes[k]).collect()).collect();
     let middle = if series.iter().all(|e| is_white(e, WHITENESS_LAGS)) {
@@ -138,7 +146,7 @@ pub fn covariance_of_residuals(jacobian: &[Vec<f64>], series: &[Vec<f64>], squar
     Ok(result)
 }
 
-/// Sum of weighted rows, Σ weight · row.
+/// Return Σ weight · row, the weighted sum of rows with `count` elements each.
 fn weighted_row_sum(weights: &[f64], rows: &[&[f64]], count: usize) -> Vec<f64> {
     let mut out = vec![0.0; count];
     for (weight, row) in weights.iter().zip(rows) {
@@ -147,25 +155,28 @@ fn weighted_row_sum(weights: &[f64], rows: &[&[f64]], count: usize) -> Vec<f64> 
     out
 }
 
-/// Number of autocovariance lags for a number of samples.
+/// Return the number of autocovariance lags for a number of samples.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn lag_count(samples: usize) -> usize {
     (4.0 * libm::pow(samples as f64, LAG_POWER)) as usize
 }
 
-/// Quadratic form R C Rᵀ of rows R with the Toeplitz matrix C of the autocovariances.
+/// Return the quadratic form R C Rᵀ, row-major, of rows R with the Toeplitz matrix C of the autocovariances.
 fn quadratic_form(rows: &[&[f64]], covariances: &[f64]) -> Vec<f64> {
     let (p, weighted) = (rows.len(), multiply_toeplitz(rows, covariances));
     let product = |i: usize, j: usize| inner(&weighted[i], rows[j]);
     (0..p * p).map(|at| 0.5 * (product(at / p, at % p) + product(at % p, at / p))).collect()
 }
 
-/// Covariance of least-squares estimates with autocorrelated noise, modeled by an autoregression of the residuals.
+/// Return the covariance of least-squares estimates for noise that is modeled by an autoregression of the residuals.
 ///
-/// The regressors do not depend on the noise, so the autocovariances determine the covariance. An autoregression
-/// describes them with few parameters. Sums over lags lose slow correlations such as 0.9 per sample. The fit removes
-/// the noise along the orthonormal `basis` of its regressors from the residuals. The result is corrected for this loss,
-/// which is larger if the noise has the spectrum of the regressors.
+/// `answers` contains the rows of the pseudoinverse of the Jacobian, one per parameter. `basis` is an orthonormal basis
+/// of the regressors, and `series` contains the residuals by run and output. The result is row-major.
+///
+/// The regressors do not depend on the noise, so the autocovariances of the noise determine the covariance. An
+/// autoregression describes them with few parameters. Sums over lags would miss slow correlations such as 0.9 per
+/// sample. The fit removes the noise along `basis` from the residuals. The result is corrected for this loss, which is
+/// larger if the noise has the spectrum of the regressors.
 #[allow(clippy::cast_precision_loss)]
 fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[Vec<f64>]) -> Vec<f64> {
     let mut total = vec![0.0; answers.len() * answers.len()];
@@ -192,7 +203,7 @@ fn autoregressive_covariance(answers: &[Vec<f64>], basis: &[&[f64]], series: &[V
     total
 }
 
-/// Scale a covariance up to the variances of another one where these are larger.
+/// Scale the covariance `one` so that no variance is below that of `other`; correlations are unchanged.
 fn widen_covariance(one: Vec<f64>, other: &[f64]) -> Vec<f64> {
     let p = one.len().isqrt();
     let stretch = |i: usize| (other[i * p + i] / one[i * p + i].max(f64::MIN_POSITIVE)).max(1.0).sqrt();
@@ -200,12 +211,14 @@ fn widen_covariance(one: Vec<f64>, other: &[f64]) -> Vec<f64> {
     one.iter().enumerate().map(|(at, value)| value * stretches[at / p] * stretches[at % p]).collect()
 }
 
-/// Long-run covariance of the summed scores with Bartlett weights, the middle of the sandwich (doi:10.2307/1913610).
+/// Return the long-run covariance of the summed scores, the middle factor of the sandwich covariance, row-major.
 ///
-/// The weights act like autocovariances, so the sum over lags is a circular convolution. O(p² m + p m log m).
+/// `jacobian` has one row per parameter. `series` contains the residuals by run and output, NaN for missing samples.
+/// Lags have Bartlett weights (Newey and West, doi:10.2307/1913610). The weights act like autocovariances, so the sum
+/// over lags is computed as a circular convolution. The cost is O(p² m + p m log m) for p parameters and m residuals.
 ///
 /// # Errors
-/// [`Error::Length`] if the residuals and the Jacobian differ in length.
+/// [`Error::Length`] if the residuals and the rows of the Jacobian differ in length.
 #[allow(clippy::cast_precision_loss)]
 pub fn long_run_covariance(jacobian: &[Vec<f64>], series: &[Vec<f64>]) -> Result<Vec<f64>> {
     let count = series.iter().map(Vec::len).sum();

@@ -22,33 +22,34 @@ use crate::recording::{Recording, Recordings, Sampling};
 use crate::regressors::BANK_LIMIT;
 use crate::signal::statistics::{mean, median, white_noise_deviation};
 
-/// Share of the multistart in the progress of a fit. Each later sweep over all runs takes [`SWEEP_PROGRESS_SHARE`] of
-/// the rest.
+/// Fraction of the progress of a fit that is complete after its multistart.
 const MULTISTART_PROGRESS_SHARE: f64 = 0.5;
+/// Fraction of the remaining multistart progress that each sweep over the candidates takes.
 const SWEEP_PROGRESS_SHARE: f64 = 0.3;
 /// Noise standard deviation assumed in a coarse fit, relative to the standard deviation of the output.
 const COARSE_RESIDUAL_RATIO: f64 = 0.01;
-/// Minimum noise standard deviation of an output in a warm start, relative to the standard deviation of the output.
+/// Minimum of the estimated noise standard deviation, relative to the standard deviation of the output.
 const MIN_NOISE_RATIO: f64 = 1e-3;
+/// Minimum noise standard deviation in a warm start, which avoids a division by zero.
 const MIN_NOISE_DEVIATION: f64 = 1e-300;
-/// Maximum number of evaluations of each survivor of the multistart on all samples, or on the first part of a long
-/// record.
+/// Maximum number of evaluations of each survivor in the fit on all samples, or on the first part of a long record.
 const MAX_FINAL_EVALUATIONS: usize = 60;
-/// Ratio of the cost per residual on all samples to that on the first part above which the other survivors are tried on
-/// all samples.
+/// Maximum ratio of the cost per residual on all samples to that on the first part of the runs.
+///
+/// If it is exceeded, the other survivors are also evaluated on all samples.
 const MAX_COST_RATIO: f64 = 2.0;
 
-/// Standard deviation of an output, and an initial guess of its noise standard deviation.
+/// Standard deviation of an output, and an estimate of its noise standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutputScale {
-    /// Standard deviation: root of the mean variance over all runs.
+    /// Standard deviation of the output: root of the mean variance over all runs.
     pub deviation: f64,
-    /// Standard deviation of the white noise.
+    /// Estimated standard deviation of the white noise of the output.
     pub noise: f64,
 }
 
 impl OutputScale {
-    /// Scale of an output from its samples by run; NaN marks missing samples.
+    /// Return the scale of an output from its samples, one list per run; NaN marks missing samples.
     #[must_use]
     pub fn from_runs(runs: &[Vec<f64>]) -> Self {
         let variance = |samples: &Vec<f64>| {
@@ -60,7 +61,7 @@ impl OutputScale {
         Self::from_deviation(size, runs)
     }
 
-    /// Scale of each output of the runs.
+    /// Return the scale of each output of the runs.
     ///
     /// # Errors
     /// [`Error::Structure`] for an output that does not exist.
@@ -75,9 +76,9 @@ impl OutputScale {
         outputs.iter().enumerate().map(of).collect()
     }
 
-    /// Scale of an output from its standard deviation and its samples by run.
+    /// Return the scale of an output with the given standard deviation from its samples, one list per run.
     ///
-    /// The noise is estimated from second differences, with a lower limit relative to the standard deviation.
+    /// The noise is estimated from second differences of the samples. It is at least 10⁻³ of the standard deviation.
     #[must_use]
     pub fn from_deviation(deviation: f64, runs: &[Vec<f64>]) -> Self {
         let noise = median(runs.iter().map(|samples| white_noise_deviation(samples)).collect());
@@ -85,14 +86,14 @@ impl OutputScale {
     }
 }
 
-/// Initialization of a fit.
+/// Initial guesses of a fit: multistart, one initial guess, or warm start.
 #[derive(Debug, Clone)]
 pub enum Initialization {
-    /// Multistart from automatic initial guesses, or the result of an earlier one, plus given initial guesses.
+    /// Multistart from automatic initial guesses, or the candidates of an earlier one, plus given initial guesses.
     Multistart {
-        /// Initial guesses, each with values of all free parameters.
+        /// Given initial guesses, each with the values of all free parameters.
         known: Vec<Vec<f64>>,
-        /// Candidates of an earlier multistart.
+        /// Candidates of an earlier multistart. None runs a new multistart.
         candidates: Option<Vec<Candidate>>,
     },
     /// A single initial guess: values of all free parameters.
@@ -115,42 +116,46 @@ pub enum Initialization {
 pub struct Settings {
     /// Loss function of the residuals. The multistart compares sums of squares.
     pub loss: Loss,
-    /// True to refine the step below the sampling interval. Otherwise the fit is one to be compared with others: its
-    /// optimization ends as soon as the likelihood hardly increases.
+    /// True to refine the step of the simulation below the sampling interval.
+    ///
+    /// If false, the fit is meant for comparison with other fits. Its optimization terminates as soon as the likelihood
+    /// hardly increases.
     pub refine: bool,
-    /// Threads of the multistart; results do not depend on it.
+    /// Number of threads of the multistart. Results do not depend on it.
     pub threads: usize,
 }
 
-/// An optimum of the joint output error.
+/// Optimum of the joint output error of all runs.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct JointFit {
-    /// The optimum and its statistics.
+    /// Optimum and its statistics.
     pub optimum: OptimumStatistics,
     /// Candidates of the multistart, best first.
     pub candidates: Vec<Candidate>,
-    /// Comparison of a stable and an unstable optimum, if one was unstable.
+    /// Comparison of the best optimum with a stable one; None if the best optimum is stable.
     pub stability: Option<StabilityComparison>,
 }
 
-/// Fit problem: parameter set, runs, initial guesses and output scales.
+/// Fit problem: free parameters, runs, source of initial guesses and output scales.
 #[derive(Clone, Copy)]
 pub struct FitProblem<'a> {
-    /// Free parameters.
+    /// Set of free parameters.
     pub free: &'a ParameterSet,
-    /// The runs.
+    /// Runs that are fitted together.
     pub source: &'a Recordings,
     /// Source of initial guesses.
     pub starts: &'a dyn InitialGuessSource,
-    /// Scale of each output.
+    /// Scales of the outputs, one per output.
     pub sizes: &'a [OutputScale],
     /// Cancellation flag.
     pub stop: &'a Stop,
 }
 
 impl<'a> FitProblem<'a> {
-    /// Objective with weights of the outputs; with the tolerance of comparisons unless the step is refined.
+    /// Return the objective with weights `outputs`.
+    ///
+    /// Unless `refine` is true, it has the looser tolerance for comparisons.
     fn grid(&self, outputs: Vec<f64>, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
         let weights = Weights { outputs, robust_weights: None };
         let source: &'a Recordings = self.source;
@@ -158,24 +163,25 @@ impl<'a> FitProblem<'a> {
         Ok(if refine { grid } else { grid.for_comparison() })
     }
 
-    /// Objective with equal weights of all outputs relative to their standard deviations.
+    /// Return the objective with equal weights of all outputs relative to their standard deviations.
     ///
-    /// The optimum depends on the noise levels, but a search far from it does not need them.
+    /// The optimum depends on the noise levels, but a search far from the optimum does not need them.
     fn equally_weighted_grid(&self, sampling: Sampling, refine: bool) -> Result<Objective<'a>> {
         let weights = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
         self.grid(weights, sampling, refine)
     }
 
-    /// Cost per residual of white noise alone, with equal weights of the outputs.
+    /// Mean square of the weighted residuals if they are white noise alone, with equal weights of the outputs.
     fn noise_floor(&self) -> f64 {
         let share = |size: &OutputScale| (size.noise / (COARSE_RESIDUAL_RATIO * size.deviation)).powi(2);
         mean(&self.sizes.iter().map(share).collect::<Vec<_>>())
     }
 
-    /// Run the multistart; return its candidates, best first.
+    /// Run the multistart and return its candidates, best first.
     ///
     /// # Errors
-    /// As the source, the initial guesses and the listener; [`Error::Interrupted`].
+    /// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress
+    /// listener if it returns one. [`Error::Interrupted`] after a stop request.
     pub fn run_multistart(&self, threads: usize, pace: &mut FitProgress<'_>) -> Result<Vec<Candidate>> {
         let floor = self.noise_floor();
         let weights: Vec<f64> = self.sizes.iter().map(|size| 1.0 / (COARSE_RESIDUAL_RATIO * size.deviation)).collect();
@@ -199,21 +205,23 @@ impl<'a> FitProblem<'a> {
     }
 }
 
-/// Free orders and coefficients of equations by name, and the fit that they are from.
+/// Estimated orders and coefficients of equations by name, and the fit that yields them.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct EquationFit {
     /// Estimates by parameter name.
     pub values: BTreeMap<String, f64>,
-    /// The optimum; its parameters are in the sequence of [`ParameterSet::names`].
+    /// Fit. Its parameters are in the sequence of [`ParameterSet::names`].
     pub fit: JointFit,
 }
 
-/// Fit equations to runs that start at rest by output error with squared loss, automatic initial guesses, a refined
-/// step and one thread.
+/// Fit equations by output error to runs with zero initial conditions.
+///
+/// The fit uses a squared loss, automatic initial guesses, a refined step and one thread.
 ///
 /// # Errors
-/// As [`fit`]; [`Error::Diverged`] if no initial guess has a finite simulation.
+/// [`Error::Diverged`] if no initial guess has a finite simulation. [`Error::Structure`] if the equations or runs are
+/// invalid. [`Error::Beyond`] if squares of residuals overflow.
 pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -> Result<EquationFit> {
     let runs = Recordings::new(runs)?;
     let signals = runs.runs()[0].channels().iter().map(|channel| channel.name.clone()).collect();
@@ -235,11 +243,12 @@ pub fn fit_equations(runs: Vec<Recording>, equations: Vec<ParametricEquation>) -
     Ok(EquationFit { values: free.names().cloned().zip(fit.optimum.estimate.iter().copied()).collect(), fit })
 }
 
-/// Fit a structure to runs by output error; None if no initial guess has a finite simulation.
+/// Fit a structure to runs by output error. Return None if no initial guess has a finite simulation.
 ///
 /// # Errors
-/// As the source and the initial guesses; [`Error::Beyond`] if squares of residuals overflow; the error of the last
-/// survivor if no survivor can be simulated; [`Error::Interrupted`].
+/// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
+/// if it returns one. [`Error::Beyond`] if squares of residuals overflow. The error of the last survivor if no survivor
+/// of the multistart can be simulated. [`Error::Interrupted`] after a stop request.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -323,7 +332,7 @@ pub fn fit(
     }
     let mut best = select_on_part(sought, &contenders, grid.sampling, settings.refine)?;
     if sought.sizes.len() > 1 {
-        // With a single output the noise level does not move the optimum.
+        // With a single output, the optimum does not depend on the noise level.
         let place = &best.result.iterate;
         best = best.with_result(grid.minimize_in(
             &free.problem_at(place, false, &[]),
@@ -342,8 +351,9 @@ pub fn fit(
 /// Origin label of a given initial guess.
 const GIVEN_START_ORIGIN: &str = "given start";
 
-/// Finish a fit with converged weights: choose a stable optimum over an unstable one, refine the step, compute
-/// statistics.
+/// Finish a fit whose weights have converged.
+///
+/// A stable optimum may replace an unstable one. Then the step is refined, and the statistics are computed.
 fn finish_fit(
     free: &ParameterSet,
     best: Candidate,
@@ -368,13 +378,18 @@ fn finish_fit(
 }
 
 /// Fit a candidate by iteratively reweighted least squares until the weights converge.
+///
+/// Return the fitted candidate and the objective with the final weights.
 fn reweight_candidate<'a>(runner: &Candidate, grid: Objective<'a>, loss: Loss) -> Result<(Candidate, Objective<'a>)> {
     let (attempt, grid) = fit_reweighted(&runner.result.iterate, grid, loss)?;
     Ok((runner.with_result(attempt), grid))
 }
 
-/// Best survivor of the multistart, fitted to all samples. For long records it is selected on their first part, unless
-/// its cost rises or its fit fails on all samples.
+/// Return the best survivor of the multistart, fitted to all samples.
+///
+/// For long records, the survivor is selected on their first part and then fitted to all samples. If that fit fails,
+/// the selection is repeated on all samples. It is also repeated if the cost rises and another survivor has a lower
+/// cost.
 fn select_on_part(
     sought: FitProblem<'_>,
     contenders: &[Candidate],
@@ -390,7 +405,7 @@ fn select_on_part(
             let end = whole.minimize_in(&problem, place, MAX_FINAL_EVALUATIONS)?;
             Ok((best.cost_per_residual(), best.with_result(end)))
         });
-        // On all samples its simulation may overflow, or be much worse than that of another survivor.
+        // On all samples, the simulation of the winner may overflow, or be much worse than that of another survivor.
         match winner {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Ok((partial, best)) => {
@@ -405,7 +420,7 @@ fn select_on_part(
     select_best_candidate(sought, contenders, &whole)
 }
 
-/// True if one of the candidates, without further optimization, has a lower cost on a grid than `best`.
+/// Return true if a candidate, without further optimization, has a lower cost on the objective `grid` than `best`.
 fn is_beaten(best: &Candidate, candidates: &[Candidate], grid: &Objective<'_>) -> Result<bool> {
     for candidate in candidates {
         if grid.evaluate(&candidate.result.iterate)?.is_some_and(|evaluation| evaluation.cost < best.result.cost) {
@@ -415,7 +430,7 @@ fn is_beaten(best: &Candidate, candidates: &[Candidate], grid: &Objective<'_>) -
     Ok(false)
 }
 
-/// Best survivor on a grid, with equal weights of all outputs.
+/// Fit the survivors with the objective `near` and return the best one.
 fn select_best_candidate(sought: FitProblem<'_>, contenders: &[Candidate], near: &Objective<'_>) -> Result<Candidate> {
     let free = sought.free;
     let fit = |runner: &Candidate, evaluations| {
@@ -428,7 +443,7 @@ fn select_best_candidate(sought: FitProblem<'_>, contenders: &[Candidate], near:
         match fit(runner, FIRST_BUDGET_EVALUATIONS) {
             Ok(attempt) => short.push(runner.with_result(attempt)),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
-            // No finite simulation on this grid; other survivors may have one.
+            // This survivor has no finite simulation on this grid. Other survivors may have one.
             Err(error) => last = Some(error),
         }
     }
@@ -447,7 +462,7 @@ fn select_best_candidate(sought: FitProblem<'_>, contenders: &[Candidate], near:
         _ => near.finer()?.rank_results(&attempts)?[0],
     };
     let best = &ends[first];
-    // The fit in logarithmic coordinates is done; repeat it in plain ones.
+    // The previous fits use logarithmic coordinates. The best one is continued in plain coordinates.
     let place = &best.result.iterate;
     let plain = near.minimize_in(&free.problem_at(place, true, &[]), place, MAX_FINAL_EVALUATIONS)?;
     Ok(if plain.cost <= best.result.cost { best.with_result(plain) } else { best.clone() })

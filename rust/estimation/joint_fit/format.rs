@@ -1,6 +1,6 @@
 //! Formatting of numbers with few significant digits.
 
-/// Format a number like `g` in C and Python: significant digits without trailing zeros, with an exponent if needed.
+/// Format a number like `g` in C and Python, with at most `digits` significant digits and no trailing zeros.
 pub(crate) fn format_general(value: f64, digits: usize) -> String {
     if !value.is_finite() {
         return if value.is_nan() {
@@ -12,7 +12,7 @@ pub(crate) fn format_general(value: f64, digits: usize) -> String {
         };
     }
     let most = digits.max(1) - 1;
-    // Rounding first: 9.99 in two digits is 10.
+    // The exponent is that of the rounded value: 9.99 in two digits is 10.
     let rounded = format!("{value:.most$e}");
     let Some((mantissa, exponent)) = rounded.split_once('e') else { return rounded };
     let power: i64 = exponent.parse().unwrap_or(0);
@@ -29,7 +29,7 @@ pub(crate) fn format_general(value: f64, digits: usize) -> String {
     }
 }
 
-/// Remove trailing zeros after the decimal point, and a trailing point.
+/// Remove trailing zeros after the decimal point, and a decimal point at the end.
 fn trim_zeros(text: &str) -> &str {
     if text.contains('.') {
         text.trim_end_matches('0').trim_end_matches('.')

@@ -3,9 +3,9 @@
 //! A `ParameterSet` lists the free parameters of a structure. Initial guesses come from coarse order grids. A
 //! multistart with successive halving optimizes them on subsampled records. Iterative reweighting then estimates the
 //! noise level of each output. An unstable optimum is kept only if it fits significantly better than a stable one.
-//! Finally the step is halved until the estimate changes by a small part of its standard error, and extrapolated to
-//! zero step. [`fit::fit`] runs all of it. [`Recordings`](crate::recording::Recordings) sample the runs at the requested
-//! step.
+//! Finally the step of the simulation is halved until the estimate changes by a small part of its standard error. The
+//! estimate is extrapolated to zero step. [`fit::fit`] performs all of these steps.
+//! [`Recordings`](crate::recording::Recordings) sample the runs at the requested step.
 
 pub mod covariance;
 pub mod fit;

@@ -1,4 +1,4 @@
-//! Objective of a joint fit: a problem on sampled runs, with output weights and robust weights.
+//! Objective of a joint fit: weighted residuals of a problem on sampled runs.
 
 use std::sync::Arc;
 
@@ -11,23 +11,24 @@ use crate::parallel::Stop;
 use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::{mean, robust_deviation, root_mean_square};
 
-/// Relative cost decrease predicted for a full step below which an optimization has converged.
+/// Relative cost decrease, predicted for a full step, below which an optimization has converged.
 pub const RELATIVE_COST_TOLERANCE: f64 = 1e-9;
-/// Increase of twice the log-likelihood predicted for a full step below which a fit that is only compared with others
-/// has converged.
+/// Increase of twice the log-likelihood, predicted for a full step, below which a fit for comparison has converged.
+///
+/// Such a fit is only compared with other fits.
 const COMPARISON_LIKELIHOOD_TOLERANCE: f64 = 2e-4;
-/// Maximum acceptable discretization error, in standard deviations of the noise.
+/// Maximum acceptable discretization error, relative to the root mean square residual or, if larger, the noise.
 const MAX_DISCRETIZATION_NOISE_RATIO: f64 = 0.3;
-/// Finest grid, in block pulses per sampling interval.
+/// Maximum number of block pulses per sampling interval.
 pub const MAX_PULSES_PER_SAMPLE: usize = 16;
 
-/// Deviation of a delay in sampling intervals from a whole number below which it is whole.
+/// Difference between a delay and a whole number of sampling intervals, in intervals, below which it counts as whole.
 const WHOLE_DELAY_TOLERANCE: f64 = 1e-9;
 
-/// Weights 1/σ of the outputs, and robust weights of the samples.
+/// Weights of the outputs, and robust weights of the samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Weights {
-    /// Weight 1/σ of each output.
+    /// Weight 1/σ of each output, with its noise standard deviation σ.
     pub outputs: Vec<f64>,
     /// Robust weight of each compared sample, by run and output; None for unit weights.
     pub robust_weights: Option<Vec<Vec<Vec<f64>>>>,
@@ -36,7 +37,7 @@ pub struct Weights {
 /// Objective of a joint fit: weighted residuals of a problem on sampled runs.
 #[derive(Clone)]
 pub struct Objective<'a> {
-    /// The optimization problem.
+    /// Optimization problem.
     pub problem: &'a Problem,
     source: &'a Recordings,
     stop: &'a Stop,
@@ -44,20 +45,21 @@ pub struct Objective<'a> {
     pub weights: Weights,
     /// Sampling of the runs.
     pub sampling: Sampling,
-    /// True if an optimization must not go from a stable model to an unstable one.
+    /// True if an optimization must not move from a stable model to an unstable one.
     pub requires_stability: bool,
-    /// Relative decrease of the cost by a full step below which an optimization has converged.
+    /// Relative decrease of the cost, predicted for a full step, below which an optimization has converged.
     tolerance: f64,
-    /// Weight 1 of the present and 0 of the missing samples, by run and output; empty without missing samples.
+    /// Weight of each sample by run and output: 1 if present, 0 if missing. Empty without missing samples.
     sample_mask: Arc<Vec<Vec<Vec<f64>>>>,
     experiments: Arc<Vec<Experiment>>,
 }
 
 impl<'a> Objective<'a> {
-    /// Objective of a problem on the runs of a source.
+    /// Return the objective of a problem on the given runs; `steady` sets [`Objective::requires_stability`].
     ///
     /// # Errors
-    /// As the source; [`Error::Length`] for a wrong number of weights.
+    /// An error if the runs cannot be sampled ([`Recordings::experiments`]). [`Error::Length`] for a wrong number of
+    /// weights. [`Error::Interrupted`] after a stop request.
     pub fn new(
         (problem, source, stop): (&'a Problem, &'a Recordings, &'a Stop),
         weights: Weights,
@@ -84,7 +86,7 @@ impl<'a> Objective<'a> {
         grid.with_weights(weights)
     }
 
-    /// Objective with other weights.
+    /// Return the objective with other weights.
     ///
     /// # Errors
     /// [`Error::Length`] for a wrong number of robust weights.
@@ -101,8 +103,10 @@ impl<'a> Objective<'a> {
         Ok(Self { weights, experiments: Arc::new(experiments), ..self.clone() })
     }
 
-    /// Objective with constants `shifts` added to the residuals of all samples, by run and output, in units of the
-    /// outputs.
+    /// Return the objective with `shifts` added to the compared samples.
+    ///
+    /// `shifts` has one value per run, output and compared sample, in the unit of the output. Values that are not
+    /// finite are ignored.
     #[must_use]
     pub fn with_residual_shifts(&self, shifts: &[Vec<Vec<f64>>]) -> Self {
         let mut experiments = Vec::clone(&self.experiments);
@@ -112,10 +116,11 @@ impl<'a> Objective<'a> {
         Self { experiments: Arc::new(experiments), ..self.clone() }
     }
 
-    /// Objective on a grid with half the step.
+    /// Return the objective on a grid with half the step.
     ///
     /// # Errors
-    /// As the source.
+    /// An error if the runs cannot be sampled at half the step ([`Recordings::experiments`]). [`Error::Interrupted`]
+    /// after a stop request.
     pub fn finer(&self) -> Result<Self> {
         let sampling = Sampling { pulses_per_sample: 2 * self.sampling.pulses_per_sample, ..self.sampling };
         let whole = (self.problem, self.source, self.stop);
@@ -123,9 +128,10 @@ impl<'a> Objective<'a> {
         Ok(Self { tolerance: self.tolerance, ..finer })
     }
 
-    /// Objective whose optimizations end as soon as the likelihood hardly increases, for comparisons of fits.
+    /// Return the objective whose optimizations terminate as soon as the likelihood hardly increases.
     ///
-    /// If the data determine a parameter poorly, the cost has a flat valley, along which this saves most evaluations.
+    /// It serves to compare fits. If the data determine a parameter poorly, the cost has a flat valley. Early
+    /// termination saves most evaluations along this valley.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn for_comparison(self) -> Self {
@@ -134,19 +140,19 @@ impl<'a> Objective<'a> {
         Self { tolerance: tolerance.max(RELATIVE_COST_TOLERANCE), ..self }
     }
 
-    /// Objective of another problem with the same outputs.
+    /// Return the objective of another problem with the same outputs.
     #[must_use]
     pub fn with_problem(&self, problem: &'a Problem) -> Self {
         Self { problem, ..self.clone() }
     }
 
-    /// Objective whose optimization does not go from a stable model to an unstable one.
+    /// Return the objective whose optimizations do not move from a stable model to an unstable one.
     #[must_use]
     pub fn with_stability_constraint(&self) -> Self {
         Self { requires_stability: true, ..self.clone() }
     }
 
-    /// The sampled runs.
+    /// Sampled runs.
     #[must_use]
     pub fn experiments(&self) -> &[Experiment] {
         &self.experiments
@@ -170,10 +176,10 @@ impl<'a> Objective<'a> {
         super::parameter_set::TimeScaling::from_runs(self.problem, &self.source.spans())
     }
 
-    /// Minimize the cost from an iterate by Levenberg–Marquardt.
+    /// Minimize the cost by the Levenberg–Marquardt method from an initial guess.
     ///
     /// # Errors
-    /// An initial guess whose simulation fails, or a stop request ([`Problem::minimize`]).
+    /// The error of the simulation of `start` if it fails. [`Error::Interrupted`] after a stop request.
     pub fn minimize(&self, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
         let settings = MinimizationSettings { evaluations, tolerance: self.tolerance };
         self.problem.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
@@ -182,14 +188,17 @@ impl<'a> Objective<'a> {
     /// Minimize the cost in the coordinates of another problem (see `ParameterSet::problem_at`).
     ///
     /// # Errors
-    /// An initial guess whose simulation fails, or a stop request ([`Problem::minimize`]).
+    /// The error of the simulation of `start` if it fails. [`Error::Interrupted`] after a stop request.
     pub fn minimize_in(&self, turned: &Problem, start: &Iterate, evaluations: usize) -> Result<OptimizationResult> {
         let settings = MinimizationSettings { evaluations, tolerance: self.tolerance };
         turned.minimize(&self.experiments, start, settings, self.requires_stability, self.stop)
     }
 
-    /// True if the simulation does not depend on the step: exact samples of integer orders, or of any orders on long
-    /// records, and no zero-order-hold input that switches within a pulse.
+    /// Return true if the simulation at an iterate does not depend on the step.
+    ///
+    /// This requires a linear problem with exact samples: integer orders, or any orders on long records. The samples
+    /// must not be decimated. Each delay must be a whole number of sampling intervals, so that no input switches within
+    /// a pulse.
     #[must_use]
     pub fn is_exact(&self, place: &Iterate) -> bool {
         let whole = |delay: f64, step: f64| (delay / step - (delay / step).round()).abs() < WHOLE_DELAY_TOLERANCE;
@@ -203,23 +212,24 @@ impl<'a> Objective<'a> {
                 || FractionalOrders::accepts(&self.problem.model, &self.experiments, &place.point))
     }
 
-    /// True if halving the step changes the simulated samples significantly relative to the residuals.
+    /// Return true if halving the step changes the simulated samples significantly relative to the residuals.
     ///
     /// The residuals contain at least the noise, and the model error of an incomplete structure.
     ///
     /// # Errors
-    /// As the source; [`Error::Interrupted`].
+    /// An error if the runs cannot be sampled at half the step ([`Recordings::experiments`]). [`Error::Interrupted`]
+    /// after a stop request.
     pub fn is_discretization_significant(&self, place: &Iterate) -> Result<bool> {
         self.is_refinement_significant(place, &self.finer()?)
     }
 
-    /// True if the simulated samples differ significantly from those on the given finer grid.
+    /// Return true if the simulated samples change significantly, relative to the residuals, on the given finer grid.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
     pub fn is_refinement_significant(&self, place: &Iterate, finer: &Self) -> Result<bool> {
         let (Some(evaluation), Some(finer_evaluation)) = (self.evaluate(place)?, finer.evaluate(place)?) else {
-            // The simulation is finite on one grid only: the difference is significant.
+            // The simulation is not finite on at least one of the grids, so the difference counts as significant.
             return Ok(true);
         };
         let changes: Vec<f64> =
@@ -230,7 +240,7 @@ impl<'a> Objective<'a> {
             || mean(&changes) > MAX_DISCRETIZATION_NOISE_RATIO * MAX_DISCRETIZATION_NOISE_RATIO * mean_square)
     }
 
-    /// Indices of results, sorted by the larger of their costs on their own grid and on this finer one.
+    /// Return the indices of results, sorted by the larger of their costs on their own grid and on this finer grid.
     ///
     /// The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit can use this mode to
     /// follow noise, but its simulation is not reproduced on any other grid.
@@ -254,7 +264,7 @@ impl<'a> Objective<'a> {
         Ok(order)
     }
 
-    /// Residuals and cost of an iterate, without derivatives; None if its simulation is not finite.
+    /// Return the residuals and the cost of an iterate without derivatives; None if its simulation is not finite.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -266,7 +276,9 @@ impl<'a> Objective<'a> {
         }
     }
 
-    /// Weights of the compared samples, by run and output; None for unit weights.
+    /// Iterate over runs and outputs: run, index of the output, and weights of its compared samples.
+    ///
+    /// The weights are None if all are 1.
     fn sample_weights(&self) -> impl Iterator<Item = (&Experiment, usize, Option<&[f64]>)> {
         let outputs = self.problem.outputs.len();
         self.experiments
@@ -274,8 +286,9 @@ impl<'a> Objective<'a> {
             .flat_map(move |e| (0..outputs).map(move |i| (e, i, e.sample_weights.get(i).map(Vec::as_slice))))
     }
 
-    /// Residuals divided by their noise level, by run and output, without robust weights; NaN where a sample is
-    /// missing.
+    /// Return the residuals in standard deviations of the noise, by run and output.
+    ///
+    /// Robust weights are not applied. The residual of a missing sample is NaN.
     #[must_use]
     pub fn residuals(&self, attempt: &OptimizationResult) -> Vec<Vec<Vec<f64>>> {
         let outputs = self.problem.outputs.len();
@@ -299,7 +312,7 @@ impl<'a> Objective<'a> {
         parts
     }
 
-    /// Weight of every residual, in the order of the residual vector.
+    /// Return the robust weight of every residual, in the sequence of the residual vector.
     #[must_use]
     pub fn flat_sample_weights(&self) -> Vec<f64> {
         let of = |(experiment, _, shares): (&Experiment, usize, Option<&[f64]>)| {
@@ -308,7 +321,9 @@ impl<'a> Objective<'a> {
         self.sample_weights().flat_map(of).collect()
     }
 
-    /// Residuals of the present samples by output, in units of the noise, all runs concatenated.
+    /// Return the residuals of each output in standard deviations of the noise, with all runs concatenated.
+    ///
+    /// Missing samples are omitted, and robust weights are not applied.
     #[must_use]
     pub fn residuals_by_output(&self, attempt: &OptimizationResult) -> Vec<Vec<f64>> {
         let parts = self.residuals(attempt);
@@ -316,13 +331,13 @@ impl<'a> Objective<'a> {
         (0..self.problem.outputs.len()).map(of).collect()
     }
 
-    /// Root mean square of the weighted residuals by output, over all runs; infinite on overflow.
+    /// Root mean square of the residuals of each output in noise standard deviations; infinite on overflow.
     #[must_use]
     pub fn residual_root_mean_squares(&self, attempt: &OptimizationResult) -> Vec<f64> {
         self.residuals_by_output(attempt).iter().map(|e| root_mean_square(e)).collect()
     }
 
-    /// Robust standard deviation of the residuals by output, in units of the weights.
+    /// Robust standard deviation of the residuals of each output, in noise standard deviations.
     ///
     /// If more than half of the residuals are zero, it is the root mean square of all residuals.
     #[must_use]

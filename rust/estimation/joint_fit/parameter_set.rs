@@ -14,40 +14,44 @@ use crate::fractional::kernels::MAX_ORDER;
 use crate::nonlinear::FreeFrictionLaw;
 use crate::signal::statistics::median;
 
-/// Default upper bound of free orders. It is higher if the structure contains a higher order.
+/// Default upper bound of free orders. It is higher if the structure contains a higher fixed order.
 pub const SEARCHED_ORDER: f64 = 3.0;
-/// Default bounds of the highest orders.
+/// Default bounds of the highest order of an equation.
 pub const ALPHA_BOUNDS: (f64, f64) = (0.05, SEARCHED_ORDER);
-/// Default bounds of the highest orders of equations with friction.
+/// Default bounds of the highest order of an equation with friction.
 const FRICTION_BOUNDS: (f64, f64) = (1.001, 2.0);
-/// Minimum difference between an estimated ratio of the coefficient law and its lower bound. Ratios are below
-/// [`MAX_RATIO`]. If no equation determines a ratio, its initial guess is [`DEFAULT_RATIO_EXCESS`] above the lower
-/// bound.
+/// Minimum difference between an estimated ratio and its lower bound.
+///
+/// A ratio is a factor of a coefficient law that is not itself a coefficient of the equations.
 const MIN_RATIO_EXCESS: f64 = 0.05;
+/// Maximum estimated ratio.
 const MAX_RATIO: f64 = 20.0;
+/// Difference between the initial guess of a ratio and its lower bound if no equation determines it.
 const DEFAULT_RATIO_EXCESS: f64 = 0.5;
 
-/// Free parameters of a structure. Orders are affine in the free orders, coefficients are products of free
-/// coefficients.
+/// Free parameters of a structure, with bounds and coordinates.
+///
+/// Orders are affine functions of the free orders. Coefficients are products of free coefficients.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterSet {
-    /// The structure.
+    /// Structure to which the free parameters belong.
     pub structure: ParametricStructure,
     /// Names of the free orders.
     pub orders: Vec<String>,
     /// Names of the free coefficients, including the factors of coefficient laws.
     pub coefficients: Vec<String>,
-    /// Coefficients determined by a law.
+    /// Coefficient laws: each determines one coefficient as a product of factors.
     pub products: Vec<Law>,
-    /// The optimization problem.
+    /// Optimization problem over the free parameters.
     pub problem: Problem,
 }
 
 impl ParameterSet {
-    /// Parameter set of a structure.
+    /// Return the parameter set of a structure.
     ///
     /// # Errors
-    /// An invalid equation, signal or order ([`ParametricStructure::check`]), or crossed bounds ([`Problem::new`]).
+    /// An error if an equation, signal or order is invalid ([`ParametricStructure::check`]), or if bounds are crossed
+    /// ([`Problem::new`]).
     pub fn from_structure(structure: ParametricStructure) -> Result<Self> {
         structure.check()?;
         let named = structure.coefficient_names();
@@ -108,7 +112,7 @@ impl ParameterSet {
         &self.problem.model.order_bounds
     }
 
-    /// True if an equation has friction.
+    /// Return true if an equation has friction.
     #[must_use]
     pub fn has_friction(&self) -> bool {
         !self.problem.frictions.is_empty()
@@ -120,10 +124,11 @@ impl ParameterSet {
         self.orders.iter().chain(&self.coefficients).chain(inputs)
     }
 
-    /// Problem with coordinates for an optimization from `start`.
+    /// Return the problem with coordinates for an optimization from `start`.
     ///
-    /// The coordinate of a nonzero coefficient is its logarithm, unless `plain` or there are non-linear terms, whose
-    /// initial guesses may have wrong signs. The parameters with the indices `fixed` are fixed at their values.
+    /// The coordinate of a nonzero coefficient is its logarithm. With nonlinear terms or `plain`, it is the coefficient
+    /// itself, because initial guesses may have wrong signs. Stribeck velocities always have logarithms. The parameters
+    /// with the indices `fixed` are fixed at their values in `start`.
     #[must_use]
     pub fn problem_at(&self, start: &Iterate, plain: bool, fixed: &[usize]) -> Problem {
         let mut problem = self.problem.clone();
@@ -153,7 +158,7 @@ impl ParameterSet {
         problem
     }
 
-    /// All coefficients of the structure, by name, from the values of the free coefficients.
+    /// Return all coefficients of the structure by name, from the values of the free coefficients.
     #[must_use]
     pub fn coefficients_by_name(&self, values: &[f64]) -> BTreeMap<String, f64> {
         let free: BTreeMap<&String, f64> = self.coefficients.iter().zip(values.iter().copied()).collect();
@@ -166,7 +171,9 @@ impl ParameterSet {
         self.structure.coefficient_names().into_iter().map(of).collect()
     }
 
-    /// Free coefficients from unconstrained estimates. Ratios are medians over the equations that determine them.
+    /// Return the free coefficients from unconstrained estimates by name.
+    ///
+    /// A ratio is the median over the equations that determine it.
     #[must_use]
     pub fn free_from(&self, estimated: &BTreeMap<String, f64>) -> Vec<f64> {
         let of = |name: &String| {
@@ -190,7 +197,9 @@ impl ParameterSet {
         self.coefficients.iter().map(of).collect()
     }
 
-    /// Integer values of the free orders within their bounds: 2 for the output, and 1 and 0 for its terms, if possible.
+    /// Return the usual integer values of the free orders, limited to their bounds.
+    ///
+    /// The order of an output is 2. Its own terms have the orders 1 and 0, and input terms have the order 0.
     #[must_use]
     pub fn integer_orders(&self) -> Vec<f64> {
         let mut usual: BTreeMap<&String, f64> = BTreeMap::new();
@@ -206,21 +215,23 @@ impl ParameterSet {
         pairs.map(|(name, (low, high))| usual.get(name).copied().unwrap_or(0.0).max(*low).min(*high)).collect()
     }
 
-    /// Parameter set with other initial terms.
+    /// Return the parameter set of the same structure with other initial terms.
+    ///
+    /// `history` is true if the initial terms represent inputs before the start of a run.
     ///
     /// # Errors
-    /// An invalid equation, signal, order or bound ([`ParameterSet::from_structure`]).
+    /// An error if an equation, signal, order or bound is invalid ([`ParameterSet::from_structure`]).
     pub fn with_initial_terms(&self, initial: Initial, history: bool) -> Result<Self> {
         Self::from_structure(ParametricStructure { initial, history, ..self.structure.clone() })
     }
 
-    /// Lower bound of a ratio of the coefficient law.
+    /// Lower bound of a ratio, which is a factor of a coefficient law; 1 by default.
     fn ratio_lower_bound(&self, ratio: &String) -> f64 {
         self.structure.hints.ratio_lower_bounds.get(ratio).copied().unwrap_or(1.0)
     }
 }
 
-/// Bounds of the free orders: given ones, else defaults.
+/// Return the bounds of the free orders: the given ones, or else the defaults.
 fn bounds(structure: &ParametricStructure, orders: &[String]) -> Vec<(f64, f64)> {
     let highest: Vec<&String> =
         structure.equations.iter().filter(|e| e.order.is_single()).flat_map(|e| e.order.names()).collect();
@@ -243,7 +254,10 @@ fn bounds(structure: &ParametricStructure, orders: &[String]) -> Vec<(f64, f64)>
     orders.iter().map(of).collect()
 }
 
-/// Default upper bound of a free order: 3, or one above the highest fixed order of its equations if that is larger.
+/// Default upper bound of a free order: at least 3.
+///
+/// It is raised to the highest fixed order n of the equations that contain this order. If the order is the highest of
+/// an equation (`above`), it is raised to n + 1.
 fn upper_order_bound(structure: &ParametricStructure, name: &String, above: bool) -> f64 {
     let beside = structure.equations.iter().filter(|e| e.orders().any(|order| order.names().any(|n| n == name)));
     let numbers =
@@ -251,8 +265,7 @@ fn upper_order_bound(structure: &ParametricStructure, name: &String, above: bool
     numbers.map(|n| n + f64::from(u8::from(above))).fold(SEARCHED_ORDER, f64::max).min(MAX_ORDER)
 }
 
-/// Time scaling of a problem: a unit of time chosen by its runs, and the exponent of this unit in the unit of each
-/// parameter.
+/// Time scaling of a problem: a unit of time, and the exponent of this unit in the unit of each parameter.
 #[derive(Debug, Clone)]
 pub struct TimeScaling {
     unit: Unit,
@@ -262,7 +275,7 @@ pub struct TimeScaling {
 }
 
 impl TimeScaling {
-    /// Time scaling for runs of the given (sampling interval, duration).
+    /// Return the time scaling for runs with the given (sampling interval, duration) \[s\].
     ///
     /// The unit is the inverse of the geometric mean of the lowest frequency of the runs and the Nyquist frequency.
     #[must_use]
@@ -276,13 +289,13 @@ impl TimeScaling {
         }
     }
 
-    /// Natural logarithm of the unit of time.
+    /// Natural logarithm of the unit of time in seconds.
     #[must_use]
     pub fn unit(&self) -> f64 {
         self.unit.log_unit()
     }
 
-    /// Factor that converts each parameter to the unit of time. It depends on the orders only.
+    /// Factors that convert the parameters from seconds to the scaled unit of time. They depend on the orders only.
     fn factors(&self, values: &[f64]) -> Vec<f64> {
         let of = |i: usize| match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => self.unit.factor(j, &values[..self.orders]),
@@ -291,8 +304,9 @@ impl TimeScaling {
         (0..self.size).map(of).collect()
     }
 
-    /// Return the relative decrease of parameter i in seconds, if the orders change by `step` and its value in the
-    /// scaled unit of time is constant.
+    /// Return the relative decrease of parameter `i` in seconds due to a change of the orders by `step`.
+    ///
+    /// The value of the parameter in the scaled unit of time is constant.
     fn relative_decrease(&self, i: usize, step: &[f64]) -> f64 {
         match i.checked_sub(self.orders) {
             Some(j) if j < self.coefficients => {
@@ -302,19 +316,19 @@ impl TimeScaling {
         }
     }
 
-    /// Convert parameters to the unit of time.
+    /// Convert parameter values from seconds to the scaled unit of time.
     #[must_use]
     pub fn to_scaled(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v * f).collect()
     }
 
-    /// Convert parameters from the unit of time back to seconds.
+    /// Convert parameter values from the scaled unit of time to seconds.
     #[must_use]
     pub fn to_unscaled(&self, values: &[f64]) -> Vec<f64> {
         values.iter().zip(self.factors(values)).map(|(v, f)| v / f).collect()
     }
 
-    /// Convert a small step in the unit of time to a step of the parameters at the given values.
+    /// Convert small changes of the parameters from the scaled unit of time to seconds, at the given values.
     #[must_use]
     pub fn step(&self, values: &[f64], changes: &[f64]) -> Vec<f64> {
         let factors = self.factors(values);
@@ -322,8 +336,9 @@ impl TimeScaling {
         values.iter().enumerate().map(of).collect()
     }
 
-    /// Standard errors in the unit of time, from a row-major covariance; infinite for a parameter that is not
-    /// identifiable.
+    /// Return the standard errors in the scaled unit of time from a row-major covariance matrix in seconds.
+    ///
+    /// The error is infinite for a parameter that is not identifiable.
     #[must_use]
     pub fn standard_errors(&self, values: &[f64], covariance: &[f64]) -> Vec<f64> {
         let (n, factors) = (values.len(), self.factors(values));
@@ -390,7 +405,7 @@ mod tests {
         let change: Vec<f64> = minutes.to_scaled(&shifted).iter().zip(&scaled).map(|(a, b)| a - b).collect();
         let step = minutes.step(&values, &change);
         assert!(step.iter().zip(tiny).all(|(a, b)| (a - b).abs() < 1e-9));
-        // Slopes by differences give the errors of independent parameters.
+        // Slopes by finite differences yield the standard errors of independent parameters.
         let n = values.len();
         let deviations = [0.1, 0.2, 0.05, 0.3, 2.0, 0.5, 0.4];
         let covariance: Vec<f64> =
@@ -404,7 +419,7 @@ mod tests {
             let expected = (0..n).map(|j| (slope(i, j) * deviations[j]).powi(2)).sum::<f64>().sqrt();
             assert!((error - expected).abs() <= 1e-3 * expected);
         }
-        // An order that is not identifiable leaves its coefficient without an error, too.
+        // If an order is not identifiable, its coefficients have no finite error either.
         let mut unseen = covariance;
         unseen[2 * n + 2] = f64::INFINITY;
         let errors = minutes.standard_errors(&values, &unseen);

@@ -1,5 +1,6 @@
-//! Problem of a joint fit: iterates, optimization, candidates and feasible steps. Equations may have friction and
-//! non-linear terms.
+//! Problem of a joint fit: iterates, optimization, candidates and feasible steps.
+//!
+//! Equations may have friction and nonlinear terms.
 
 use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
@@ -17,20 +18,22 @@ use crate::signal::statistics::inner;
 pub struct Problem {
     /// Names of the outputs, one per equation, for messages.
     pub outputs: Vec<String>,
-    /// The equations and the coordinates of the optimization.
+    /// Equations and coordinates of the optimization.
     pub model: FreeModel,
-    /// Friction laws by index of their equation.
+    /// Friction laws, each with the index of its equation.
     pub frictions: Vec<(usize, FreeFrictionLaw)>,
-    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
+    /// Expressions that are the signals of nonlinear terms. They are numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
 }
 
 impl Problem {
-    /// Problem in the coordinates of the model; Stribeck velocities are positive and use logarithms.
+    /// Return a problem in the coordinates of the model.
+    ///
+    /// Stribeck velocities are positive, so their coordinates are logarithms.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::Structure`] for an unknown coefficient or equation, or crossed bounds; as
-    /// [`AffineOrder::check`].
+    /// [`Error::Length`] if `outputs` does not have one name per equation. [`Error::Structure`] for an unknown
+    /// coefficient or equation, and for crossed bounds. Also the errors of an invalid order ([`AffineOrder::check`]).
     pub fn new(outputs: Vec<String>, mut model: FreeModel, frictions: Vec<(usize, FreeFrictionLaw)>) -> Result<Self> {
         check_length("outputs", model.equations.len(), outputs.len())?;
         let coefficients = model.coordinates.len();
@@ -61,13 +64,15 @@ impl Problem {
         Ok(Self { outputs, model, frictions, derived: Vec::new() })
     }
 
-    /// Problem with derived signals, numbered after the recorded ones.
+    /// Return the problem with derived signals, which are numbered after the recorded ones.
     #[must_use]
     pub fn with_derived(self, derived: Vec<DerivedSignal>) -> Self {
         Self { derived, ..self }
     }
 
-    /// True if the simulation is linear in coefficients of inputs and in initial terms.
+    /// Return true if the simulation is linear in the coefficients of inputs and in the initial terms.
+    ///
+    /// This is the case without friction and without nonlinear terms.
     #[must_use]
     pub fn is_linear(&self) -> bool {
         self.frictions.is_empty() && self.derived.is_empty()
@@ -79,7 +84,7 @@ impl Problem {
         self.model.order_bounds.len() + self.model.coordinates.len() + self.model.inputs.len()
     }
 
-    /// Convert the values of all free parameters to a point.
+    /// Convert the values of all free parameters (orders, coefficients, input parameters) to a point.
     ///
     /// # Errors
     /// [`Error::Length`] for a number of values that differs from the number of free parameters.
@@ -90,7 +95,9 @@ impl Problem {
         Ok(ParameterPoint { orders: orders.into(), coefficients: coefficients.into(), inputs: inputs.into() })
     }
 
-    /// Bounds of all free parameters. Coefficients are unbounded, except that friction must dissipate energy.
+    /// Lower and upper bound of each free parameter.
+    ///
+    /// Friction must dissipate energy, so its coefficients have lower bounds. Other coefficients are unbounded.
     #[must_use]
     pub fn bounds(&self) -> Vec<(f64, f64)> {
         let mut coefficients = vec![(f64::NEG_INFINITY, f64::INFINITY); self.model.coordinates.len()];
@@ -106,17 +113,22 @@ impl Problem {
         self.model.order_bounds.iter().copied().chain(coefficients).chain(ends).collect()
     }
 
-    /// True if an equation is unstable at a point and has free initial terms, which may cancel the unstable mode.
+    /// Return true if an equation is unstable at a point and has free initial terms.
+    ///
+    /// These terms may cancel the unstable mode.
     #[must_use]
     pub fn is_unstable(&self, point: &ParameterPoint) -> bool {
         self.is_linear() && !self.model.initial.is_at_rest() && self.model.is_unstable(point)
     }
 
-    /// Minimize the cost by Levenberg–Marquardt. If `steady`, a stable model does not become unstable.
+    /// Minimize the cost by the Levenberg–Marquardt method.
+    ///
+    /// If `steady`, a linear model that is stable does not become unstable.
     ///
     /// # Errors
-    /// An initial guess whose simulation fails, a model that does not match the experiments, or a stop request
-    /// ([`fit_until`]; with friction or non-linear terms [`nonlinear::fit`]).
+    /// The error of the simulation of `start` if it fails. An error if the model does not match the experiments
+    /// ([`fit_until`]; with friction or nonlinear terms [`nonlinear::fit`]). [`Error::Interrupted`] after a stop
+    /// request.
     pub fn minimize(
         &self,
         experiments: &[Experiment],
@@ -164,7 +176,7 @@ impl Problem {
 pub struct Iterate {
     /// Free orders, coefficients and input parameters.
     pub point: ParameterPoint,
-    /// Initial states of each run with friction or non-linear terms; empty if unknown.
+    /// Initial states of each run if there is friction or a nonlinear term; empty if unknown.
     pub states: Vec<Vec<f64>>,
 }
 
@@ -172,26 +184,26 @@ pub struct Iterate {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct OptimizationResult {
-    /// The final iterate.
+    /// Final iterate.
     pub iterate: Iterate,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Vector of weighted residuals, ordered by run, then by output.
+    /// Weighted residuals, ordered by run, then by output, then by sample.
     pub residuals: Vec<f64>,
     /// Derivatives of the residuals, one row per parameter; empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
-    /// Coefficients of the initial terms by run and equation; initial states if there is friction.
+    /// Coefficients of the initial terms by run and equation. With friction or nonlinear terms, initial states by run.
     pub initial: Vec<Vec<Vec<f64>>>,
-    /// Orthonormal basis of the weighted responses to the initial terms by run; empty after several evaluations.
+    /// Orthonormal basis of the weighted responses to the initial terms, by run; empty after several evaluations.
     pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
-    /// Reason of termination.
+    /// Reason for termination.
     pub status: Status,
 }
 
 impl OptimizationResult {
-    /// Result before any optimization, with infinite cost.
+    /// Result before any optimization: infinite cost and no residuals.
     #[must_use]
     pub fn initial_result(iterate: Iterate) -> Self {
         let (cost, evaluations, status) = (f64::INFINITY, 0, Status::Exhausted);
@@ -200,14 +212,14 @@ impl OptimizationResult {
         Self { iterate, cost, residuals, jacobian, initial, initial_responses, evaluations, status }
     }
 
-    /// Cost per residual, which is about 1 if the weights match the noise and the model is complete.
+    /// Mean square of the weighted residuals: about 1 if the weights match the noise and the model is complete.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn cost_per_residual(&self) -> f64 {
         2.0 * self.cost / self.residuals.len() as f64
     }
 
-    /// True if the gradient vanished, except for components that point out of an active bound.
+    /// Return true if the gradient vanished, except for components that point out of an active bound.
     ///
     /// An optimization that stopped at the limit of its domain has not converged.
     #[must_use]
@@ -215,14 +227,14 @@ impl OptimizationResult {
         self.status == Status::Converged
     }
 
-    /// All parameters: orders, coefficients, input parameters.
+    /// Values of all free parameters: orders, coefficients, input parameters.
     #[must_use]
     pub fn values(&self) -> Vec<f64> {
         let ParameterPoint { orders, coefficients, inputs } = &self.iterate.point;
         [orders.as_slice(), coefficients, inputs].concat()
     }
 
-    /// Iterate with other parameter values and the same states.
+    /// Return the iterate with other parameter values and the same states.
     #[must_use]
     pub fn iterate_at(&self, values: &[f64]) -> Iterate {
         let point = &self.iterate.point;
@@ -235,12 +247,14 @@ impl OptimizationResult {
 
 /// Minimum difference between the highest order of an equation and the orders of its autoregressive terms.
 const MIN_INTEGRATION_ORDER: f64 = 1e-3;
-/// Rounding error of the difference of two orders, each rounded to 1e-9. Orders of other signals may equal the highest.
+/// Rounding error of the difference of two orders, each rounded to 1e-9.
+///
+/// The order of an input term may equal the highest order of its equation within this tolerance.
 const ORDER_ROUNDING_TOLERANCE: f64 = 2e-9;
-/// Relative singular value below which the normal of a constraint is linearly dependent on others.
+/// Relative singular value below which the normal of a constraint counts as linearly dependent on the others.
 const DIRECTION_RANK_TOLERANCE: f64 = 1e-9;
 
-/// Affine constraint a·x + b ≥ m.
+/// Affine constraint a·x + b ≥ m on the parameters x, with normal a, offset b and margin m.
 struct Constraint {
     normal: Vec<f64>,
     offset: f64,
@@ -248,11 +262,11 @@ struct Constraint {
 }
 
 impl Problem {
-    /// Move from the feasible point `at` towards `towards` until a bound or a constraint of the orders is met, and
-    /// return the last feasible point.
+    /// Move from the feasible point `at` toward `towards` and return the last feasible point.
     ///
-    /// The direction `towards − at` is first projected on the constraints that are active at `at`, so the path may
-    /// leave the straight line to `towards`. All constraints are affine, so the result is exact.
+    /// The move ends at a bound or a constraint of the orders. The direction `towards − at` is first projected on the
+    /// constraints that are active at `at`, so the path may leave the straight line. All constraints are affine, so the
+    /// result is exact.
     ///
     /// # Errors
     /// [`Error::Length`] for a number of values that differs from the number of free parameters.
@@ -263,7 +277,7 @@ impl Problem {
         let room: Vec<f64> = (constraints.iter())
             .map(|c| {
                 let room = inner(&c.normal, at) + c.offset;
-                // A point accepted within the margin keeps its distance.
+                // A point that is within the margin keeps its distance from the constraint.
                 (room - c.margin.min(room)).max(0.0)
             })
             .collect();
@@ -300,7 +314,7 @@ impl Problem {
         Ok(at.iter().zip(&step).map(|(a, s)| a + share * s).collect())
     }
 
-    /// Highest order of a derivative of a signal in the expressions of non-linear terms.
+    /// Highest order of a derivative of a signal in the expressions of the nonlinear terms; 0 if it has none.
     fn highest_derivative(&self, signal: usize) -> f64 {
         let channels = self.derived.iter().flat_map(|derived| &derived.channels);
         channels.filter(|channel| channel.0 == signal).fold(0.0, |highest, channel| channel.1.max(highest))
@@ -324,7 +338,7 @@ impl Problem {
             let derivative = self.highest_derivative(equation.output);
             for (signal, order, _) in &equation.terms {
                 let own = *signal == equation.output;
-                // Derivatives of an output in expressions are integrals of everything but the output's own terms.
+                // Derivatives of an output in expressions are integrals of all terms except those of the output itself.
                 let above = if own { 0.0 } else { derivative };
                 limits.push(Constraint {
                     normal: wide(&|k| of(&equation.order, k) - of(order, k)),
@@ -341,7 +355,7 @@ impl Problem {
     }
 }
 
-/// Candidate of the multistart: optimization result, origin, and origins of merged duplicates.
+/// Candidate of the multistart: optimization result, description of its origin, and origins of merged duplicates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
     /// Current optimization result.
@@ -359,13 +373,13 @@ impl Candidate {
         Self { result: OptimizationResult::initial_result(place), origin: origin.into(), duplicates: Vec::new() }
     }
 
-    /// Candidate with a new optimization result.
+    /// Return the candidate with a new optimization result.
     #[must_use]
     pub fn with_result(&self, attempt: OptimizationResult) -> Self {
         Self { result: attempt, ..self.clone() }
     }
 
-    /// Cost per residual.
+    /// Mean square of the weighted residuals.
     #[must_use]
     pub fn cost_per_residual(&self) -> f64 {
         self.result.cost_per_residual()

@@ -1,14 +1,14 @@
-//! Monotonic progress of a fit.
+//! Progress of a fit, which never decreases.
 
 use crate::error::Result;
 
 /// Number of parts into which the progress of a fit is divided.
 pub const PROGRESS_PARTS: usize = 1000;
 
-/// Progress callback of (parts done, [`PROGRESS_PARTS`]); an error ends the fit.
+/// Progress callback with the number of finished parts and [`PROGRESS_PARTS`]. An error that it returns ends the fit.
 pub type ProgressListener<'a> = dyn Fn(usize, usize) -> Result<()> + 'a;
 
-/// Progress of a fit as a fraction of 1, over phases of unknown length.
+/// Progress of a fit between 0 and 1, over phases of unknown length.
 pub struct FitProgress<'a> {
     listener: &'a ProgressListener<'a>,
     share_done: f64,
@@ -18,13 +18,13 @@ pub struct FitProgress<'a> {
 }
 
 impl<'a> FitProgress<'a> {
-    /// Return a progress of 0 with a callback.
+    /// Return a progress of 0 that is reported to a callback.
     #[must_use]
     pub fn new(listener: &'a ProgressListener<'a>) -> Self {
         Self { listener, share_done: 0.0, reported_parts: None, phase_start: 0.0, last: 0.0 }
     }
 
-    /// Advance to a fraction of the whole.
+    /// Advance to the fraction `share` of the whole fit, and report it.
     ///
     /// # Errors
     /// The error of the callback.
@@ -39,8 +39,10 @@ impl<'a> FitProgress<'a> {
         (self.listener)(parts, PROGRESS_PARTS)
     }
 
-    /// Advance within a phase that ends at the fraction `share` of the whole, after `count` of `of` parts. A phase can
-    /// count from zero repeatedly. Each count takes the fraction `sweep` of the rest of the phase.
+    /// Advance within a phase that ends at the fraction `share` of the whole fit.
+    ///
+    /// A phase consists of sweeps, in each of which `count` increases from 0 to `of`. Each sweep takes the fraction
+    /// `sweep` of the rest of the phase.
     ///
     /// # Errors
     /// The error that the callback returns ([`FitProgress::advance_to`]).

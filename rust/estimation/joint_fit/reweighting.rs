@@ -1,4 +1,4 @@
-//! Iteratively reweighted noise levels and Huber weights.
+//! Iterative reweighting: noise levels of the outputs and Huber weights of the samples.
 //!
 //! The minimum of Huber's loss is found by iteratively reweighted least squares (doi:10.1214/aoms/1177703732,
 //! doi:10.1080/03610927708827533). The scale is the median absolute residual, which is robust to outliers.
@@ -8,27 +8,27 @@ use super::problem::{Iterate, OptimizationResult};
 use crate::error::{Error, Result};
 use crate::signal::statistics::HUBER_THRESHOLD;
 
-/// Standard deviations above which a residual is an outlier: one in two million samples of normal noise.
+/// Magnitude of an outlier in standard deviations. Normal noise exceeds it once in two million samples.
 const OUTLIER_DEVIATIONS: f64 = 5.0;
 /// Change of the robust weights below which they have converged.
 const ROBUST_WEIGHT_TOLERANCE: f64 = 2e-3;
-/// Lower limit of a standard deviation in a quotient.
+/// Lower limit of a standard deviation that is a divisor.
 const MIN_DEVIATION: f64 = 1e-300;
 
 /// Loss function of the residuals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Loss {
-    /// Least squares.
+    /// Squared residuals (least squares).
     Squares,
     /// Huber's loss.
     Huber,
 }
 
-/// Counts of downweighted residuals and outliers of a robust loss.
+/// Counts of downweighted residuals and of outliers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct RobustSummary {
-    /// Number of residuals beyond 1.345 standard deviations, which are downweighted: 18 % of normal noise.
+    /// Number of residuals beyond 1.345 standard deviations, which are downweighted. Of normal noise, this is 18 %.
     pub reduced_weight_count: usize,
     /// Number of residuals beyond five standard deviations.
     pub outliers: usize,
@@ -37,7 +37,7 @@ pub struct RobustSummary {
 }
 
 impl RobustSummary {
-    /// Counts at an optimum.
+    /// Count the downweighted residuals and the outliers at an optimum.
     #[must_use]
     pub fn from_result(grid: &Objective<'_>, attempt: &OptimizationResult) -> Self {
         let mut counted = Self { reduced_weight_count: 0, outliers: 0, samples: 0 };
@@ -53,6 +53,8 @@ impl RobustSummary {
 }
 
 /// Square roots of Huber's weights of the compared samples, by run and output; 1 for missing samples.
+///
+/// `levels` contains the standard deviation of the residuals of each output.
 pub(super) fn huber_weights(grid: &Objective<'_>, attempt: &OptimizationResult, levels: &[f64]) -> Vec<Vec<Vec<f64>>> {
     let root = |size: f64| if size > HUBER_THRESHOLD { (HUBER_THRESHOLD / size).sqrt() } else { 1.0 };
     let of = |(e, level): (Vec<f64>, &f64)| e.iter().map(|e| root(e.abs() / level.max(MIN_DEVIATION))).collect();
@@ -60,7 +62,7 @@ pub(super) fn huber_weights(grid: &Objective<'_>, attempt: &OptimizationResult, 
     parts.map(|part| part.into_iter().zip(levels).map(of).collect()).collect()
 }
 
-/// True if robust weights have converged.
+/// Return true if two sets of robust weights agree within the tolerance, or if there are none.
 pub(super) fn are_weights_equal(before: Option<&Vec<Vec<Vec<f64>>>>, after: Option<&Vec<Vec<Vec<f64>>>>) -> bool {
     let flat = |shares: &Vec<Vec<Vec<f64>>>| shares.iter().flatten().flatten().copied().collect::<Vec<_>>();
     match (before, after) {
@@ -70,25 +72,30 @@ pub(super) fn are_weights_equal(before: Option<&Vec<Vec<Vec<f64>>>>, after: Opti
     }
 }
 
-/// Maximum number of evaluations of each optimization.
+/// Maximum number of evaluations of each optimization between two reweightings.
 pub const EVALUATIONS_PER_REWEIGHTING: usize = 120;
-/// Maximum number of reweightings. Each one reduces the error of the robust weights by a factor of about four.
+/// Maximum number of reweightings with squared loss.
 const MAX_REWEIGHTINGS: usize = 4;
+/// Maximum number of reweightings with Huber's loss. Each reduces the error of the weights by a factor of about four.
 const MAX_ROBUST_REWEIGHTINGS: usize = 15;
-/// Relative difference between noise levels and weights below which the weights have converged.
+/// Relative deviation of a noise level from the inverse weight of its output below which the weights have converged.
 const NOISE_LEVEL_TOLERANCE: f64 = 0.01;
 
-/// Fit by iteratively reweighted least squares, until weights and robust weights match the residuals over all runs.
+/// Fit by iteratively reweighted least squares, until all weights match the residuals over all runs.
+///
+/// Return the optimum and the objective with the final weights.
 ///
 /// # Errors
-/// As [`Objective::minimize`]; [`Error::Beyond`] if the residuals overflow.
+/// The error of the simulation of `start` if it fails. [`Error::Beyond`] if the residuals overflow.
+/// [`Error::Interrupted`] after a stop request.
 pub fn fit_reweighted<'a>(
     start: &Iterate,
     grid: Objective<'a>,
     loss: Loss,
 ) -> Result<(OptimizationResult, Objective<'a>)> {
     let rounds = if loss == Loss::Huber { MAX_ROBUST_REWEIGHTINGS } else { MAX_REWEIGHTINGS };
-    // Exact samples leave no residual; what remains of the first noise level then is rounding.
+    // The residuals of noise-free samples are rounding errors, so the weights have upper limits relative to the first
+    // ones.
     let limits: Vec<f64> = grid.weights.outputs.iter().map(|weight| weight / f64::EPSILON).collect();
     let (mut place, mut grid, mut turn) = (start.clone(), grid, 0);
     loop {

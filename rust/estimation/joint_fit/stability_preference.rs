@@ -1,7 +1,7 @@
 //! Choice between an unstable optimum and a stable one: the unstable one must fit significantly better.
 //!
-//! With nonzero initial conditions an equation has free initial terms for each run. They can cancel an unstable mode up
-//! to the end of the run, which makes the response noncausal: the output reacts before the input. No machine does that,
+//! With nonzero initial conditions, an equation has free initial terms for each run. They can cancel an unstable mode
+//! up to the end of the run. The response is then noncausal: the output reacts before the input. No machine does that,
 //! but with autocorrelated residuals such a model can fit better.
 
 use std::collections::BTreeMap;
@@ -16,14 +16,15 @@ use super::structure::Coefficient;
 use crate::error::{Error, Result};
 use crate::signal::statistics::mean;
 
-/// Number of segments of the runs whose sums of squares are compared.
+/// Number of segments of the runs whose mean squared residuals are compared.
 const COMPARISON_SEGMENTS: f64 = 20.0;
 /// 99 % quantile of Student's t distribution with [`COMPARISON_SEGMENTS`] − 1 degrees of freedom.
 const STUDENT_T_QUANTILE_99: f64 = 2.54;
-/// Ratio of the residuals above which the better optimum is chosen without a test: an instability may appear in the last
-/// segment alone.
+/// Ratio of the root mean square residuals above which the better optimum is chosen without a test.
+///
+/// Without this rule, an instability in the last segment alone would not be significant.
 const DECISIVE_RESIDUAL_RATIO: f64 = 2.0;
-/// Maximum number of stable candidates of the multistart that are tried.
+/// Maximum number of stable candidates of the multistart from which a stable optimum is searched.
 const MAX_STABLE_CANDIDATES: usize = 3;
 /// Maximum number of evaluations of each stable candidate that continues after a short fit.
 const EVALUATIONS_PER_CANDIDATE: usize = 60;
@@ -34,19 +35,22 @@ const EVALUATIONS_PER_CANDIDATE: usize = 60;
 pub struct StabilityComparison {
     /// True if the unstable optimum is the result, because it fits significantly better or no stable one exists.
     pub keeps_unstable: bool,
-    /// Relative excess of the root mean square residual of the stable optimum. It is infinite without a stable optimum,
-    /// and negative if the stable one fits better.
+    /// Relative excess of the root mean square residual of the stable optimum over that of the unstable one.
+    ///
+    /// It is infinite without a stable optimum, and negative if the stable one fits better.
     pub residual_excess: f64,
-    /// True if the stable one has not converged, usually because it lies on the stability limit.
+    /// True if the stable optimum has not converged, usually because it lies on the stability limit.
     pub at_stability_limit: bool,
 }
 
-/// Choose between the best optimum and a stable one; return it with its objective and the comparison.
+/// Choose between the best optimum, if it is unstable, and a stable one.
 ///
-/// The objective requires stability if the stable optimum is chosen.
+/// Return the chosen optimum, its objective and the comparison. The comparison is None if the best optimum is stable.
+/// The objective requires stability if the stable optimum is chosen. `reached` contains the candidates of the
+/// multistart.
 ///
 /// # Errors
-/// As the source, [`Error::Interrupted`].
+/// An error if the runs cannot be sampled at half the step. [`Error::Interrupted`] after a stop request.
 pub fn prefer_stable<'a>(
     free: &ParameterSet,
     best: Candidate,
@@ -61,8 +65,8 @@ pub fn prefer_stable<'a>(
     let mut first = search.short_fits(&best, reached)?;
     let unit = grid.time_scaling();
     for one in known_orders(free) {
-        // A stable optimum with one order fixed is a candidate for the full equation. The optima of the multistart with
-        // one order fixed are among the candidates already.
+        // A stable optimum with one order fixed is a candidate for the full problem. The optima of the multistart with
+        // one order fixed are in `reached` already.
         let narrow = StableSearch { free: &one.free, grid: constrained.with_problem(&one.free.problem) };
         let fits = narrow.short_fits(&one.restrict(&best, &unit), &[])?;
         first.extend(fits.iter().map(|fit| one.embed(fit, free)));
@@ -115,12 +119,12 @@ fn ignore_failure<T>(outcome: Result<T>) -> Result<Option<T>> {
     }
 }
 
-/// True if an equation is unstable at a candidate.
+/// Return true if an equation is unstable at a candidate.
 fn is_unstable(free: &ParameterSet, runner: &Candidate) -> bool {
     free.problem.is_unstable(&runner.result.iterate.point)
 }
 
-/// Free autoregressive coefficients by name, with the known factor that multiplies each in its term.
+/// Known factor of each free autoregressive coefficient in its term, by name of the coefficient.
 fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
     let own = free.structure.equations.iter().flat_map(|equation| equation.autoregressive_terms());
     own.filter_map(|term| match &term.coefficient {
@@ -130,12 +134,11 @@ fn autoregressive_factors(free: &ParameterSet) -> BTreeMap<&String, f64> {
     .collect()
 }
 
-/// Candidate with negative coefficients of all output terms on the right-hand side, and the indices of those changed.
+/// Return a candidate with negative coefficients of all output terms, and the parameter indices of the changed ones.
 ///
-/// Equations of an order up to 2 are then stable.
-///
-/// The changed coefficients are first kept fixed while the others adapt, because the input coefficients still belong to
-/// the unstable optimum.
+/// The terms are on the right-hand side, so equations of an order up to 2 are then stable. In a fit, the changed
+/// coefficients should first be fixed while the others adapt. The input coefficients still belong to the unstable
+/// optimum.
 #[must_use]
 pub fn dissipative_candidate(free: &ParameterSet, runner: &Candidate) -> (Candidate, Vec<usize>) {
     let own = autoregressive_factors(free);
@@ -150,9 +153,10 @@ pub fn dissipative_candidate(free: &ParameterSet, runner: &Candidate) -> (Candid
     (candidate_at(runner, place, "stable signs of the coefficients"), turned)
 }
 
-/// One candidate per autoregressive coefficient, with that coefficient at 0, and the index of the coefficient.
+/// Return one candidate per autoregressive coefficient, with that coefficient at 0, and its parameter index.
 ///
-/// The coefficient is first kept fixed while the others adapt. Empty if there is only one.
+/// In a fit, the coefficient should first be fixed while the others adapt. The result is empty if there is only one
+/// autoregressive coefficient.
 #[must_use]
 pub fn candidates_without_term(free: &ParameterSet, runner: &Candidate) -> Vec<(Candidate, Vec<usize>)> {
     let places = autoregressive_indices(free);
@@ -169,7 +173,7 @@ pub fn candidates_without_term(free: &ParameterSet, runner: &Candidate) -> Vec<(
     }
 }
 
-/// Indices of the free autoregressive coefficients.
+/// Indices of the free autoregressive coefficients among the free coefficients.
 fn autoregressive_indices(free: &ParameterSet) -> Vec<usize> {
     let own = autoregressive_factors(free);
     (0..free.coefficients.len()).filter(|&k| own.contains_key(&free.coefficients[k])).collect()
@@ -193,7 +197,7 @@ impl StableSearch<'_, '_> {
         Ok(start.with_result(self.grid.minimize_in(&problem, place, evaluations)?))
     }
 
-    /// Short fits from stable candidates of the multistart and from modifications of the unstable optimum.
+    /// Fit briefly from stable candidates of the multistart and from modifications of the unstable optimum.
     fn short_fits(&self, best: &Candidate, reached: &[Candidate]) -> Result<Vec<Candidate>> {
         let stable = reached.iter().filter(|runner| !is_unstable(self.free, runner)).take(MAX_STABLE_CANDIDATES);
         let mut starts: Vec<(Candidate, Vec<usize>)> = stable.map(|runner| (runner.clone(), Vec::new())).collect();
@@ -209,10 +213,12 @@ impl StableSearch<'_, '_> {
         Ok(fits)
     }
 
-    /// Minimize along the stability limit, with one autoregressive coefficient fixed at a time.
+    /// Minimize along the stability limit and return the best result.
     ///
-    /// An optimization stops if a step of all parameters would be unstable, although the cost can still decrease along
-    /// the limit.
+    /// One autoregressive coefficient is fixed at a time.
+    ///
+    /// An optimization stops if a step of all parameters would be unstable. The cost can still decrease along the
+    /// limit.
     fn minimize_along_limit(&self, end: &Candidate) -> Result<Candidate> {
         let status = end.result.status;
         let mut best = end.clone();
@@ -221,15 +227,15 @@ impl StableSearch<'_, '_> {
             let optimum = ignore_failure(self.minimize(end, &fixed, EVALUATIONS_PER_CANDIDATE))?;
             best = optimum.filter(|optimum| optimum.cost_per_residual() < best.cost_per_residual()).unwrap_or(best);
         }
-        // Convergence with a fixed coefficient is not that of all parameters.
+        // Convergence with one coefficient fixed does not imply convergence of all parameters.
         best.result.status = status;
         Ok(best)
     }
 
-    /// Stable candidate to compare with the unstable optimum.
+    /// Select the stable candidate that is compared with the unstable optimum.
     ///
-    /// A converged optimum is preferred over a candidate on the stability limit, unless the latter fits significantly
-    /// better than all of them.
+    /// A converged optimum is preferred over a candidate on the stability limit. The exception is a candidate that fits
+    /// significantly better than all converged optima.
     fn select_optimum(&self, ends: &[Candidate]) -> Result<Candidate> {
         let attempts: Vec<&OptimizationResult> = ends.iter().map(|runner| &runner.result).collect();
         let order = self.grid.finer()?.rank_results(&attempts)?;
@@ -241,10 +247,10 @@ impl StableSearch<'_, '_> {
     }
 }
 
-/// Vuong's test of non-nested models: true if the best fits significantly better than the other.
+/// Return true if the result `best` fits significantly better than `other`, by Vuong's test of non-nested models.
 ///
-/// The mean squares over segments of the runs are compared (Vuong, doi:10.2307/1912557; for autocorrelated residuals
-/// Rivers & Vuong, doi:10.1111/1368-423X.t01-1-00071).
+/// The test compares the mean squares over segments of the runs (Vuong, doi:10.2307/1912557; for autocorrelated
+/// residuals Rivers & Vuong, doi:10.1111/1368-423X.t01-1-00071). With fewer than two segments, the result is true.
 #[must_use]
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn is_significantly_better(grid: &Objective<'_>, best: &OptimizationResult, other: &OptimizationResult) -> bool {
@@ -278,7 +284,7 @@ pub fn is_significantly_better(grid: &Objective<'_>, best: &OptimizationResult, 
     middle > STUDENT_T_QUANTILE_99 * (spread / count).sqrt()
 }
 
-/// Sum of squared weighted residuals of all outputs, by sample; missing samples count 0.
+/// Sum of squared weighted residuals over all outputs, by sample. A missing sample contributes 0.
 fn squares_by_sample(outputs: &[Vec<f64>]) -> Vec<f64> {
     let mut total = vec![0.0; outputs.first().map_or(0, Vec::len)];
     for residuals in outputs {

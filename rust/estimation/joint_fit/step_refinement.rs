@@ -1,4 +1,4 @@
-//! Step refinement: the step is halved until the estimate changes by a small part of its standard error.
+//! Step refinement: the simulation step is halved until the estimate changes by a small part of its standard error.
 
 use super::covariance::covariance;
 use super::objective::{Objective, Weights, MAX_PULSES_PER_SAMPLE};
@@ -9,25 +9,26 @@ use crate::error::{Error, Result};
 use crate::estimation::output_error::Status;
 use crate::signal::statistics::inner;
 
-/// Change of an estimate, or of its extrapolation to zero step, below which the refinement has converged.
+/// Maximum change of an estimate, in standard errors, at which the step refinement has converged.
 const MAX_CHANGE_STANDARD_ERRORS: f64 = 0.1;
-/// Increase of the log residuals by halving the step above which other survivors are tried on the finer grid.
+/// Increase of the negative log-likelihood per sample, due to halving the step, above which other survivors are fitted.
 const MAX_LOG_RESIDUAL_INCREASE: f64 = 5e-4;
 
-/// Minimum number of block pulses of a grid whose optimum is corrected for its step without finer grids.
+/// Minimum number of block pulses over all runs at which the step error is corrected without fits on finer grids.
 const MIN_CORRECTED_PULSES: usize = 1 << 15;
-/// Maximum number of corrections by one pair of finer grids. Each correction multiplies the error of the last by about
-/// the relative discretization error of the grid.
+/// Maximum number of corrections with one pair of finer grids.
+///
+/// Each correction multiplies the remaining error by about the relative discretization error of the grid.
 const MAX_CORRECTIONS: usize = 4;
 
 /// Optimum on the finest grid, and its extrapolation to zero step.
 #[derive(Clone)]
 pub struct Optimum<'a> {
-    /// The optimum of the finest grid.
+    /// Optimum of the finest grid.
     pub attempt: OptimizationResult,
-    /// That grid.
+    /// Objective on the finest grid.
     pub grid: Objective<'a>,
-    /// Parameters extrapolated to zero step from two grids.
+    /// Values of all free parameters, extrapolated to zero step from two grids.
     pub estimate: Vec<f64>,
     /// True if halving the step changed no estimate by more than a tenth of its standard error.
     pub step_converged: bool,
@@ -38,34 +39,36 @@ pub struct Optimum<'a> {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct OptimumStatistics {
-    /// The optimum of the finest grid.
+    /// Optimum of the finest grid.
     pub attempt: OptimizationResult,
-    /// Weights at the optimum.
+    /// Weights of outputs and samples at the optimum.
     pub weights: Weights,
-    /// Block pulses per sampling interval of that grid.
+    /// Number of block pulses per sampling interval of the finest grid.
     pub pulses_per_sample: usize,
-    /// Parameters extrapolated to zero step, within bounds.
+    /// Values of all free parameters, extrapolated to zero step, within bounds.
     pub estimate: Vec<f64>,
     /// True if halving the step changed no estimate by more than a tenth of its standard error.
     pub step_converged: bool,
-    /// Row-major covariance of the parameters.
+    /// Row-major covariance matrix of all free parameters.
     pub covariance: Vec<f64>,
-    /// Standard deviation of the residuals by output; with a robust loss from the median absolute residual.
+    /// Standard deviation of the residuals of each output.
+    ///
+    /// With a robust loss, it follows from the median absolute residual.
     pub noise: Vec<f64>,
-    /// Residuals divided by their noise level, by run and output; NaN where a sample is missing.
+    /// Residuals in standard deviations of the noise, by run and output; NaN for a missing sample.
     pub residuals: Vec<Vec<Vec<f64>>>,
-    /// Counts of downweighted residuals of a robust loss; None for squares.
+    /// Counts of downweighted residuals of a robust loss; None for a squared loss.
     pub robust: Option<RobustSummary>,
 }
 
-/// Halve the step until the estimate changes by a small part of its standard error.
+/// Halve the step until the estimate changes by a small part of its standard error, and return the optimum.
 ///
-/// On a coarse grid an optimization can follow a flat valley to the limit of its domain, where a finer grid makes no
-/// progress. Then the other survivors are optimized on the finer grid as well.
+/// On a coarse grid, an optimization can follow a flat valley to the limit of its domain, where a finer grid makes no
+/// progress. Then the other survivors, `others`, are optimized on the finer grid as well.
 ///
 /// # Errors
-/// A simulation that fails, residuals that overflow, or a stop request ([`fit_reweighted`]); a Jacobian that is not
-/// finite ([`covariance`]).
+/// The error of a simulation that fails. [`Error::Beyond`] if residuals overflow. [`Error::NotFinite`] if the Jacobian
+/// is not finite. [`Error::Interrupted`] after a stop request.
 pub fn refine_step<'a>(
     best: OptimizationResult,
     grid: Objective<'a>,
@@ -90,7 +93,7 @@ pub fn refine_step<'a>(
         let mut fine = fine;
         if (finer.status == Status::DomainLimit && before.is_none()) || (rose && !others.is_empty()) {
             let freed = best_alternative(&finer, &fine, others, loss)?;
-            // The other survivors are tried once.
+            // The other survivors are tried only once.
             others = &[];
             if let Some((other, freed_grid)) = freed {
                 // The two grids have different optima, so they cannot be extrapolated.
@@ -103,8 +106,8 @@ pub fn refine_step<'a>(
         std::mem::swap(&mut grid, &mut fine);
         let (freed_grid, own_values) = (finer.values(), best.values());
         let fit = covariance(&finer, &grid)?;
-        // The scheme is of second order: Richardson extrapolation of two grids gives the limit, a third grid confirms
-        // it. Optimizations that did not converge cannot be extrapolated.
+        // The scheme is of second order. Richardson extrapolation of two grids yields the limit, and a third grid
+        // confirms it. Optimizations that did not converge cannot be extrapolated.
         let mut limit = freed_grid.clone();
         if finer.has_converged() && best.has_converged() {
             limit = extrapolate(&grid, &clock, &freed_grid, &own_values, 3.0)?;
@@ -119,15 +122,15 @@ pub fn refine_step<'a>(
     Ok(Optimum { attempt: best, grid, estimate, step_converged: still, covariance: spread })
 }
 
-/// Optimum of a long record for zero step size, by deferred correction; None if that needs a finer grid.
+/// Return the optimum of a long record for zero step, by deferred correction; None if this fails.
 ///
 /// At the optimum, the residuals of two finer grids are extrapolated to zero step. Their difference from the residuals
 /// of the grid hardly depends on the parameters. It is added to the samples, and the grid is fitted again until the
 /// estimate does not change (Stetter, doi:10.1007/BF01432879). The finer grids are simulated without derivatives.
 ///
 /// # Errors
-/// A Jacobian that is not finite ([`covariance`]); the errors of the experiments; [`Error::Interrupted`] after a stop
-/// request.
+/// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]). An error if the runs cannot be sampled at a
+/// shorter step. [`Error::Interrupted`] after a stop request.
 pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: Loss) -> Result<Option<Optimum<'a>>> {
     let pulses: usize = grid.experiments().iter().map(|experiment| experiment.record.m()).sum();
     if pulses < MIN_CORRECTED_PULSES || !best.has_converged() {
@@ -148,7 +151,7 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
             let spread = covariance(&next, &next_grid)?;
             let is_still = is_within_errors(&clock, &next.values(), &place.values(), (&next.values(), &spread));
             if is_still && correction == 0 {
-                // The optimum is that of the pair of coarser grids.
+                // The optimum is the same as with the previous pair of coarser grids.
                 let estimate = next.values();
                 let attempt = OptimizationResult { iterate: best.iterate.clone(), ..next };
                 let grid = next_grid;
@@ -164,8 +167,10 @@ pub fn correct_step<'a>(best: &OptimizationResult, grid: &Objective<'a>, loss: L
     Ok(None)
 }
 
-/// Return residuals extrapolated to zero step minus residuals on `grid`, by run, output and sample, in units of the
-/// outputs. None if these differences are large relative to the noise, or a simulation is not finite.
+/// Return residuals extrapolated to zero step minus residuals on `grid`, in units of the outputs.
+///
+/// The values are indexed by run, output and sample. Return None if the differences are large relative to the noise, or
+/// if a simulation is not finite.
 fn limit_shifts(
     place: &Iterate,
     grid: &Objective<'_>,
@@ -174,7 +179,7 @@ fn limit_shifts(
 ) -> Result<Option<Vec<Vec<Vec<f64>>>>> {
     let mut shifts: Vec<Vec<Vec<f64>>> = Vec::new();
     let (mut power, mut noise) = (0.0, 0.0);
-    // The scheme is of second order.
+    // Richardson extrapolation of a scheme of second order.
     for (objective, share) in [(fine, 4.0 / 3.0), (coarse, -1.0 / 3.0), (grid, -1.0)] {
         let Some(evaluation) = objective.evaluate(place)? else { return Ok(None) };
         let residuals = objective.residuals(&evaluation);
@@ -194,22 +199,22 @@ fn limit_shifts(
     Ok((power <= noise).then_some(shifts))
 }
 
-/// Sum of the squares of the finite values times a weight.
+/// Sum of the squares of all finite products of a value and `weight`.
 fn finite_squares(values: &[f64], weight: f64) -> f64 {
     values.iter().map(|v| v * weight).filter(|v| v.is_finite()).map(|v| v * v).sum()
 }
 
 impl<'a> Optimum<'a> {
-    /// Optimum of a grid without refinement.
+    /// Return the optimum of a grid without step refinement.
     ///
     /// # Errors
-    /// A Jacobian that is not finite ([`covariance`]).
+    /// [`Error::NotFinite`] if the Jacobian is not finite ([`covariance`]).
     pub fn without_refinement(attempt: OptimizationResult, grid: Objective<'a>) -> Result<Self> {
         let covariance = covariance(&attempt, &grid)?;
         Ok(Self { estimate: attempt.values(), step_converged: true, covariance, attempt, grid })
     }
 
-    /// Compute covariance, noise levels and residuals of the optimum.
+    /// Convert to the statistics of the optimum, with noise levels and residuals.
     #[must_use]
     pub fn into_statistics(self) -> OptimumStatistics {
         let Self { attempt, grid, estimate, step_converged: settled, covariance } = self;
@@ -218,7 +223,7 @@ impl<'a> Optimum<'a> {
         let inside = |(value, (low, high)): (f64, (f64, f64))| value.clamp(low, high);
         let mut residuals = grid.residuals(&attempt);
         for run in &mut residuals {
-            // The weights have converged to the noise levels within a tolerance only.
+            // The weights equal the inverse noise levels within a tolerance only, so the residuals are scaled again.
             for (series, &level) in run.iter_mut().zip(&levels).filter(|(_, level)| **level > 0.0) {
                 series.iter_mut().for_each(|e| *e /= level);
             }
@@ -237,7 +242,9 @@ impl<'a> Optimum<'a> {
     }
 }
 
-/// True if two estimates differ by a small part of the standard errors at an optimum with a covariance.
+/// Return true if two estimates differ by at most a tenth of the standard errors in scaled time.
+///
+/// The standard errors are those of the covariance matrix `spread` at the parameter values `at`.
 fn is_within_errors(clock: &TimeScaling, one: &[f64], other: &[f64], (at, spread): (&[f64], &[f64])) -> bool {
     let ways = clock.to_scaled(one).into_iter().zip(clock.to_scaled(other));
     let errors = clock.standard_errors(at, spread);
@@ -245,6 +252,8 @@ fn is_within_errors(clock: &TimeScaling, one: &[f64], other: &[f64], (at, spread
 }
 
 /// Extrapolate the estimates of two grids: add their difference, divided by `share`, to the estimate of the finer grid.
+///
+/// The result is limited to feasible values.
 fn extrapolate(
     grid: &Objective<'_>,
     clock: &TimeScaling,
@@ -257,7 +266,9 @@ fn extrapolate(
     Ok(clock.to_unscaled(&grid.problem.last_feasible_point(&fine, &target)?))
 }
 
-/// Initial guess on half the step. The optimum is expected to move a quarter as far as at the last halving.
+/// Return the initial guess for half the step.
+///
+/// The optimum is expected to move a quarter as far as at the last halving.
 fn extrapolated_start(
     grid: &Objective<'_>,
     clock: &TimeScaling,
@@ -272,10 +283,9 @@ fn extrapolated_start(
     }
 }
 
-/// Best other candidate, with converged weights, if it fits better than the result `stuck`, which stopped at the limit
-/// of its domain.
+/// Return the best other candidate, with converged weights; None if none fits better than the result `stuck`.
 ///
-/// Unstable candidates are excluded if the objective requires stability.
+/// `stuck` stopped at the limit of its domain. Unstable candidates are excluded if the objective requires stability.
 ///
 /// # Errors
 /// [`Error::Interrupted`] after a stop request.
@@ -300,7 +310,7 @@ pub fn best_alternative<'a>(
     Ok(best)
 }
 
-/// Negative log-likelihood per sample, up to a constant.
+/// Negative log-likelihood per sample, summed over outputs, up to a constant.
 fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -> f64 {
     grid.residual_root_mean_squares(attempt)
         .iter()
@@ -309,10 +319,10 @@ fn negative_log_likelihood(attempt: &OptimizationResult, grid: &Objective<'_>) -
         .sum()
 }
 
-/// Select the extrapolated limit or the optimum of the finer grid, whichever fits better on half the step.
+/// Return the extrapolated limit or the optimum of the finest grid, whichever fits better on half the step.
 ///
 /// If poorly determined parameters have a curved valley, a straight extrapolation leaves it. If the residuals are
-/// linear along the line and the grids agree, the limit is better.
+/// linear along the line and the grids agree, the limit is returned without this comparison.
 fn select_limit_or_optimum(
     best: &OptimizationResult,
     grid: &Objective<'_>,
@@ -329,7 +339,7 @@ fn select_limit_or_optimum(
     }
     let length = |row: &[f64]| inner(row, row).sqrt();
     if inner(&way, &way) <= MAX_CHANGE_STANDARD_ERRORS * MAX_CHANGE_STANDARD_ERRORS {
-        // Both have the same residuals.
+        // Both points have nearly the same residuals.
         return Ok(limit);
     }
     let limit_iterate = best.iterate_at(&limit);
@@ -343,7 +353,7 @@ fn select_limit_or_optimum(
     let finer = match grid.finer() {
         Ok(finer) => finer,
         Err(Error::Interrupted) => return Err(Error::Interrupted),
-        // Neither can be simulated on half the step.
+        // Neither point can be simulated on half the step.
         Err(_) => return Ok(limit),
     };
     let mut costs = [f64::INFINITY; 2];

@@ -8,7 +8,7 @@ use crate::estimation::output_error::FreeInput;
 use crate::expression::DerivedSignal;
 use crate::fractional::kernels::{MAX_EXCESS, MIN_INPUT_ORDER};
 
-/// Difference below which two orders are equal.
+/// Difference below which two orders count as equal.
 const ORDER_TOLERANCE: f64 = 1e-9;
 
 /// Coefficient of a term: free or fixed.
@@ -35,7 +35,7 @@ impl Coefficient {
     }
 }
 
-/// Term factor · coefficient · D^order signal.
+/// Term of an equation: factor · coefficient · D^ν signal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParametricTerm {
     /// Index of the signal.
@@ -44,12 +44,12 @@ pub struct ParametricTerm {
     pub order: Order,
     /// Coefficient, free or fixed.
     pub coefficient: Coefficient,
-    /// Factor of the coefficient, a given number.
+    /// Known factor of the coefficient.
     pub factor: f64,
 }
 
 impl ParametricTerm {
-    /// Value of factor · coefficient if fixed; None if free.
+    /// Return factor · coefficient if the coefficient is fixed, else None.
     #[must_use]
     pub fn fixed_coefficient(&self) -> Option<f64> {
         match self.coefficient {
@@ -59,7 +59,7 @@ impl ParametricTerm {
     }
 }
 
-/// Friction parameters fc, fs and vs of the output of an equation, each a factor times a coefficient.
+/// Friction parameters of the output of an equation, each as a known factor and a coefficient.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionParameters {
     /// Coulomb friction fc.
@@ -76,7 +76,7 @@ impl FrictionParameters {
     }
 }
 
-/// Equation D^order output = Σ terms.
+/// Equation D^α output = Σ terms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParametricEquation {
     /// Index of the output.
@@ -90,13 +90,13 @@ pub struct ParametricEquation {
 }
 
 impl ParametricEquation {
-    /// Equation D^order output = 0, to which [`Self::with_term`] adds terms.
+    /// Return the equation D^α output = 0 with the order α = `order`, to which [`Self::with_term`] adds terms.
     #[must_use]
     pub fn new(output: usize, order: Order) -> Self {
         Self { output, order, terms: Vec::new(), friction: None }
     }
 
-    /// Add a term coefficient · D^order signal with a free coefficient of this name.
+    /// Add a term coefficient · D^order signal, whose coefficient is free and has the given name.
     #[must_use]
     pub fn with_term(mut self, coefficient: &str, order: Order, signal: usize) -> Self {
         self.terms.push(ParametricTerm {
@@ -114,17 +114,17 @@ impl ParametricEquation {
         self.terms.iter().filter_map(|term| term.coefficient.name()).chain(rubs)
     }
 
-    /// α, then the order of each term.
+    /// Order α of the equation, then the order of each term.
     pub fn orders(&self) -> impl Iterator<Item = &Order> {
         std::iter::once(&self.order).chain(self.terms.iter().map(|term| &term.order))
     }
 
-    /// Terms of the output of the equation.
+    /// Autoregressive terms: those of the output of the equation.
     pub fn autoregressive_terms(&self) -> impl Iterator<Item = &ParametricTerm> {
         self.terms.iter().filter(|term| term.signal == self.output)
     }
 
-    /// Terms of other signals.
+    /// Terms of other signals than the output.
     pub fn input_terms(&self) -> impl Iterator<Item = &ParametricTerm> {
         self.terms.iter().filter(|term| term.signal != self.output)
     }
@@ -157,70 +157,72 @@ impl ParametricEquation {
     }
 }
 
-/// Free parameter of an input and its name.
+/// Free parameter of an input, with its name.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Input {
     /// Name of the parameter, such as `delay_u`.
     pub name: String,
-    /// Kind of the parameter and its input.
+    /// Kind of the parameter, its bounds and its input.
     pub free: FreeInput,
 }
 
-/// Coefficient law: a coefficient that equals sign · Π factors.
+/// Coefficient law: a coefficient equals sign · Π factors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Law {
     /// Name of the coefficient.
     pub name: String,
     /// Sign, ±1.
     pub sign: f64,
-    /// Names of the factors, repeated for powers.
+    /// Names of the factors. A factor is repeated for a power.
     pub factors: Vec<String>,
 }
 
-/// Prior knowledge of orders and coefficients for initial guesses; it does not bound the fit.
+/// Prior knowledge of orders and coefficients for initial guesses. It does not bound the fit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Hints {
-    /// Typical interval of the highest orders.
+    /// Typical interval of the highest orders of the equations.
     pub highest: Option<(f64, f64)>,
-    /// Typical values besides integer orders, by order name.
+    /// Typical values of free orders, by name.
     pub natural: BTreeMap<String, Vec<f64>>,
-    /// Physical lower bound of each ratio of the coefficient law; default 1.
+    /// Physical lower bound of each ratio (factor of a coefficient law), by name; 1 by default.
     pub ratio_lower_bounds: BTreeMap<String, f64>,
-    /// Coefficients that the law determines from another equation and that are positive by physics.
+    /// Names of coefficients that a coefficient law determines from another equation and that are physically positive.
     pub positive: BTreeSet<String>,
-    /// Approximate physical values of coefficients.
+    /// Approximate physical values of coefficients, by name.
     pub known: BTreeMap<String, f64>,
 }
 
-/// Structure of a joint fit: equations, bounds, initial terms, input non-linearities and laws.
+/// Structure of a joint fit: equations, bounds, initial terms, input nonlinearities and coefficient laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParametricStructure {
-    /// Names of the signals, for messages: recorded ones, then derived ones.
+    /// Names of the signals, for messages: recorded signals, then derived signals.
     pub signals: Vec<String>,
-    /// Signals of the non-linear terms: expressions, numbered after the recorded signals.
+    /// Expressions that are the signals of nonlinear terms. They are numbered after the recorded signals.
     pub derived: Vec<DerivedSignal>,
     /// One equation per output.
     pub equations: Vec<ParametricEquation>,
-    /// Lower and upper bound of free orders, if given.
+    /// Given lower and upper bounds of free orders, by name.
     pub bounds: BTreeMap<String, (f64, f64)>,
-    /// True if outputs enter other equations as simulated; false if as measured.
+    /// True if simulated outputs enter the other equations, false if measured outputs do.
     pub coupled: bool,
     /// True if an input has a fixed delay.
     pub delayed: bool,
-    /// Initial terms.
+    /// Initial terms of the equations.
     pub initial: Initial,
     /// True if the initial terms represent inputs before the start of a run.
     pub history: bool,
-    /// Free parameters of the inputs.
+    /// Free parameters of inputs: delays and limits.
     pub inputs: Vec<Input>,
-    /// Laws between coefficients.
+    /// Coefficient laws.
     pub laws: Vec<Law>,
     /// Prior knowledge for initial guesses.
     pub hints: Hints,
 }
 
 impl ParametricStructure {
-    /// Structure with measured signals as inputs and no further assumptions.
+    /// Return a structure of uncoupled equations without bounds, laws or free input parameters.
+    ///
+    /// Measured signals are the inputs.
     #[must_use]
     pub fn new(signals: Vec<String>, equations: Vec<ParametricEquation>, initial: Initial) -> Self {
         Self {
@@ -244,7 +246,9 @@ impl ParametricStructure {
         self.signals.len() - self.derived.len().min(self.signals.len())
     }
 
-    /// Names of the free orders: single ones in order of appearance, then those that occur only in a law.
+    /// Names of the free orders.
+    ///
+    /// Orders that stand alone come first, in order of appearance. Those that occur only in an order law follow.
     #[must_use]
     pub fn order_names(&self) -> Vec<String> {
         let orders = || self.equations.iter().flat_map(ParametricEquation::orders);
@@ -258,7 +262,9 @@ impl ParametricStructure {
         self.equations.iter().flat_map(ParametricEquation::coefficient_names).cloned().collect()
     }
 
-    /// True if orders depend on one another: one is not a single free order, or two are the same.
+    /// Return true if orders depend on one another.
+    ///
+    /// This is the case if an order is not a single free order, or if two orders are the same free order.
     #[must_use]
     pub fn has_order_law(&self) -> bool {
         let orders: Vec<_> =
@@ -267,16 +273,17 @@ impl ParametricStructure {
         orders.iter().any(|order| !order.is_single()) || names.len() < orders.len()
     }
 
-    /// True if an equation has friction.
+    /// Return true if an equation has friction.
     #[must_use]
     pub fn has_friction(&self) -> bool {
         self.equations.iter().any(|equation| equation.friction.is_some())
     }
 
-    /// Check that signals have names and orders form valid equations.
+    /// Check that there are equations, that their signals exist and that their orders are valid.
     ///
     /// # Errors
-    /// [`Error::Structure`] for an equation without terms, a signal that does not exist, or an order out of range.
+    /// [`Error::Structure`] if there is no equation, for an equation without terms, a signal that does not exist, or an
+    /// order out of range.
     pub fn check(&self) -> Result<()> {
         if self.equations.is_empty() {
             return Err(Error::Structure { what: "a model without an equation".into(), remedy: "add one".into() });
@@ -295,7 +302,7 @@ impl ParametricStructure {
         self.equations.iter().try_for_each(ParametricEquation::check)
     }
 
-    /// Return the structure with values for some free orders.
+    /// Return the structure with fixed values for some free orders, given by name.
     ///
     /// # Errors
     /// [`Error::Structure`] for an order out of range ([`ParametricStructure::check`]).
@@ -310,7 +317,7 @@ impl ParametricStructure {
         Ok(out)
     }
 
-    /// Return the structure with values for some free coefficients.
+    /// Return the structure with fixed values for some free coefficients, given by name.
     #[must_use]
     pub fn with_coefficients(&self, values: &BTreeMap<String, f64>) -> Self {
         let mut out = self.clone();
@@ -325,7 +332,7 @@ impl ParametricStructure {
         out
     }
 
-    /// Structure without free input parameters.
+    /// Return the structure without free input parameters.
     #[must_use]
     pub fn without_inputs(&self) -> Self {
         Self { inputs: Vec::new(), ..self.clone() }
@@ -342,7 +349,7 @@ impl ParametricStructure {
     }
 }
 
-/// Each name once, in order of appearance.
+/// Return each name once, in order of appearance.
 pub(super) fn unique<'a>(names: impl Iterator<Item = &'a String>) -> Vec<String> {
     let mut names_so_far = BTreeSet::new();
     names.filter(|name| names_so_far.insert(*name)).cloned().collect()
@@ -353,12 +360,12 @@ pub(super) fn unique<'a>(names: impl Iterator<Item = &'a String>) -> Vec<String>
 pub struct Order {
     /// Constant part.
     pub constant: f64,
-    /// Nonzero weight of each free order, sorted by name.
+    /// Name and nonzero weight of each free order, sorted by name.
     pub weights: Vec<(String, f64)>,
 }
 
 impl Order {
-    /// Order with a fixed value.
+    /// Return an order with a fixed value.
     ///
     /// ```
     /// use ftlm::estimation::joint_fit::structure::Order;
@@ -369,7 +376,7 @@ impl Order {
         Self { constant, weights: Vec::new() }
     }
 
-    /// Single free order.
+    /// Return an order that is a single free order.
     #[must_use]
     pub fn free(name: &str) -> Self {
         Self { constant: 0.0, weights: vec![(name.to_owned(), 1.0)] }
@@ -380,25 +387,25 @@ impl Order {
         self.weights.iter().map(|(name, _)| name)
     }
 
-    /// Whether it depends on free orders.
+    /// Return true if the order depends on free orders.
     #[must_use]
     pub fn is_free(&self) -> bool {
         !self.weights.is_empty()
     }
 
-    /// True if it is a single free order with weight 1 and no constant.
+    /// Return true if the order is a single free order with weight 1 and no constant.
     #[must_use]
     pub fn is_single(&self) -> bool {
         self.constant == 0.0 && matches!(self.weights.as_slice(), [(_, 1.0)])
     }
 
-    /// Value at the given values of the free orders.
+    /// Return the value of the order; `value` returns the value of a free order by its name.
     #[must_use]
     pub fn at(&self, value: impl Fn(&str) -> f64) -> f64 {
         self.constant + self.weights.iter().map(|(name, weight)| weight * value(name)).sum::<f64>()
     }
 
-    /// Return the order with values for some free orders.
+    /// Return the order with fixed values for some free orders, given by name.
     #[must_use]
     pub fn substitute(&self, values: &BTreeMap<String, f64>) -> Self {
         let weighted = self.weights.iter().filter_map(|(name, weight)| values.get(name).map(|value| weight * value));
@@ -407,7 +414,7 @@ impl Order {
         Self { constant, weights }
     }
 
-    /// Convert to an order with unnamed weights, in the sequence of `names`.
+    /// Convert to an order without names, whose weights are in the sequence of `names`.
     #[must_use]
     pub fn affine(&self, names: &[String]) -> AffineOrder {
         let weight = |name: &String| self.weights.iter().find(|(n, _)| n == name).map_or(0.0, |(_, weight)| *weight);

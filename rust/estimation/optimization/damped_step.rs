@@ -1,8 +1,9 @@
-//! Steps of a non-linear least-squares problem: problem trait, damped step, secant curvature, valley extrapolation.
+//! Steps of a nonlinear least-squares problem: problem trait, damped step, secant curvature, valley extrapolation.
 //!
-//! With an incomplete model the residuals stay large, and in an ill-conditioned valley the second-order part is as
-//! large as JᵀJ. Gauss–Newton then converges slowly. The secant updates of Dennis, Gay & Welsch (NL2SOL,
-//! doi:10.1145/355958.355965) need no evaluation, and are used only if they predict the cost better.
+//! J is the Jacobian of the residuals e. With an incomplete model the residuals stay large. In an ill-conditioned
+//! valley, the second-order part of the Hessian is then as large as JᵀJ, and Gauss–Newton converges slowly. The secant
+//! updates of Dennis, Gay & Welsch (NL2SOL, doi:10.1145/355958.355965) approximate this part without an evaluation.
+//! They are used only if they predict the cost better.
 //!
 //! Poorly determined parameters cause a curved valley, along which successive steps have nearly the same direction. The
 //! sum of the last steps is multiplied and tried as one extrapolation step. Ordinary steps follow from there. If they
@@ -14,29 +15,31 @@ use crate::linalg::orthogonal::norm;
 use crate::linalg::small::{self, back_substitute};
 use crate::signal::statistics::inner;
 
-/// Minimum damping. Below it the rounding error of the QR factor dominates.
+/// Minimum damping. Below it, the rounding error of the QR factorization dominates.
 pub(crate) const MIN_DAMPING: f64 = 1e-12;
-/// Distance from a linear constraint up to which it is active. The distance is the change of the residuals, relative to
-/// their norm.
+/// Maximum distance from a linear constraint at which the constraint is active.
+///
+/// The distance is measured by the change of the residuals along it, relative to their norm.
 const ACTIVE_CONSTRAINT_TOLERANCE: f64 = 1e-9;
 
-/// Linearization of a problem at a point: QR factor R of [J | e], with J in coordinates and scaled to unit columns.
+/// Linearization of a problem at a point: triangular factor R of the QR factorization of [J | e].
 ///
-/// Eliminated parameters come first. The lower part of R then belongs to the other parameters, with the eliminated ones
-/// projected out.
+/// The columns of the Jacobian J are derivatives with respect to the coordinates, scaled to unit norm. e are the
+/// residuals. Eliminated parameters come first. The lower part of R then belongs to the other parameters, with the
+/// eliminated ones projected out.
 pub(crate) struct LinearizedProblem {
     r: Vec<f64>,
-    /// Parameter of each column.
+    /// Index of the parameter of each column.
     order: Vec<usize>,
-    /// Norm of each column before scaling; 0 without effect.
+    /// Norm of each column before scaling; 0 for a parameter without effect.
     pub(crate) scales: Vec<f64>,
-    /// Products of the unit columns with the residuals.
+    /// Dot products of the unit columns with the residuals.
     gradient: Vec<f64>,
-    /// Distances from the bounds, in scaled steps.
+    /// Distances from the lower and the upper bound, in scaled steps, by column.
     distance_to_bounds: Vec<(f64, f64)>,
-    /// Linear inequality constraints on scaled steps: unit normal, and largest dot product of the normal with a step.
+    /// Linear inequality constraints on scaled steps: unit normal, and maximum dot product of the normal with a step.
     constraints: Vec<(Vec<f64>, f64)>,
-    /// True for parameters excluded from the steps.
+    /// True for each column whose parameter is excluded from the steps.
     is_fixed: Vec<bool>,
     /// Number of eliminated parameters.
     pub(crate) eliminated_count: usize,
@@ -102,7 +105,7 @@ impl LinearizedProblem {
         }
     }
 
-    /// Largest gradient component of a free parameter, without components that point out of active constraints.
+    /// Largest magnitude of a gradient component of a free parameter, without the parts along active constraints.
     pub(crate) fn max_gradient(&self) -> f64 {
         let mut gradient = self.gradient.clone();
         for (k, multiplier) in self.active_constraints() {
@@ -111,12 +114,12 @@ impl LinearizedProblem {
         gradient.iter().zip(&self.is_fixed).filter(|(_, is_fixed)| !**is_fixed).fold(0.0, |a, (g, _)| a.max(g.abs()))
     }
 
-    /// True if a linear inequality constrains the steps.
+    /// Return true if a linear inequality constrains the steps.
     pub(crate) fn is_constrained(&self) -> bool {
         !self.constraints.is_empty()
     }
 
-    /// Active constraints that block the descent direction: index and Lagrange multiplier.
+    /// Return the active constraints that block the descent direction, as pairs of index and Lagrange multiplier.
     pub(crate) fn active_constraints(&self) -> Vec<(usize, f64)> {
         let near = |k: &usize| self.constraints[*k].1 <= ACTIVE_CONSTRAINT_TOLERANCE * self.norm;
         let active: Vec<usize> = (0..self.constraints.len()).filter(near).collect();
@@ -127,8 +130,9 @@ impl LinearizedProblem {
         active.into_iter().zip(multipliers).filter(|(_, multiplier)| *multiplier > 0.0).collect()
     }
 
-    /// Minimize ‖J s + e‖² + λ‖s‖² over the free parameters within bounds; return the step and its relative decrease of
-    /// the cost.
+    /// Minimize ‖J s + e‖² + λ‖s‖² over the scaled step s of the free parameters, within bounds and constraints.
+    ///
+    /// λ is `damping`. Return the step and the predicted relative decrease of the cost.
     pub(crate) fn damped_step_and_decrease(&self, damping: f64) -> (Vec<f64>, f64) {
         let step = self
             .step_within_bounds(|is_fixed| {
@@ -139,20 +143,23 @@ impl LinearizedProblem {
         (step, falls)
     }
 
-    /// Step with secant curvature over the parameters that are not eliminated; None if the quadratic model has no
-    /// minimum.
+    /// Return the step with secant curvature over the parameters that are not eliminated.
+    ///
+    /// Return also the predicted relative decrease of the cost, or None if the quadratic model has no minimum.
     pub(crate) fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
         let step = self.step_within_bounds(|is_fixed| self.minimize_with_curvature(is_fixed, damping, curvature))?;
         let falls = self.predicted_decrease(&step, self.eliminated_count) - self.curvature_change(&step, curvature);
         Some((step, falls))
     }
 
-    /// Relative increase of the cost along a scaled step by the secant curvature.
+    /// Relative increase of the cost along a scaled step that is due to the secant curvature.
     pub(crate) fn curvature_change(&self, step: &[f64], curvature: &Curvature) -> f64 {
         curvature.quadratic_form(&self.to_coordinates(step)) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
-    /// Step of the free parameters within bounds, by an active-set iteration.
+    /// Return the scaled step within bounds, by an active-set iteration.
+    ///
+    /// `step_of` returns the step for given flags of fixed parameters, or None.
     fn step_within_bounds(&self, step_of: impl Fn(&[bool]) -> Option<Vec<f64>>) -> Option<Vec<f64>> {
         let mut is_fixed = self.is_fixed.clone();
         let mut step = loop {
@@ -172,7 +179,9 @@ impl LinearizedProblem {
         Some(step)
     }
 
-    /// Relative decrease of the cost along a step predicted by JᵀJ, with the columns before `first` projected out.
+    /// Return the relative decrease of the cost that JᵀJ predicts for a scaled step.
+    ///
+    /// The columns before `first` are projected out.
     pub(crate) fn predicted_decrease(&self, step: &[f64], first: usize) -> f64 {
         let k = step.len();
         let image = |i: usize| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>();
@@ -182,8 +191,9 @@ impl LinearizedProblem {
         (-2.0 * along - quadratic) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
     }
 
-    /// Product JᵀJ s of the Gauss–Newton matrix with a step s, by parameter, with the eliminated parameters projected
-    /// out.
+    /// Product JᵀJ s of the Gauss–Newton matrix with a step s in coordinates, by parameter.
+    ///
+    /// The eliminated parameters are projected out.
     pub(crate) fn columns_along(&self, step: &[f64]) -> Vec<f64> {
         let k = self.scales.len();
         let scaled: Vec<f64> = self.order.iter().zip(&self.scales).map(|(&i, scale)| step[i] * scale).collect();
@@ -204,7 +214,7 @@ impl LinearizedProblem {
         out
     }
 
-    /// Gradient in coordinates, by parameter; 0 for eliminated parameters.
+    /// Gradient of the cost by the coordinates, one value per parameter; 0 for eliminated parameters.
     pub(crate) fn gradient_by_parameter(&self) -> Vec<f64> {
         let mut out = vec![0.0; self.scales.len()];
         for (place, &i) in self.order.iter().enumerate().skip(self.eliminated_count) {
@@ -213,7 +223,7 @@ impl LinearizedProblem {
         out
     }
 
-    /// Minimize the quadratic model with secant curvature and damping; None if it is not positive definite.
+    /// Minimize the quadratic model with secant curvature and damping. Return None if it is not positive definite.
     fn minimize_with_curvature(&self, is_fixed: &[bool], damping: f64, curvature: &Curvature) -> Option<Vec<f64>> {
         let k = is_fixed.len();
         let free: Vec<usize> = (self.eliminated_count..k).filter(|&i| !is_fixed[i]).collect();
@@ -238,7 +248,7 @@ impl LinearizedProblem {
         Some(step)
     }
 
-    /// Convert a scaled step to the coordinates, by parameter.
+    /// Convert a scaled step by column to a step in the coordinates by parameter.
     pub(crate) fn to_coordinates(&self, step: &[f64]) -> Vec<f64> {
         let mut out = vec![0.0; step.len()];
         for ((&i, s), scale) in self.order.iter().zip(step).zip(&self.scales) {
@@ -248,9 +258,10 @@ impl LinearizedProblem {
     }
 }
 
-/// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for fixed parameters.
+/// Minimize ‖R s + e‖² + λ‖s‖² for the triangular factor `r` of [J | e], with s = 0 for fixed parameters.
 ///
-/// Eliminated parameters have the smallest damping. Each constraint (normal, room) means normal · s ≤ room.
+/// λ is `damping`, except for the first `projected` parameters. These are eliminated and have the smallest damping.
+/// Each constraint (normal, room) means normal · s ≤ room.
 fn triangular_damped_step(
     r: &[f64],
     is_fixed: &[bool],
@@ -303,7 +314,7 @@ fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(V
     let columns: Vec<Vec<f64>> = (constraints.iter())
         .filter(|(normal, room)| room.is_finite() && normal.iter().any(|v| *v != 0.0))
         .map(|(normal, room)| {
-            // −R⁻ᵀ normal, with the distance from the constraint below it.
+            // −R⁻ᵀ normal, followed by the distance from the constraint.
             let mut column: Vec<f64> = Vec::with_capacity(k + 1);
             for i in 0..k {
                 let before: f64 = (0..i).map(|l| r[l * stride + i] * column[l]).sum();
@@ -325,39 +336,43 @@ fn constrained_solution(r: &[f64], stride: usize, rhs: &[f64], constraints: &[(V
     back_substitute(r, stride, &shifted)
 }
 
-/// Non-linear least-squares problem.
+/// Nonlinear least-squares problem.
 pub trait LeastSquaresProblem {
-    /// Argument of the residuals.
+    /// Parameters at which the residuals are evaluated.
     type Point: Clone;
-    /// Residuals at a point, and intermediates for their derivatives.
+    /// Residuals at a point, and intermediate results for their derivatives.
     type Evaluation;
 
-    /// Evaluate a point.
+    /// Compute the residuals at a point.
     ///
-    /// After [`crate::error::Error::Diverged`] and [`crate::error::Error::LeadingZero`] the step is shortened.
+    /// The minimization shortens the step after an error that ends the simulation, such as
+    /// [`crate::error::Error::Diverged`] and [`crate::error::Error::LeadingZero`].
     ///
     /// # Errors
     /// Any other error terminates the minimization.
     fn evaluate(&self, point: &Self::Point) -> Result<Self::Evaluation>;
 
-    /// The residuals of an evaluation.
+    /// Residuals of an evaluation.
     fn residuals<'a>(&self, evaluation: &'a Self::Evaluation) -> &'a [f64];
 
-    /// Derivatives of the residuals with respect to every parameter, one column each.
+    /// Derivatives of the residuals with respect to every parameter, one column per parameter.
     ///
     /// # Errors
-    /// As [`LeastSquaresProblem::evaluate`]; [`crate::error::Error::Diverged`] shortens the step.
+    /// The minimization shortens the step after an error that ends the simulation, and terminates after any other
+    /// error.
     fn jacobian(&self, point: &Self::Point, evaluation: &Self::Evaluation) -> Result<Vec<Vec<f64>>>;
 
-    /// Move a point by steps in the coordinates, within bounds; return it and the largest relative change.
+    /// Move a point by steps in the coordinates, within bounds.
+    ///
+    /// Return the new point and the largest relative change of a parameter.
     fn apply_step(&self, point: &Self::Point, steps: &[f64]) -> (Self::Point, f64);
 
-    /// Point of an evaluation, with the eliminated linear parameters at their optimum.
+    /// Return the point of an evaluation, with the eliminated linear parameters at their optimum.
     fn point_of_evaluation(&self, _evaluation: &Self::Evaluation, point: Self::Point) -> Self::Point {
         point
     }
 
-    /// True if every evaluation eliminates a parameter; its steps need no damping.
+    /// Return true if every evaluation eliminates a parameter. Its steps then need no damping.
     fn is_eliminated(&self, _parameter: usize) -> bool {
         false
     }
@@ -367,7 +382,9 @@ pub trait LeastSquaresProblem {
         1.0
     }
 
-    /// Derivatives of other parameters with respect to the coordinate of a parameter, as (index, derivative).
+    /// Derivatives of other parameters with respect to the coordinate of a parameter.
+    ///
+    /// Each is a pair of the index of the other parameter and the derivative.
     fn coupled_derivatives(&self, _point: &Self::Point, _parameter: usize) -> Vec<(usize, f64)> {
         Vec::new()
     }
@@ -377,43 +394,48 @@ pub trait LeastSquaresProblem {
         (f64::INFINITY, f64::INFINITY)
     }
 
-    /// Linear inequality constraints on steps from a point: normal in the coordinates, and largest dot product of the
-    /// normal with a step.
+    /// Linear inequality constraints on steps from a point, as pairs of normal and room.
+    ///
+    /// A step in the coordinates is admissible if its dot product with the normal is at most the room.
     fn constraints(&self, _point: &Self::Point) -> Vec<(Vec<f64>, f64)> {
         Vec::new()
     }
 
-    /// True if the cost can have kinks along a parameter, so that its gradient need not vanish at a minimum.
+    /// Return true if the cost can have kinks along a parameter, so that the gradient need not vanish at a minimum.
     fn has_kinks(&self, _point: &Self::Point, _parameter: usize) -> bool {
         false
     }
 
-    /// Norm of the signals whose difference the residuals are; it bounds their rounding error.
+    /// Norm of the signals whose difference is the residual vector. It determines the rounding error of the residuals.
     fn signal_norm(&self, _evaluation: &Self::Evaluation) -> f64 {
         0.0
     }
 
-    /// True if a point is admissible. Steps from an admissible point to an inadmissible one are rejected.
+    /// Return true if a point is admissible. Steps from an admissible point to an inadmissible one are rejected.
     fn is_admissible(&self, _point: &Self::Point) -> bool {
         true
     }
 
-    /// True if the minimization may extrapolate along valleys. A multistart disables it, to keep distinct optima.
+    /// Return true if the minimization may extrapolate along valleys.
+    ///
+    /// A multistart disables extrapolation, to keep distinct optima.
     fn allows_extrapolation(&self) -> bool {
         true
     }
 
-    /// True if the optimum is nearly known, so that the first step may be almost Gauss–Newton.
+    /// Return true if the optimum is nearly known, so that the first step may be almost Gauss–Newton.
     fn starts_near_optimum(&self) -> bool {
         false
     }
 }
-/// Ratio of the prediction errors at the last step above which the better model is used for the next one.
+/// Ratio of the prediction errors at the last step above which the next step uses the better model.
+///
+/// The two models are those without and with secant curvature.
 const MIN_PREDICTION_IMPROVEMENT: f64 = 1.5;
-/// Relative prediction error below which Gauss–Newton is accurate enough.
+/// Relative prediction error below which the Gauss–Newton model is accurate enough.
 const PREDICTION_TOLERANCE: f64 = 0.1;
 
-/// Secant approximation of the second-order part, in the coordinates of the steps.
+/// Secant approximation of the second-order part of the Hessian, in the coordinates of the steps.
 pub(crate) struct Curvature {
     count: usize,
     matrix: Vec<f64>,
@@ -422,12 +444,12 @@ pub(crate) struct Curvature {
 }
 
 impl Curvature {
-    /// Zero matrix for `count` parameters.
+    /// Return a zero matrix for `count` parameters.
     pub(crate) fn new(count: usize) -> Self {
         Self { count, matrix: vec![0.0; count * count], has_update: false, is_used: false }
     }
 
-    /// True if the matrix has `count` rows.
+    /// Return true if the matrix has `count` rows.
     pub(crate) fn is_for(&self, count: usize) -> bool {
         self.count == count
     }
@@ -441,12 +463,14 @@ impl Curvature {
         self.matrix.chunks_exact(self.count.max(1)).map(|row| row.iter().zip(step).map(|(a, s)| a * s).sum()).collect()
     }
 
-    /// Quadratic form sᵀ B s of this matrix B: second-order change of twice the cost along a step s.
+    /// Quadratic form sᵀ B s of this matrix B with a step s: second-order change of twice the cost.
     pub(crate) fn quadratic_form(&self, step: &[f64]) -> f64 {
         self.times(step).iter().zip(step).map(|(a, s)| a * s).sum()
     }
 
-    /// Decide on the use of the matrix by comparing predictions without and with it to the actual decrease.
+    /// Decide whether the next step uses the matrix.
+    ///
+    /// `without` and `with` are the predicted relative decreases of the cost, and `fall` is the actual one.
     pub(crate) fn select_model(&mut self, without: f64, with: f64, fall: f64) {
         let (missed, missed_with) = ((without - fall).abs(), (with - fall).abs());
         if self.is_used {
@@ -458,7 +482,9 @@ impl Curvature {
         }
     }
 
-    /// Update the matrix after a step. `change` is the change of the gradient, and `columns` the part of it due to JᵀJ.
+    /// Update the matrix after a step.
+    ///
+    /// `change` is the change of the gradient, and `columns` is its part due to JᵀJ.
     pub(crate) fn update(&mut self, step: &[f64], change: &[f64], columns: &[f64]) {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
         let target: Vec<f64> = change.iter().zip(columns).map(|(y, c)| y - c).collect();
@@ -485,13 +511,13 @@ impl Curvature {
         }
     }
 }
-/// Number of last steps whose sum is extrapolated.
+/// Number of most recent steps whose sum is extrapolated.
 const EXTRAPOLATION_STEPS: usize = 4;
-/// Ratio of the norm of the sum of the steps to the sum of their norms. Below it the steps have no common direction.
+/// Minimum ratio of the norm of the sum of the steps to the sum of their norms at which they have a common direction.
 const MIN_STRAIGHTNESS: f64 = 0.8;
 /// Relative decrease of the cost per step above which no extrapolation is needed.
 const MAX_GAIN_PER_STEP: f64 = 1e-3;
-/// Evaluations after an extrapolation within which the cost must decrease.
+/// Number of evaluations after an extrapolation within which the cost must decrease.
 const MAX_TRIAL_EVALUATIONS: usize = 6;
 /// Initial factor by which the sum of the steps is multiplied.
 const INITIAL_EXTRAPOLATION_FACTOR: f64 = 2.0;
@@ -502,17 +528,17 @@ const MAX_EXTRAPOLATION_FACTOR: f64 = 16.0;
 pub(crate) struct ValleyExtrapolation<P> {
     steps: Vec<Vec<f64>>,
     factor: f64,
-    /// Point before the extrapolation, its cost, and the number of evaluations.
+    /// Point before the extrapolation, its cost, and the number of evaluations until then.
     trial_start: Option<(P, f64, usize)>,
 }
 
 impl<P> ValleyExtrapolation<P> {
-    /// Extrapolation without recorded steps.
+    /// Return an extrapolation without recorded steps.
     pub(crate) fn new() -> Self {
         Self { steps: Vec::new(), factor: INITIAL_EXTRAPOLATION_FACTOR, trial_start: None }
     }
 
-    /// Record a step in coordinates and its relative decrease of the cost.
+    /// Record a step in coordinates. Discard all steps if the relative decrease of the cost, `gain`, is large.
     pub(crate) fn record_step(&mut self, step: &[f64], gain: f64) {
         if gain > MAX_GAIN_PER_STEP {
             self.steps.clear();
@@ -521,7 +547,9 @@ impl<P> ValleyExtrapolation<P> {
         }
     }
 
-    /// Extrapolation step from the last steps, if they are straight and enough evaluations are left.
+    /// Return an extrapolation step in coordinates, or None.
+    ///
+    /// The last steps must have a common direction, and the remaining number of `evaluations` must suffice.
     pub(crate) fn propose_step(&mut self, evaluations: usize) -> Option<Vec<f64>> {
         if self.trial_start.is_some() || self.steps.len() < EXTRAPOLATION_STEPS || evaluations <= MAX_TRIAL_EVALUATIONS
         {
@@ -535,18 +563,20 @@ impl<P> ValleyExtrapolation<P> {
         straight.then(|| sum.iter().map(|s| self.factor * s).collect())
     }
 
-    /// Begin a trial extrapolation from this point and cost.
+    /// Begin a trial extrapolation. Store the point before it, the cost and the number of evaluations.
     pub(crate) fn begin_trial(&mut self, from: P, cost: f64, evaluations: usize) {
         self.trial_start = Some((from, cost, evaluations));
     }
 
-    /// Reject the trial extrapolation.
+    /// Reject the trial extrapolation: halve the extrapolation factor, to 1 at least, and discard the recorded steps.
     pub(crate) fn reject_trial(&mut self) {
         self.factor = (0.5 * self.factor).max(1.0);
         self.steps.clear();
     }
 
     /// Return the point before the trial extrapolation if the trial failed or the search ends during it, else None.
+    ///
+    /// After a decrease of the cost, the extrapolation factor is doubled.
     pub(crate) fn outcome(&mut self, cost: f64, evaluations: usize, ends: bool) -> Option<P> {
         let (from, least, since) = self.trial_start.take()?;
         if cost < least {

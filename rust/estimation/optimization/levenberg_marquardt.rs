@@ -1,15 +1,15 @@
-//! Non-linear least squares with bounds by Levenberg–Marquardt.
+//! Nonlinear least squares with bounds by the Levenberg–Marquardt method.
 //!
-//! Columns are scaled by the column norms of the Jacobian. Steps follow from a QR factor of [J | e] with the damping
-//! below it. A rejected step costs no Jacobian. The problem defines the coordinates and bounds of its parameters.
-//! Parameters at an active bound are excluded from step and gradient. Under linear inequality constraints a step solves
-//! the damped linear problem within them.
+//! The columns of the Jacobian J are scaled to unit norm. A step follows from a QR factorization of [J | e], with the
+//! residuals e and with the rows of the damping appended. A rejected step requires no Jacobian. The problem defines the
+//! coordinates and bounds of its parameters. Parameters at an active bound are excluded from step and gradient. Under
+//! linear inequality constraints, a step solves the damped linear problem within them.
 //!
-//! If Gauss–Newton predicts the decrease of the cost badly, secant updates of the second-order part are used. Along an
+//! If Gauss–Newton predicts the decrease of the cost poorly, secant updates of the second-order part are used. Along an
 //! ill-conditioned valley, several steps are extrapolated.
 //!
-//! Convergence means a vanishing gradient: the cosine between the residuals and every free column, as in Dennis &
-//! Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
+//! Convergence means a vanishing gradient. The measure is the cosine between the residuals and every free column, as in
+//! Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
 pub use super::damped_step::LeastSquaresProblem;
 
@@ -20,17 +20,18 @@ use crate::error::{check_length, Error, Result};
 const INITIAL_DAMPING: f64 = 1e-3;
 /// Damping of the first step near an optimum: almost Gauss–Newton.
 const INITIAL_DAMPING_NEAR_OPTIMUM: f64 = 1e-6;
-/// Damping above which a step is at rounding level.
+/// Damping above which a step is at rounding level, so that the minimization terminates.
 const MAX_DAMPING: f64 = 1e12;
 /// Factor by which an accurately predicted step decreases the damping and a rejected step increases it.
 const DAMPING_FACTOR: f64 = 10.0;
 /// Ratio of actual to predicted decrease of the cost above which the damping is decreased.
 const ACCEPTABLE_GAIN_RATIO: f64 = 0.25;
-/// Rounding error of the residuals relative to the signals. It is used in the convergence test if no step decreases the
-/// cost.
+/// Rounding error of the residuals relative to the norm of the signals.
+///
+/// The convergence test uses it if no step decreases the cost.
 const RELATIVE_ROUNDING_ERROR: f64 = 1e-10;
 
-/// Reason of termination.
+/// Reason for termination.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
     /// The gradient is zero up to rounding, except at active bounds.
@@ -39,16 +40,18 @@ pub enum Status {
     Exhausted,
     /// No step decreases the cost although the gradient is not zero.
     Stalled,
-    /// The descent direction leaves the domain of the problem: the value is not finite or not admissible.
+    /// The descent direction leaves the domain of the problem: the cost is not finite or the point is not admissible.
     DomainLimit,
 }
 
 /// Termination criteria.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MinimizationSettings {
-    /// Maximum number of residual evaluations; 0 for the residuals of the initial guess without derivatives.
+    /// Maximum number of residual evaluations. With 0, only the residuals of the initial guess are computed.
     pub evaluations: usize,
-    /// Relative decrease of the cost by a Gauss–Newton step at convergence: the square of the cosine of the gradient.
+    /// Relative decrease of the cost by a Gauss–Newton step below which the minimization has converged.
+    ///
+    /// It is the square of the cosine between the residuals and a column of the Jacobian.
     pub tolerance: f64,
 }
 
@@ -62,9 +65,9 @@ impl Default for MinimizationSettings {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Minimum<P, E> {
-    /// The best point.
+    /// Best point.
     pub point: P,
-    /// Its evaluation.
+    /// Evaluation of the best point.
     pub evaluation: E,
     /// Half the sum of squared residuals.
     pub cost: f64,
@@ -72,11 +75,11 @@ pub struct Minimum<P, E> {
     pub jacobian: Vec<Vec<f64>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
-    /// Reason of termination.
+    /// Reason for termination.
     pub status: Status,
 }
 
-/// Half the sum of squares.
+/// Half the sum of squared residuals.
 fn cost(residuals: &[f64]) -> f64 {
     0.5 * residuals.iter().map(|e| e * e).sum::<f64>()
 }
@@ -86,7 +89,8 @@ fn cost(residuals: &[f64]) -> f64 {
 /// A step costs O(k² N) for k parameters and N residuals, in addition to the evaluations.
 ///
 /// # Errors
-/// Those of the problem at the initial guess; [`Error::Length`] for a Jacobian that does not match the residuals.
+/// The error of the evaluation of the initial guess. [`Error::Length`] for a column of the Jacobian that does not match
+/// the residuals. At later points, any error that does not end the simulation.
 ///
 /// ```
 /// use ftlm::error::Result;
@@ -169,7 +173,7 @@ struct SearchState<P: LeastSquaresProblem> {
     trusted: bool,
     damping: f64,
     curvature: Curvature,
-    /// The last step in coordinates, and the gradient before it.
+    /// Last step in coordinates, and the gradient before it.
     before: Option<(Vec<f64>, Vec<f64>)>,
 }
 
@@ -180,7 +184,7 @@ impl<P: LeastSquaresProblem> SearchState<P> {
     }
 }
 
-/// Result of one iteration: the step in coordinates and its relative decrease of the cost, or termination.
+/// Result of one iteration: step in coordinates and relative decrease of the cost, or reason for termination.
 enum Advance {
     Moved(Vec<f64>, f64),
     Ended(Status),
@@ -195,7 +199,7 @@ struct Search<'a, P> {
     gain: f64,
     /// True if the last trial step left the domain of the problem.
     hit: bool,
-    /// True if parameters with kinks are kept fixed.
+    /// True if parameters with kinks are fixed.
     corners: bool,
 }
 
@@ -207,7 +211,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
         Ok(jacobian)
     }
 
-    /// Evaluate the initial guess, without derivatives.
+    /// Evaluate the initial guess without derivatives.
     fn start(&self, start: P::Point) -> Result<SearchState<P>> {
         let evaluation = self.problem.evaluate(&start)?;
         let point = self.problem.point_of_evaluation(&evaluation, start);
@@ -218,12 +222,12 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
         Ok(SearchState { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
     }
 
-    /// Reset the progress of the last steps.
+    /// Discard the gain of the last step and the flag of the domain limit.
     fn reset_progress(&mut self) {
         (self.gain, self.hit) = (f64::INFINITY, false);
     }
 
-    /// Evaluate an extrapolation step; None if it leaves the domain of the problem.
+    /// Evaluate an extrapolation step. Return None if it leaves the domain of the problem.
     fn evaluate_extrapolation(&mut self, from: &SearchState<P>, leap: &[f64]) -> Result<Option<SearchState<P>>> {
         let next = self.problem.apply_step(&from.point, leap).0;
         self.evaluations += 1;
@@ -239,7 +243,7 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
         }
     }
 
-    /// Make one step that decreases the cost, or return the reason of termination.
+    /// Make one step that decreases the cost, or return the reason for termination.
     fn advance(&mut self, at: &mut SearchState<P>) -> Result<Advance> {
         let (problem, settings) = (self.problem, self.settings);
         // Cosine of the gradient at convergence; its square is a relative decrease of the cost.
@@ -268,7 +272,8 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             let level = slope <= flat * linear.norm;
             let (newton, falls) = linear.damped_step_and_decrease(MIN_DAMPING);
             let nowhere = problem.apply_step(&at.point, &linear.to_coordinates(&newton)).1 <= settings.tolerance;
-            // In a valley a small gradient can still be far from the minimum: check the predicted decrease as well.
+            // In a valley, the minimum can be far away although the gradient is small. The predicted decrease is
+            // therefore checked as well.
             if nowhere || (level && (falls <= settings.tolerance || self.gain <= settings.tolerance)) {
                 return Ok(Advance::Ended(Status::Converged));
             }
@@ -284,7 +289,9 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
         }
     }
 
-    /// Shorten the step until it decreases the cost; None if parameters with kinks must be fixed first.
+    /// Shorten the step until it decreases the cost, or return the reason for termination.
+    ///
+    /// Return None if parameters with kinks must be fixed first.
     fn find_descent_step(
         &mut self,
         at: &mut SearchState<P>,
@@ -303,7 +310,8 @@ impl<P: LeastSquaresProblem> Search<'_, P> {
             let steps = linear.to_coordinates(&step);
             let (next, change) = problem.apply_step(&at.point, &steps);
             if change <= settings.tolerance || at.damping > MAX_DAMPING {
-                // No step decreases the cost: converged, at rounding level, at the domain limit or at a kink.
+                // No step decreases the cost. The point has converged, or is at rounding level, at the domain limit or
+                // at a kink.
                 return Ok(if level || slope <= RELATIVE_ROUNDING_ERROR * problem.signal_norm(&at.evaluation) {
                     Some(Advance::Ended(Status::Converged))
                 } else if self.hit {

@@ -1,4 +1,4 @@
-//! Optimization: non-linear least squares within bounds.
+//! Optimization: nonlinear least squares within bounds.
 
 pub mod damped_step;
 pub mod levenberg_marquardt;

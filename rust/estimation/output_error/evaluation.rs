@@ -1,4 +1,4 @@
-//! Residuals at a point, and the elimination of the linear coefficients.
+//! Residuals at a parameter point, and the elimination of the linear coefficients.
 
 use super::parameterization::ParameterPoint;
 use crate::error::{Error, Result};
@@ -7,24 +7,26 @@ use crate::linalg::dense;
 use crate::linalg::orthogonal::{norm, project_out};
 use crate::linalg::small::back_substitute;
 
-/// Relative norm of a response to an initial term outside the span of the other responses, below which it is linearly
-/// dependent.
+/// Relative norm of a response outside the span of the other responses below which it counts as dependent on them.
+///
+/// The responses are those to the initial terms.
 pub(crate) const RANK_TOLERANCE: f64 = 1e-12;
 
-/// Residuals at a point, and intermediate results `P` of each experiment for their derivatives.
+/// Residuals at a point, and intermediate results `P` of each experiment for the derivatives of the residuals.
 pub(crate) struct Evaluation<P> {
-    /// The point, with optimal values of the linear coefficients.
+    /// Parameter point, with optimal values of the linear coefficients.
     pub(crate) point: ParameterPoint,
     pub(crate) residuals: Vec<f64>,
     /// Norm of the weighted measured samples.
     pub(crate) size: f64,
+    /// Coefficients of the initial terms, by experiment and equation.
     pub(crate) initial: Vec<Vec<Vec<f64>>>,
     pub(crate) exponents: Vec<Vec<f64>>,
     pub(crate) parts: Vec<P>,
 }
 
 impl<P> Evaluation<P> {
-    /// Evaluation before any experiment.
+    /// Return an evaluation at a point before any experiment is evaluated.
     pub(crate) fn empty(point: ParameterPoint) -> Self {
         let (residuals, initial, exponents) = (Vec::new(), Vec::new(), Vec::new());
         Self { point, residuals, size: 0.0, initial, exponents, parts: Vec::new() }
@@ -32,9 +34,9 @@ impl<P> Evaluation<P> {
 
     /// Eliminate the linear coefficients and the initial terms from the residuals of each experiment.
     ///
-    /// `columns` are the weighted responses to the initial terms, each with the index of its equation, or None for a
-    /// level. The function `of` returns the orthonormal basis of these responses and the effects of the linear
-    /// coefficients.
+    /// `columns` contains, by experiment, the weighted responses to the initial terms. Each response has the index of
+    /// its equation, or None for a constant level of the output. The function `of` returns the orthonormal basis of
+    /// these responses and the effects of the linear coefficients on the samples.
     pub(crate) fn eliminate(
         &mut self,
         linear: &[usize],
@@ -76,16 +78,17 @@ impl<P> Evaluation<P> {
     }
 }
 
-/// Damping of the unit columns. It is at the level of rounding, so a coefficient that is not identifiable is not
-/// changed.
+/// Damping of the unit columns of the linear coefficients.
+///
+/// It is at the level of rounding errors, so a coefficient that is not identifiable is not changed.
 const COLLINEARITY_DAMPING: f64 = 1e-7;
 
-/// Residuals of an experiment, the basis of its initial terms, and the effects of the linear coefficients on its samples.
+/// Residuals of an experiment, the basis of its initial terms, and the effects of linear coefficients on the samples.
 pub(crate) type LinearSide<'a> = (&'a [f64], &'a [Vec<f64>], Vec<&'a [f64]>);
 
-/// Solve for the steps of the linear coefficients that minimize the residuals of all experiments.
+/// Return the steps of the linear coefficients that minimize the residuals of all experiments.
 ///
-/// The initial terms of each experiment are projected out.
+/// The initial terms of each experiment are projected out. [`Error::Diverged`] if a step is not finite.
 pub(crate) fn solve_linear_steps(sides: &[LinearSide<'_>]) -> Result<Vec<f64>> {
     let count = sides.first().map_or(0, |(_, _, effects)| effects.len());
     let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];

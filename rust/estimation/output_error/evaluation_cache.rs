@@ -1,7 +1,7 @@
 //! Cache of kernels and spectra across the evaluations of one optimization.
 //!
 //! The kernel of a term is the power series of its fractional operator. A kernel and its spectrum are computed again
-//! only if the order of the term changes. Runs with the same step and filter share them.
+//! only if the order of the term changes. Runs with the same step and filter share the kernels and spectra.
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -18,32 +18,36 @@ use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::Kernel;
 
-/// Maximum number of cached powers of t for long records.
+/// Maximum number of cached powers of time for long records.
 const MAX_POWERS_LONG_RECORD: usize = 8;
-/// Maximum number of cached powers of t for short records.
+/// Maximum number of cached powers of time for short records.
 const MAX_POWERS_SHORT_RECORD: usize = 64;
 
-/// Minimum length of a run divided by the longest run with the same cache. Shorter runs would need unnecessarily long
-/// transforms.
+/// Minimum ratio of the length of a run to that of the longest run with the same cache.
+///
+/// Shorter runs would need unnecessarily long transforms.
 const MIN_LENGTH_RATIO: f64 = 0.7;
 
-/// Cache of runs with the same step and filter: kernels, powers of t, and A⁻¹ at the last point, for the longest run.
+/// Cache of the runs with the same step and filter, for the length of the longest run.
+///
+/// It contains kernels, powers of time, and the inverse A⁻¹ of the system matrix at the last point.
 struct GridCache {
     /// Record of zeros with the length of the longest run.
     bare: Record,
     /// Sensor filter of all signals.
     filter: Option<Rc<SeriesFilter>>,
+    /// Number of runs that share the cache.
     runs: usize,
-    /// The last operator of each term of each equation.
+    /// Last operator of each term, by index of its equation and of the term.
     operators: HashMap<(usize, usize), Rc<Operator>>,
-    /// Initial terms t^e, by the bits of their exponents.
+    /// Initial terms t^e, by the bits of the exponent e.
     powers: HashMap<u64, Rc<InitialTerm>>,
-    /// Inverse of the last equations, with the bits of their autoregressive terms as key.
+    /// Inverse of the last system matrix, with the bits of the autoregressive terms as key.
     solved: Option<(Vec<u64>, Rc<SystemInverse>)>,
 }
 
 impl GridCache {
-    /// True if an experiment can share the cache of a longer one.
+    /// Return true if an experiment can share the cache of a longer one.
     fn accepts(&self, experiment: &Experiment) -> bool {
         let record = &experiment.record;
         let filters = match (self.bare.filter(), record.filter()) {
@@ -64,19 +68,19 @@ pub(crate) struct EvaluationCache {
     /// Cancellation flag, checked within an evaluation.
     pub(crate) stop: Stop,
     grid: Rc<RefCell<GridCache>>,
-    /// Length of the spectra.
+    /// Length to which series are padded for their spectra.
     pub(crate) total: usize,
-    /// Spectra of inputs without a free parameter.
+    /// Spectra of inputs without a free parameter, by signal and by the flag of a negative integration order.
     input_spectra: HashMap<(usize, bool), Rc<Kernel>>,
-    /// Impulses at the sensor filters in weighted samples, by output and the bits of their exponents.
+    /// Weighted samples of the responses of the sensor filters to impulses, by output and bits of the exponent.
     impulses: HashMap<(usize, u64), Vec<f64>>,
 }
 
 impl EvaluationCache {
-    /// One cache per experiment; experiments on the same grid share a part of it.
+    /// Return one cache per experiment. Experiments with the same step and filter share a part of it.
     ///
     /// # Errors
-    /// As [`Record::new`].
+    /// An error if a record of zeros cannot be built ([`Record::new`]).
     pub(crate) fn of(experiments: &[Experiment], stop: &Stop) -> Result<Vec<Self>> {
         let mut longest: Vec<usize> = (0..experiments.len()).collect();
         longest.sort_by_key(|&k| std::cmp::Reverse(experiments[k].record.m()));
@@ -111,10 +115,13 @@ impl EvaluationCache {
         Ok(places.into_iter().map(shelf).collect())
     }
 
-    /// Responses of `n` outputs to initial terms t^e, given as (equation, e) in `terms`, over at least `m` pulses.
+    /// Return the responses of `n` outputs to initial terms t^e over at least `m` pulses.
+    ///
+    /// `terms` contains the pairs (index of the equation, e).
     ///
     /// # Errors
-    /// [`crate::error::Error::Length`] for series that do not match the equations ([`SystemInverse::initial_term_responses`]).
+    /// [`crate::error::Error::Length`] for series that do not match the equations
+    /// ([`SystemInverse::initial_term_responses`]).
     pub(crate) fn initial_term_responses(
         &self,
         solved: &SystemInverse,
@@ -127,17 +134,19 @@ impl EvaluationCache {
         })
     }
 
-    /// Pulses of the longest run on the grid.
+    /// Number of pulses of the longest run that shares the cache.
     pub(crate) fn pulses(&self) -> usize {
         self.grid.borrow().bare.m()
     }
 
-    /// True if other runs are on the grid.
+    /// Return true if several runs share the cache.
     fn is_shared(&self) -> bool {
         self.grid.borrow().runs > 1
     }
 
-    /// Operator of a term of integration order `eta`.
+    /// Return the operator of a term of integration order `eta`, from the cache if the order is unchanged.
+    ///
+    /// `place` contains the indices of equation and term. `free` is true for a free order.
     pub(crate) fn operator(&self, place: (usize, usize), eta: f64, free: bool) -> Rc<Operator> {
         let mut grid = self.grid.borrow_mut();
         if let Some(cached) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
@@ -151,10 +160,12 @@ impl EvaluationCache {
         new_operator
     }
 
-    /// Inverse of the equations with these bits of autoregressive terms, computed by `compute` if not cached.
+    /// Return the inverse of the system matrix, computed by `compute` if it is not cached.
+    ///
+    /// The key `bits` contains the bits of the autoregressive terms.
     ///
     /// # Errors
-    /// Those of `compute`.
+    /// The errors of `compute`.
     pub(crate) fn system_inverse(
         &self,
         bits: Vec<u64>,
@@ -175,8 +186,9 @@ impl EvaluationCache {
         }
     }
 
-    /// Spectrum of the input of a term of integration order `eta`, after its input non-linearity, for products of
-    /// [`SPECTRUM_FACTORS`] series.
+    /// Return the spectrum of the input of a term of integration order `eta`, after its input nonlinearity.
+    ///
+    /// The spectrum is padded for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn input_spectrum(
         &mut self,
         model: &FreeModel,
@@ -196,12 +208,12 @@ impl EvaluationCache {
         self.input_spectra.entry((signal, eta < 0.0)).or_insert_with(spectrum).clone()
     }
 
-    /// Spectrum of a series, for products of [`SPECTRUM_FACTORS`] series.
+    /// Return the spectrum of a series, padded for products of [`SPECTRUM_FACTORS`] series.
     pub(crate) fn spectrum(&self, series: &[f64]) -> Rc<Kernel> {
         Rc::new(Kernel::with_length(series, self.total))
     }
 
-    /// Initial term t^e, of the length of the longest run.
+    /// Return the initial term t^e with e = `exponent` over the length of the longest run.
     pub(crate) fn initial_term(&self, exponent: f64) -> Rc<InitialTerm> {
         let mut grid = self.grid.borrow_mut();
         // Exponents that change with free orders would fill the cache.
@@ -223,12 +235,12 @@ impl EvaluationCache {
         self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.apply(series))
     }
 
-    /// Spectrum of the filtered series, for a product with one more series.
+    /// Return the spectrum of the filtered series, padded for a product with one more series.
     pub(crate) fn filtered_spectrum(&self, series: &[f64]) -> Rc<Kernel> {
         Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref(), self.total))
     }
 
-    /// Return the weighted samples of the sensor filter's response to an impulse or to its derivative.
+    /// Return the weighted samples of the response of the sensor filter to an impulse or to its derivative.
     pub(crate) fn impulse_samples(&mut self, experiment: &Experiment, output: usize, exponent: f64) -> Vec<f64> {
         let samples = || {
             let mut means = vec![vec![0.0; experiment.record.m()]; experiment.samples.len()];

@@ -1,4 +1,4 @@
-//! Experiment: one run whose samples are compared with the simulation.
+//! Experiment: one run whose measured samples are compared with the simulation.
 
 use std::sync::Arc;
 
@@ -7,20 +7,20 @@ use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 
-/// One run of measured data: pulse means on a grid with a sample at every `pulses_per_sample`-th pulse edge.
+/// One run of measured data: block-pulse means, with a sample at every `pulses_per_sample`-th edge of a pulse.
 #[derive(Debug, Clone)]
 pub struct Experiment {
-    /// Pulse means of all signals, shared by experiments that differ in weights only.
+    /// Block-pulse means of all signals, shared by experiments that differ in weights only.
     pub record: Arc<Record>,
-    /// Block pulses per sampling interval.
+    /// Number of block pulses per sampling interval.
     pub pulses_per_sample: usize,
-    /// Samples of the output of each equation, one more than there are sampling intervals.
+    /// Samples of the output of each equation. There is one more uniform sample than there are sampling intervals.
     pub samples: Vec<Vec<f64>>,
-    /// Sensor filter of the simulated outputs, if any: a series of the length of the record, and a flag per output.
+    /// Sensor filter of the simulated outputs, if any: its series, one value per pulse, and a flag per output.
     pub filter: Option<(Vec<f64>, Vec<bool>)>,
-    /// 1/σ of each equation's output.
+    /// Weight 1/σ of the output of each equation, with its noise standard deviation σ.
     pub weights: Vec<f64>,
-    /// Value of each signal at the sample times, for direct feedthrough; empty if only pulse means are known.
+    /// Values of each signal at the sample times, for direct feedthrough; empty if only pulse means are known.
     pub point_values: Vec<PointValues>,
     /// Relative weight of each compared sample of each output, 0 for a missing sample; empty for unit weights.
     pub sample_weights: Vec<Vec<f64>>,
@@ -30,10 +30,10 @@ pub struct Experiment {
     is_prefiltered: bool,
 }
 
-/// Nonuniform sample times, all of which are compared.
+/// Nonuniform sample times of a run. All samples are compared with the simulation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonuniformSamples {
-    /// Sample times, as an interpolation of pulse means.
+    /// Interpolation of block-pulse means at the sample times.
     pub readings: SampleInterpolation,
     /// Jumps near the samples of each zero-order-hold signal of the record; None for other signals.
     pub jumps: Vec<Option<Jumps>>,
@@ -42,29 +42,28 @@ pub struct NonuniformSamples {
 /// Values of a signal at the sample times.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointValues {
-    /// Values at the samples, just after any jump; None for the mean of the adjacent pulses.
+    /// Values at the sample times, just after any jump. None stands for the mean of the adjacent pulses.
     pub values: Option<Vec<f64>>,
-    /// True for a zero-order hold between samples.
+    /// True if the signal is a zero-order hold between samples.
     pub is_zero_order_hold: bool,
 }
 
 impl Experiment {
-    /// Experiment without a filter.
+    /// Return an experiment with uniform samples, `every` pulses per sampling interval, and no filter.
     ///
     /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
-    /// ([`Experiment::check`]).
+    /// [`Error::Structure`] if the number of pulses is not a multiple of `every`. [`Error::Length`] if the data do not
+    /// match the record. [`Error::NotFinite`] if a value is not finite.
     pub fn new(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Result<Self> {
         let experiment = Self::new_unchecked(record, every, samples, weights);
         experiment.check()?;
         Ok(experiment)
     }
 
-    /// Experiment with nonuniform sample times.
+    /// Return an experiment with nonuniform sample times.
     ///
     /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
-    /// ([`Experiment::check`]).
+    /// [`Error::Length`] if the data do not match the record. [`Error::NotFinite`] if a value is not finite.
     pub fn with_nonuniform_samples(
         record: Record,
         samples: Vec<Vec<f64>>,
@@ -91,21 +90,21 @@ impl Experiment {
         }
     }
 
-    /// Set relative weights of the compared samples.
+    /// Set the relative weights of the compared samples, one list per output.
     ///
     /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
-    /// ([`Experiment::check`]).
+    /// [`Error::Length`] if there is not one weight per compared sample of each output. [`Error::NotFinite`] if a
+    /// weight is not finite.
     pub fn with_sample_weights(mut self, shares: Vec<Vec<f64>>) -> Result<Self> {
         self.sample_weights = shares;
         self.check()?;
         Ok(self)
     }
 
-    /// Set the weights of the outputs. Multiply the weights of the compared samples by `shares`.
+    /// Set the weights of the outputs, and multiply the relative weights of the compared samples by `shares`.
     ///
     /// # Errors
-    /// [`Error::Length`] for another number of shares than outputs or compared samples.
+    /// [`Error::Length`] if `shares` does not match the outputs or the compared samples.
     pub fn with_weights(mut self, outputs: &[f64], shares: Option<&[Vec<f64>]>) -> Result<Self> {
         self.weights = outputs.to_vec();
         let Some(shares) = shares else { return Ok(self) };
@@ -121,33 +120,33 @@ impl Experiment {
         Ok(self)
     }
 
-    /// Set the sensor filter of the simulated outputs.
+    /// Set the sensor filter of the simulated outputs: its series, and a flag per output that passes it.
     ///
     /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
-    /// ([`Experiment::check`]).
+    /// [`Error::Length`] if there is not one value per pulse and one flag per output. [`Error::NotFinite`] if a value
+    /// is not finite.
     pub fn with_filter(mut self, series: Vec<f64>, applies: Vec<bool>) -> Result<Self> {
         self.filter = Some((series, applies));
         self.check()?;
         Ok(self)
     }
 
-    /// Set the values of the signals at the sample times.
+    /// Set the values of the signals at the sample times, one entry per signal.
     ///
     /// # Errors
-    /// [`Error::Length`] or [`Error::NotFinite`] for data that do not match the record or are not finite
-    /// ([`Experiment::check`]).
+    /// [`Error::Length`] if the values do not match the signals or samples. [`Error::NotFinite`] if a value is not
+    /// finite.
     pub fn with_point_values(mut self, instants: Vec<PointValues>) -> Result<Self> {
         self.point_values = instants;
         self.check()?;
         Ok(self)
     }
 
-    /// Check lengths and values.
+    /// Check that all data match the record and that their values are finite.
     ///
     /// # Errors
-    /// [`Error::Structure`] if the pulses are no multiple of `pulses_per_sample`, [`Error::Length`],
-    /// [`Error::NotFinite`].
+    /// [`Error::Structure`] if the number of pulses is not a multiple of `pulses_per_sample`. [`Error::Length`] if data
+    /// do not match the record, the outputs or the samples. [`Error::NotFinite`] if a value is not finite.
     pub fn check(&self) -> Result<()> {
         let (m, every) = (self.record.m(), self.pulses_per_sample);
         if every == 0 || m % every != 0 {
@@ -191,9 +190,10 @@ impl Experiment {
         check_length("weights", self.samples.len(), self.weights.len())
     }
 
-    /// Experiment with prefiltered signals, if all outputs pass the filter; None otherwise.
+    /// Return the experiment with prefiltered signals if all outputs pass the filter.
     ///
-    /// Equations and filter commute, so that filtering the inputs once replaces filtering every simulated output.
+    /// Return None otherwise, for nonuniform samples, and for a record that is filtered already. Equations and filter
+    /// commute. Filtering the inputs once therefore replaces filtering every simulated output.
     ///
     /// # Errors
     /// [`Error::NotFinite`] if a filtered signal overflows ([`Record::with_filter`]).
@@ -212,18 +212,18 @@ impl Experiment {
         }
     }
 
-    /// True if an initial term of this exponent affects only the sensor filter of this output.
+    /// Return true if an initial term with this exponent affects only the sensor filter of this output.
     pub(crate) fn affects_only_filter(&self, output: usize, exponent: f64) -> bool {
         is_impulse(exponent)
             && (self.is_prefiltered || !self.record.is_filtered() || self.record.has_filter_transient(output))
     }
 
-    /// True if an output passes a sensor filter, alone or with its whole equation.
+    /// Return true if an output passes a sensor filter, either alone or with all signals of its equation.
     pub(crate) fn is_filtered(&self, output: usize) -> bool {
         self.record.is_filtered() || self.filter.as_ref().is_some_and(|(_, applies)| applies[output])
     }
 
-    /// Number of compared samples: those with a pulse on either side, or all nonuniform samples.
+    /// Number of compared samples of each output: those between two pulses, or all nonuniform samples.
     #[must_use]
     pub fn compared_count(&self) -> usize {
         match &self.nonuniform {
@@ -232,13 +232,13 @@ impl Experiment {
         }
     }
 
-    /// Part of the values at the samples that is compared.
+    /// Part of `values` that belongs to the compared samples.
     fn compared_values<'a>(&self, values: &'a [f64]) -> &'a [f64] {
         let first = usize::from(self.nonuniform.is_none());
         &values[first..first + self.compared_count()]
     }
 
-    /// Shift the compared samples of each output; values that are not finite do not count.
+    /// Add `shifts` to the compared samples of each output. Shifts that are not finite are ignored.
     pub(crate) fn shift_samples(&mut self, shifts: &[Vec<f64>]) {
         let first = usize::from(self.nonuniform.is_none());
         for (samples, shifts) in self.samples.iter_mut().zip(shifts) {
@@ -247,13 +247,13 @@ impl Experiment {
         }
     }
 
-    /// Weights of the compared samples of an output.
+    /// Weights of the compared samples of an output, 1/σ times the relative weight.
     pub(crate) fn weights_of(&self, output: usize) -> impl Iterator<Item = f64> + '_ {
         let (weight, shares) = (self.weights[output], self.sample_weights.get(output));
         (0..self.compared_count()).map(move |k| weight * shares.map_or(1.0, |shares| shares[k]))
     }
 
-    /// Weights times measured samples, for the compared samples, outputs concatenated.
+    /// Weighted measured values of the compared samples, with all outputs concatenated.
     pub(crate) fn measured_samples(&self) -> Vec<f64> {
         let weighted = |(i, values): (usize, &Vec<f64>)| -> Vec<f64> {
             self.weights_of(i).zip(self.compared_values(values)).map(|(w, v)| w * v).collect()
@@ -261,13 +261,13 @@ impl Experiment {
         self.samples.iter().enumerate().flat_map(weighted).collect()
     }
 
-    /// Pulse means on either side of each compared sample.
+    /// Pulse means just before and just after each compared sample of a uniform run.
     fn sides<'a>(&'a self, means: &'a [f64]) -> impl Iterator<Item = (f64, f64)> + 'a {
         (1..=self.compared_count())
             .map(move |k| (means[k * self.pulses_per_sample - 1], means[k * self.pulses_per_sample]))
     }
 
-    /// Values of a signal at the compared samples, from its pulse means.
+    /// Values of a signal at the compared samples, computed from its pulse means.
     fn samples_of_pulses(&self, means: &[f64]) -> Vec<f64> {
         match &self.nonuniform {
             Some(own) => own.readings.interpolate(means),
@@ -275,7 +275,9 @@ impl Experiment {
         }
     }
 
-    /// Deviation of a signal at the compared samples from the value given by its pulse means.
+    /// Values of a signal at the compared samples minus those computed from its pulse means.
+    ///
+    /// They are 0 if only pulse means are known.
     pub(crate) fn point_deviation(&self, signal: usize) -> Vec<f64> {
         match self.point_values.get(signal).and_then(|instant| instant.values.as_ref()) {
             Some(values) => self
@@ -288,7 +290,10 @@ impl Experiment {
         }
     }
 
-    /// Deviation of an input with a free parameter, and its derivative: half the jump of a zero-order hold.
+    /// Deviation of an input with a free parameter, and its derivative, at the compared samples.
+    ///
+    /// `acted` contains the pulse means of the input after its nonlinearity, and their derivative with respect to the
+    /// parameter. The deviation is half the jump of a zero-order hold, and 0 for other inputs.
     pub(crate) fn input_point_deviation(&self, signal: usize, acted: &(Vec<f64>, Vec<f64>)) -> (Vec<f64>, Vec<f64>) {
         let half =
             if self.point_values.get(signal).is_some_and(|instant| instant.is_zero_order_hold) { 0.5 } else { 0.0 };
@@ -296,7 +301,9 @@ impl Experiment {
         (jump(&acted.0), jump(&acted.1))
     }
 
-    /// Samples of pulse means, weighted, outputs concatenated.
+    /// Weighted values of the outputs at the compared samples, computed from their pulse means.
+    ///
+    /// All outputs are concatenated.
     pub(crate) fn weighted_samples(&self, response: &[Vec<f64>]) -> Vec<f64> {
         let mut samples = Vec::with_capacity(response.len() * self.compared_count());
         for (i, means) in response.iter().enumerate() {
@@ -313,7 +320,7 @@ impl Experiment {
         samples
     }
 
-    /// Weights times corrections of the samples of each output; zero for filtered outputs.
+    /// Weighted corrections of the samples, with all outputs concatenated; zero for filtered outputs.
     pub(crate) fn weighted_corrections(&self, values: &[Vec<f64>]) -> Vec<f64> {
         let mut out = Vec::with_capacity(values.len() * self.compared_count());
         for (i, row) in values.iter().enumerate() {

@@ -1,9 +1,9 @@
 //! Direct feedthrough: the instantaneous effect of a term whose order equals the order of its equation.
 //!
-//! A sample is taken just after its input changes: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without feedthrough
-//! and s the input. The mean of the two pulses next to t contains G times their mean of s. The correction is G δ, where
-//! δ is s(t⁺) minus that mean. It is half a jump of a zero-order hold, or a quarter of the second difference of a
-//! linearly interpolated signal.
+//! A sample is taken just after its input changes: y(t⁺) = y'(t) + G s(t⁺). Here y' is the output without feedthrough,
+//! s the input and G the gain of the feedthrough. The mean of the two pulses next to t contains G times their mean of
+//! s. The correction is G δ, where δ is s(t⁺) minus that mean. For a zero-order hold, δ is half a jump. For a linearly
+//! interpolated signal, it is a quarter of the second difference.
 
 use super::experiment::Experiment;
 use super::parameterization::{FreeModel, ParameterPoint};
@@ -12,23 +12,28 @@ use crate::error::Result;
 use crate::fractional::kernels::first_coefficient;
 use crate::linalg::small;
 
-/// Difference of the orders of term and equation below which a term has direct feedthrough.
+/// Difference between the orders of term and equation below which the term has direct feedthrough.
 pub(crate) const FEEDTHROUGH_ORDER_TOLERANCE: f64 = 1e-9;
 
 /// Direct feedthrough of one experiment.
 pub(crate) struct Feedthrough {
-    /// (I − C)⁻¹ with C the feedthrough gains between outputs, row-major; None without such gains.
+    /// (I − C)⁻¹ with the feedthrough gains C between outputs, row-major; None without such gains.
     coupling_inverse: Option<Vec<f64>>,
-    /// δ of each input with feedthrough, and its derivative with respect to its free parameter.
+    /// Deviation δ of each input with feedthrough at the samples, and its derivative.
+    ///
+    /// δ is the value just after a sample time minus the mean of the two adjacent pulses. The derivative is that with
+    /// respect to the free parameter of the input.
     deviations: Vec<Option<(Vec<f64>, Vec<f64>)>>,
-    /// True for terms with feedthrough, by equation.
+    /// True for each term with feedthrough, by equation.
     terms: Vec<Vec<bool>>,
     /// (I − C)⁻¹ B δ by output and sample, unweighted.
+    ///
+    /// δ are the deviations of the inputs, B their feedthrough gains, and C those between outputs.
     values: Vec<Vec<f64>>,
 }
 
 impl Feedthrough {
-    /// Feedthrough at a point; None without such terms.
+    /// Return the feedthrough at a point; None if no term has feedthrough.
     ///
     /// # Errors
     /// [`crate::error::Error::LeadingZero`] if the algebraic loop between the outputs is singular.
@@ -71,7 +76,9 @@ impl Feedthrough {
         Ok(Some(direct))
     }
 
-    /// Add the weighted deviation δ of the inputs with feedthrough of each equation.
+    /// Add the deviations δ of the inputs with feedthrough to `driven`, which has one row of samples per equation.
+    ///
+    /// The function `weight` returns the factor of a term, given the indices of equation and term.
     fn add_inputs<'a>(
         &'a self,
         model: &FreeModel,
@@ -95,7 +102,7 @@ impl Feedthrough {
         }
     }
 
-    /// Multiply the sums of inputs with feedthrough of the equations by (I − C)⁻¹.
+    /// Multiply `driven`, which has one row of samples per equation, by (I − C)⁻¹.
     pub(crate) fn apply_coupling(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
         let Some(between) = &self.coupling_inverse else { return driven };
         let gains = between.chunks_exact(driven.len());
@@ -109,13 +116,15 @@ impl Feedthrough {
         gains.map(mixed).collect()
     }
 
-    /// Correction of the weighted samples.
+    /// Weighted correction of the compared samples, with all outputs concatenated.
     pub(crate) fn weighted_correction(&self, experiment: &Experiment) -> Vec<f64> {
         experiment.weighted_corrections(&self.values)
     }
 }
 
-/// Add the derivative of the feedthrough to the derivative of the samples.
+/// Add the derivative of the feedthrough to `column`, the derivative of the weighted samples.
+///
+/// Both are derivatives with respect to `parameter`.
 pub(crate) fn add_feedthrough_derivative(
     model: &FreeModel,
     experiment: &Experiment,
@@ -147,14 +156,16 @@ pub(crate) fn add_feedthrough_derivative(
     column.iter_mut().zip(experiment.weighted_corrections(&direct.apply_coupling(driven))).for_each(|(v, s)| *v += s);
 }
 
-/// Correction of the response to jumps and kinks of the inputs, which is half a pulse early in pulse means.
+/// Correction of the response to jumps and slope discontinuities of the inputs.
 ///
-/// The mean of the pulses on either side of a sample contains half of the response of the first pulse after it, of
-/// which only the direct gain is present at the sample. Without the correction a first-order equation has an error
-/// proportional to the step. An equation with an input derivative of order 0.6 has one of order step^0.4.
+/// In pulse means, this response is half a pulse early. The mean of the pulses on either side of a sample contains half
+/// of the response of the first pulse after it. At the sample itself, only the direct gain of this response is present.
+/// Without the correction, a first-order equation has an error proportional to the step. With an input derivative of
+/// order 0.6, the error is proportional to step^0.4.
 pub(crate) struct JumpCorrection {
-    /// For each signal, half of the change of the next pulse mean that its jump or kink causes, at each compared
-    /// sample. The second list is the derivative with respect to the free parameter of the input.
+    /// Per signal: half of the change of the next pulse mean due to a jump or kink, at each compared sample.
+    ///
+    /// The second list is the derivative with respect to the free parameter of the input.
     jumps: Vec<Option<(Vec<f64>, Vec<f64>)>>,
 }
 
@@ -162,14 +173,14 @@ pub(crate) struct JumpCorrection {
 const RELATIVE_DIFFERENCE_STEP: f64 = 1e-5;
 
 impl JumpCorrection {
-    /// Jumps of zero-order-hold signals, and kinks of linearly interpolated ones.
+    /// Return the jumps of zero-order-hold signals, and the kinks of linearly interpolated ones.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, acted: &[(Vec<f64>, Vec<f64>)]) -> Self {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
                 // Nonuniform samples have an exact kink correction instead.
                 let instant = experiment.point_values.get(signal).filter(|_| experiment.nonuniform.is_none())?;
                 if !instant.is_zero_order_hold {
-                    // The kinks behind a free input non-linearity are unknown.
+                    // The kinks of an input after a nonlinearity with a free parameter are unknown.
                     instant.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
                     return Some((experiment.point_deviation(signal).iter().map(|v| -v).collect(), Vec::new()));
                 }
@@ -186,7 +197,9 @@ impl JumpCorrection {
         Self { jumps }
     }
 
-    /// Response of the first pulse minus the direct gain: outputs by signals, row-major.
+    /// Gain of the first pulse of the response minus the direct gain, as a row-major matrix of outputs by signals.
+    ///
+    /// `at_once` flags the terms with direct feedthrough.
     fn gains(
         model: &FreeModel,
         step: f64,
@@ -225,7 +238,9 @@ impl JumpCorrection {
         structures.iter().map(near).collect()
     }
 
-    /// Subtract the early response, with the given gains, from weighted samples.
+    /// Subtract the early part of the response, with the given gains, from weighted samples.
+    ///
+    /// If `slopes` is true, the derivatives of the jumps replace the jumps.
     fn add(&self, experiment: &Experiment, gains: &[f64], slopes: bool, samples: &mut [f64]) {
         let (signals, compared) = (self.jumps.len(), experiment.compared_count());
         for (i, row) in samples.chunks_exact_mut(compared.max(1)).enumerate() {
@@ -242,7 +257,7 @@ impl JumpCorrection {
         }
     }
 
-    /// Correct weighted samples.
+    /// Correct the weighted samples of all outputs in place.
     ///
     /// # Errors
     /// [`crate::error::Error::LeadingZero`] if the scheme is singular.
@@ -262,7 +277,7 @@ impl JumpCorrection {
         Ok(())
     }
 
-    /// Correct the derivative of weighted samples with respect to a parameter.
+    /// Correct the derivative of the weighted samples with respect to a parameter in place.
     ///
     /// # Errors
     /// [`crate::error::Error::LeadingZero`] if the scheme is singular ([`JumpCorrection::correct`]).

@@ -22,25 +22,25 @@ pub struct OutputErrorFit {
     pub point: ParameterPoint,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
-    /// Residuals (y − ŷ)/σ, ordered by record, then by output.
+    /// Residuals (y − ŷ)/σ with measured y, simulated ŷ and noise deviation σ, ordered by record, output and sample.
     pub residuals: Vec<f64>,
-    /// Derivatives of the residuals with respect to orders, coefficients (plain coordinates) and inputs, with the
-    /// initial terms projected out; empty if only residuals were requested.
+    /// Derivatives of the residuals, one row per order, coefficient (in plain coordinates) and input parameter.
+    ///
+    /// The initial terms are projected out. Empty if only residuals were requested.
     pub jacobian: Vec<Vec<f64>>,
-    /// Coefficients of the initial terms per record and equation.
+    /// Coefficients of the initial terms, by record and equation.
     pub initial: Vec<Vec<Vec<f64>>>,
-    /// Exponents of the initial terms per equation.
+    /// Exponents of the initial terms, by equation.
     pub exponents: Vec<Vec<f64>>,
-    /// Orthonormal basis of the weighted responses to the initial terms per record; empty after several evaluations.
+    /// Orthonormal basis of the weighted responses to the initial terms, by record; empty after several evaluations.
     pub initial_responses: Vec<Vec<Vec<f64>>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
-    /// Reason of termination.
+    /// Reason for termination.
     pub status: Status,
 }
 
-/// Evaluation of one of three simulations: block pulses, exact states of integer orders, or exact transforms of other
-/// orders.
+/// Evaluation by block pulses, by exact states of integer orders, or by exact transforms of other orders.
 enum Simulation<'a> {
     Pulses(Evaluation<Linearization>),
     Exact(Evaluation<ExactSimulation<'a>>),
@@ -72,7 +72,7 @@ impl Simulation<'_> {
         }
     }
 
-    /// Orthonormal basis of the weighted responses to the initial terms, per record.
+    /// Orthonormal basis of the weighted responses to the initial terms, by record.
     fn initial_responses(&self) -> Vec<Vec<Vec<f64>>> {
         match self {
             Self::Pulses(evaluation) => evaluation.parts.iter().map(|part| part.basis.clone()).collect(),
@@ -81,7 +81,7 @@ impl Simulation<'_> {
         }
     }
 
-    /// Coefficients and exponents of the initial terms.
+    /// Coefficients of the initial terms by record and equation, and their exponents by equation.
     fn initial_terms(&self) -> (&[Vec<Vec<f64>>], &[Vec<f64>]) {
         match self {
             Self::Pulses(evaluation) => (&evaluation.initial, &evaluation.exponents),
@@ -91,13 +91,13 @@ impl Simulation<'_> {
     }
 }
 
-/// Non-linear least-squares problem of the output error of a model.
+/// Nonlinear least-squares problem of the output error of a model.
 struct OutputErrorProblem<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
-    /// Initial coefficients, converted to the unit of time.
+    /// Initial coefficients in the scaled unit of time.
     start: Vec<f64>,
-    /// Unit of time in which steps of the coefficients are relative.
+    /// Scaled unit of time, in which steps of the coefficients are relative.
     time_unit: TimeUnit,
     /// True if a stable model must not become unstable.
     requires_stability: bool,
@@ -105,9 +105,9 @@ struct OutputErrorProblem<'a> {
     allows_extrapolation: bool,
     /// Indices of the coefficients that are eliminated at every point.
     linear: Vec<usize>,
-    /// Exact simulation, if all orders are integers.
+    /// Exact simulation if all orders are integers, else None.
     exact: Option<IntegerOrders>,
-    /// Exact simulation of other orders on long records.
+    /// Exact simulation of other orders on long records; None if it is not possible.
     sampled: Option<FractionalOrders>,
     /// Caches of the evaluations, by experiment.
     caches: RefCell<Vec<EvaluationCache>>,
@@ -171,7 +171,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         })
     }
 
-    /// Derivatives of the coefficients with respect to an order, with constant coefficients in the unit of time.
+    /// Derivatives of the coefficients with respect to an order, with constant coefficients in the scaled unit of time.
     fn coupled_derivatives(&self, point: &ParameterPoint, parameter: usize) -> Vec<(usize, f64)> {
         if parameter >= point.orders.len() {
             return Vec::new();
@@ -182,7 +182,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
             .collect()
     }
 
-    /// Distance of a parameter from its bounds. Coefficients are bounded only if they keep their sign.
+    /// Distance of a parameter from its bounds. A coefficient is bounded only if it must keep its sign.
     fn distance_to_bounds(&self, point: &ParameterPoint, parameter: usize) -> (f64, f64) {
         let behind = point.orders.len() + point.coefficients.len();
         let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
@@ -198,7 +198,7 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         (value - low, high - value)
     }
 
-    /// True for input parameters: the response is piecewise linear in delays and limits.
+    /// Return true for input parameters, because the response is piecewise linear in delays and limits.
     fn has_kinks(&self, point: &ParameterPoint, parameter: usize) -> bool {
         parameter >= point.orders.len() + point.coefficients.len()
     }
@@ -207,7 +207,9 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
         evaluation.size()
     }
 
-    /// True if the grids resolve the dynamics of each equation. Unresolved modes would fit noise.
+    /// Return true if the grids resolve the dynamics of each equation and, if required, the model is stable.
+    ///
+    /// Unresolved modes would fit noise.
     fn is_admissible(&self, point: &ParameterPoint) -> bool {
         let is_resolved = match &self.exact {
             Some(exact) => exact.is_resolved(self.model, self.experiments, point),
@@ -225,10 +227,10 @@ impl<'a> LeastSquaresProblem for OutputErrorProblem<'a> {
     }
 }
 
-/// Move a point by steps in its coordinates, within bounds; return it and the largest change.
+/// Move a point by steps in its coordinates, within bounds. Return the new point and the largest change.
 ///
-/// Changes of orders are absolute. Those of coefficients are relative in the unit of time, those of input parameters
-/// relative to their interval.
+/// Changes of orders are absolute. Changes of coefficients are relative in the scaled unit of time. Changes of input
+/// parameters are relative to the interval between their bounds.
 fn step_within_bounds(
     model: &FreeModel,
     clock: &TimeUnit,
@@ -262,11 +264,11 @@ fn step_within_bounds(
 /// Fit a model to experiments by output error from an initial guess, by Levenberg–Marquardt.
 ///
 /// The coefficients of external inputs are eliminated at every point, so their initial values and signs do not matter.
-/// With a single evaluation, the initial guess is evaluated as given.
+/// If at most one evaluation is allowed, the initial guess is evaluated as given.
 ///
 /// # Errors
-/// An initial guess whose simulation is not finite ([`Error::Diverged`]), or which is out of the range of its
-/// coordinates; a model that does not match the experiments ([`FreeModel::check`]).
+/// [`Error::Diverged`] if the simulation of the initial guess is not finite. [`Error::OutOfRange`] if the initial guess
+/// is out of the range of its coordinates. An error if the model does not match the experiments ([`FreeModel::check`]).
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -311,13 +313,14 @@ pub fn fit(
     fit_until(model, experiments, start, settings, false, &Stop::default())
 }
 
-/// Fit a model as [`fit`], but never step from a stable model to an unstable one.
+/// Fit a model as [`fit`] does, but never step from a stable model to an unstable one.
 ///
-/// Free initial terms can cancel an unstable mode up to the end of the run, which makes the response depend on future
-/// inputs. The stability of coupled equations is not checked.
+/// Free initial terms can cancel an unstable mode up to the end of the run. The response then depends on future inputs.
+/// The stability of coupled equations is not checked.
 ///
 /// # Errors
-/// An initial guess whose simulation is not finite, or a model that does not match the experiments ([`fit`]).
+/// [`Error::Diverged`] if the simulation of the initial guess is not finite. [`Error::OutOfRange`] if the initial guess
+/// is out of the range of its coordinates. An error if the model does not match the experiments ([`FreeModel::check`]).
 pub fn fit_stable(
     model: &FreeModel,
     experiments: &[Experiment],
@@ -327,10 +330,11 @@ pub fn fit_stable(
     fit_until(model, experiments, start, settings, true, &Stop::default())
 }
 
-/// Fit a model as [`fit`], or as [`fit_stable`] if `steady`, with a cancellation flag.
+/// Fit a model as [`fit`] does, or as [`fit_stable`] if `steady` is true, with a cancellation flag.
 ///
 /// # Errors
-/// An initial guess whose simulation is not finite, or a model that does not match the experiments ([`fit`]);
+/// [`Error::Diverged`] if the simulation of the initial guess is not finite. [`Error::OutOfRange`] if the initial guess
+/// is out of the range of its coordinates. An error if the model does not match the experiments ([`FreeModel::check`]).
 /// [`Error::Interrupted`] after a stop request.
 pub fn fit_until(
     model: &FreeModel,
@@ -348,13 +352,14 @@ pub fn fit_until(
     let mut point = start.clone();
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
-    // With a single evaluation nothing is eliminated.
+    // If at most one evaluation is allowed, no coefficient is eliminated.
     let linear = if settings.evaluations > 1 { model.linear_coefficients() } else { Vec::new() };
     let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();
     // Logarithmic coordinates are not needed for eliminated coefficients.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
-    // With free input parameters the inputs of the equations are not signals of the record.
+    // With free input parameters, the inputs of the equations are not signals of the record and cannot be filtered
+    // before.
     let passed: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
         true => experiments.iter().map(Experiment::prefilter_signals).collect::<Result<_>>()?,
         false => None,
@@ -394,6 +399,8 @@ pub fn fit_until(
 }
 
 /// Check that an initial guess is finite and in the range of its coordinates.
+///
+/// [`Error::OutOfRange`] or [`Error::NotFinite`] if it is not.
 fn check_start(model: &FreeModel, start: &ParameterPoint) -> Result<()> {
     for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
         if !coordinate.contains(c) {

@@ -1,10 +1,10 @@
 //! Exact output samples of equations of any orders, and their derivatives.
 //!
-//! In the integration orders η of its terms, an equation is y = Σ c s^−η u/D, where D = 1 − Σ c s^−η sums over the
-//! terms of y. A zero-order-hold input is a sum of steps, so the starred transform of the samples of y is that of c
-//! s^−η/(D s) times the transform of the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D.
-//! Derivatives with respect to orders and coefficients are functions of s as well. A sample at a jump is the mean of
-//! both sides; [`Feedthrough`] corrects it.
+//! The equation is y = Σ c s^−η u/D, with D = 1 − Σ c s^−η. The first sum is over the terms of the inputs u, the second
+//! over the terms of the output y. Each term has a coefficient c and an integration order η. A zero-order-hold input is
+//! a sum of steps. The starred transform of the samples of y is therefore that of c s^−η/(D s) times the transform of
+//! the jumps of the input. An initial term c t^e adds c Γ(e + 1) s^−(e + 1)/D. Derivatives with respect to orders and
+//! coefficients are functions of s as well. A sample at a jump is the mean of both sides; [`Feedthrough`] corrects it.
 
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -22,7 +22,7 @@ use crate::fractional::kernels::digamma;
 use crate::fractional::starred_transform::{integration, StarredTransform};
 use crate::linalg::orthogonal::{extend_orthonormal, project_out};
 
-/// Minimum number of pulses for exact samples. Block pulses are faster for shorter experiments.
+/// Minimum number of pulses for exact samples. For shorter experiments, block pulses are faster.
 pub(crate) const MIN_EXACT_PULSES: usize = 1 << 12;
 
 /// Equations of any orders with zero-order-hold inputs, on experiments with uniform samples.
@@ -33,7 +33,7 @@ pub(crate) struct FractionalOrders {
 /// Transforms of one experiment.
 struct Run {
     transform: Rc<StarredTransform>,
-    /// Transforms of the jumps of the inputs.
+    /// Transforms of the jumps of the inputs, by signal.
     jumps: HashMap<usize, Vec<Bin>>,
 }
 
@@ -47,21 +47,23 @@ pub(crate) struct SampledSimulation {
 
 /// Terms of an equation at a parameter point.
 struct Terms {
-    /// Distinct integration orders η. `places` holds the index of each term's η in this list.
+    /// Distinct integration orders η of the terms.
     etas: Vec<f64>,
+    /// Index of the integration order of each term in `etas`.
     places: Vec<usize>,
     coefficients: Vec<f64>,
     /// Input signal of each term; None for a term of the output itself.
     inputs: Vec<Option<usize>>,
 }
 
-/// For each term, (derivative of the coefficient, derivative of the integration order) with respect to one parameter.
+/// Derivatives of the coefficient and of the integration order of each term with respect to one parameter.
 type Slopes = Vec<(f64, f64)>;
 
-/// Response of an equation to one input from zero initial conditions. The coefficients of this input's terms are
-/// replaced by weights.
+/// Response of an equation to one input from zero initial conditions.
+///
+/// The coefficients of the terms of this input are replaced by weights.
 struct Column {
-    /// Weight of each term of the equation. Weights of other terms are not used.
+    /// Weight of each term of the equation. Only the weights of the terms of this input are used.
     weights: Vec<f64>,
     input: usize,
 }
@@ -88,7 +90,7 @@ impl Terms {
         Ok(terms)
     }
 
-    /// Distinct inputs.
+    /// Distinct input signals in ascending order.
     fn signals(&self) -> Vec<usize> {
         let mut signal_indices: Vec<usize> = self.inputs.iter().flatten().copied().collect();
         signal_indices.sort_unstable();
@@ -97,19 +99,21 @@ impl Terms {
     }
 
     /// Return Σ weight·s^−η over the terms of `input`, or over the terms of the output itself if `input` is None.
+    ///
+    /// `powers` contains s^−η of each distinct integration order.
     fn sum(&self, input: Option<usize>, powers: &[Bin], weight: impl Fn(usize) -> Bin) -> Bin {
         let terms = (0..self.places.len()).filter(|&k| self.inputs[k] == input);
         terms.map(|k| weight(k) * powers[self.places[k]]).sum()
     }
 
-    /// Write s^−η of each distinct integration order η to `powers`, and return 1/D.
+    /// Write s^−η of each distinct integration order η to `powers`, and return 1/D; `logarithm` is ln s.
     fn powers(&self, logarithm: Bin, powers: &mut Vec<Bin>) -> Bin {
         powers.clear();
         powers.extend(self.etas.iter().map(|&eta| integration(logarithm, eta)));
         (Bin::from(1.0) - self.sum(None, powers, |k| self.coefficients[k].into())).inv()
     }
 
-    /// Return half of the jump of the step response at t = 0. `weights` holds the weight of each term of the input.
+    /// Return half of the jump of the step response at t = 0. `weights` returns the weight of a term of the input.
     fn start(&self, input: usize, weights: impl Fn(usize) -> f64) -> f64 {
         let at_once =
             |k: &usize| self.inputs[*k] == Some(input) && self.etas[self.places[*k]] < FEEDTHROUGH_ORDER_TOLERANCE;
@@ -119,7 +123,7 @@ impl Terms {
 
 /// Initial terms c t^e of one equation, which have the Laplace transforms c Γ(e + 1) s^−(e + 1).
 struct InitialTerms {
-    /// e + 1, c Γ(e + 1) and ψ(e + 1) of each term. They are the same at every s.
+    /// e + 1, c Γ(e + 1) and the digamma function ψ(e + 1) of each term, which do not depend on s.
     terms: Vec<(f64, f64, f64)>,
 }
 
@@ -129,14 +133,14 @@ impl InitialTerms {
         Self { terms: exponents.iter().zip(values).map(of).collect() }
     }
 
-    /// Transform of each term; return their sum.
+    /// Write the Laplace transform of each term to `out`, and return the sum of the transforms; `logarithm` is ln s.
     fn transforms(&self, logarithm: Bin, out: &mut Vec<Bin>) -> Bin {
         out.clear();
         out.extend(self.terms.iter().map(|&(power, weight, _)| integration(logarithm, power) * weight));
         out.iter().sum()
     }
 
-    /// Return the derivative of the sum of the transforms. `slopes` holds the derivatives of the exponents.
+    /// Return the derivative of the sum of the transforms. `slopes` contains the derivatives of the exponents.
     fn slope(&self, logarithm: Bin, transforms: &[Bin], slopes: &[f64]) -> Bin {
         let parts = self.terms.iter().zip(transforms).zip(slopes).filter(|(_, by)| **by != 0.0);
         parts.map(|((term, transform), by)| transform * (Bin::from(term.2) - logarithm) * by).sum()
@@ -144,8 +148,10 @@ impl InitialTerms {
 }
 
 impl FractionalOrders {
-    /// True if a model has exact samples on every experiment: stable equations without coupling, zero-order-hold inputs
-    /// without free parameters, and uniform samples without a sensor filter.
+    /// Return true if a model has exact samples on every experiment.
+    ///
+    /// This requires stable equations without coupling, and zero-order-hold inputs without free parameters. The records
+    /// must be long, with uniform samples and without a sensor filter.
     pub(crate) fn accepts(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> bool {
         let is_suitable = |experiment: &Experiment| {
             experiment.record.m() >= MIN_EXACT_PULSES
@@ -167,7 +173,7 @@ impl FractionalOrders {
             && !model.is_unstable(point)
     }
 
-    /// Transforms of the experiments; None if a model is not accepted.
+    /// Return the transforms of the experiments; None if the model has no exact samples on them.
     pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
         if !Self::accepts(model, experiments, point) {
             return None;
@@ -194,7 +200,9 @@ impl FractionalOrders {
         Some(Self { runs: experiments.iter().map(run).collect() })
     }
 
-    /// Residuals at a point with the `linear` coefficients and the initial terms eliminated.
+    /// Return the residuals at a point, with the `linear` coefficients and the initial terms eliminated.
+    ///
+    /// [`Error::Diverged`] if the model is unstable or its simulation is not finite.
     pub(crate) fn evaluate(
         &self,
         model: &FreeModel,
@@ -203,7 +211,7 @@ impl FractionalOrders {
         linear: &[usize],
     ) -> Result<Evaluation<SampledSimulation>> {
         if model.is_unstable(point) {
-            // e^{−σt} does not damp a response that grows.
+            // The damping e^{−σt} of the transform does not bound the response of an unstable model.
             return Err(Error::Diverged { what: "free run".into(), index: 0 });
         }
         let structures = model.structures(&point.orders);
@@ -261,7 +269,7 @@ impl FractionalOrders {
         Ok(out)
     }
 
-    /// Derivatives of the residuals, with the initial terms projected out.
+    /// Derivatives of the residuals, one row per parameter, with the initial terms projected out.
     pub(crate) fn jacobian(
         &self,
         model: &FreeModel,
@@ -319,15 +327,16 @@ impl FractionalOrders {
     }
 }
 
-/// Add samples of equation i to weighted samples of all equations.
+/// Add `sign` times the weighted `samples` of equation `i` to `sum`, the weighted samples of all equations.
 fn add_weighted(experiment: &Experiment, i: usize, sign: f64, samples: &[f64], sum: &mut [f64]) {
     let count = experiment.compared_count();
     let own = sum[i * count..(i + 1) * count].iter_mut();
     own.zip(experiment.weights_of(i).zip(samples)).for_each(|(v, (w, y))| *v += sign * w * y);
 }
 
-/// For each term of equation i, return the derivatives of coefficient and integration order with respect to a
-/// parameter.
+/// Return the derivatives of the coefficient and the integration order of each term of equation `i`.
+///
+/// They are derivatives with respect to `parameter`.
 fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: usize) -> Slopes {
     let equation = &model.equations[i];
     let of = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
@@ -340,8 +349,10 @@ fn term_slopes(model: &FreeModel, i: usize, point: &ParameterPoint, parameter: u
 }
 
 impl Run {
-    /// Return (samples from zero initial conditions for each list of coefficients in `weight_sets`, response to each
-    /// initial term t^e with e in `exponents`) of one equation.
+    /// Return two lists of compared samples of one equation.
+    ///
+    /// The first has the response from zero initial conditions for each list of coefficients in `weight_sets`. The
+    /// second has the response to each initial term t^e with e in `exponents`.
     fn responses(
         &self,
         experiment: &Experiment,
@@ -380,8 +391,9 @@ impl Run {
         (driven, free)
     }
 
-    /// Derivatives of the samples of an equation. Each request holds the derivatives of its terms and of its initial
-    /// exponents.
+    /// Return the derivatives of the compared samples of an equation, one list of samples per request.
+    ///
+    /// A request contains the derivatives of the terms and of the initial exponents with respect to one parameter.
     fn sensitivities(
         &self,
         experiment: &Experiment,
@@ -451,7 +463,7 @@ impl Run {
         sums.into_iter().map(samples).collect()
     }
 
-    /// Compute the compared samples of a transform.
+    /// Return the compared samples of the function whose transform is `spectrum`.
     fn compared_samples(&self, experiment: &Experiment, spectrum: Vec<Bin>) -> Vec<f64> {
         let every = experiment.pulses_per_sample;
         let samples = self.transform.samples(spectrum);
@@ -472,7 +484,7 @@ mod tests {
 
     const STEP: f64 = 0.02;
 
-    /// D^α y = a1 D^ν y + a0 y + b1 D^ν u + b0 u + c D^α v.
+    /// Model D^α y = a1 D^ν y + a0 y + b1 D^ν u + b0 u + c D^α v with free α between `bounds`, and ν = `order`.
     fn model(bounds: (f64, f64), order: f64, initial: Initial) -> FreeModel {
         let own = |constant: f64| AffineOrder { constant, weights: vec![0.0] };
         let highest = || AffineOrder { constant: 0.0, weights: vec![1.0] };
@@ -512,7 +524,7 @@ mod tests {
         value.ok_or_else(|| Error::Diverged { what: "experiments without exact samples".into(), index: 0 })
     }
 
-    /// Return the largest difference, divided by the largest absolute value of `exact`.
+    /// Return the largest difference, divided by the largest magnitude in `exact`.
     fn distance(actual: &[f64], exact: &[f64]) -> f64 {
         assert_eq!(actual.len(), exact.len());
         let peak = exact.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
@@ -532,7 +544,7 @@ mod tests {
             assert!(distance(&samples.point.coefficients, &state_samples.point.coefficients) < 1e-8);
             let slopes = orders.jacobian(&model, &experiments, &[2, 3], &samples)?;
             let exact = states.jacobian(&model, &experiments, &[2, 3], &state_samples)?;
-            // The order is fixed in the states.
+            // The states have no derivative with respect to the order, which is fixed for them.
             slopes.iter().zip(&exact).skip(1).for_each(|(a, b)| assert!(distance(a, b) < 1e-7));
         }
         Ok(())

@@ -1,11 +1,12 @@
 //! Exact output samples of equations of integer orders, and their derivatives.
 //!
-//! Let D^n y = Σ a_i D^i y + Σ b_j D^j u, A(s) = s^n − Σ a_i s^i. The samples of s^j/A u are states of one companion
-//! form, advanced from pulse to pulse by its matrix exponential. This is exact for an input that is held or linear over
-//! a pulse, with any delay of a zero-order-hold input. y is linear in b_j. Its derivative with respect to a_i is s^i/A
-//! y, a state of two companion forms in series. Its derivative with respect to a delay is −D y. An initial term c t^e
-//! is the response of a chain of integrators to an impulse, a constant or a ramp. Time is scaled by the largest
-//! coefficient, so that no element of the companion form is above 1.
+//! The equation is D^n y = Σ a_i D^i y + Σ b_j D^j u with output y and inputs u. Its denominator is A(s) = s^n − Σ a_i
+//! s^i. The samples of (s^j/A) u are states of one companion form, which its matrix exponential advances from pulse to
+//! pulse. This is exact for an input that is held or linear over a pulse. A zero-order-hold input may have any delay.
+//! The output is linear in b_j. Its derivative with respect to a_i is (s^i/A) y, a state of two companion forms in
+//! series. Its derivative with respect to a delay is −D y. An initial term c t^e is the response of a chain of
+//! integrators to an impulse, a constant or a ramp. Time is scaled by the largest coefficient, so that no element of
+//! the companion form is above 1.
 
 use std::borrow::Cow;
 use std::cell::RefCell;
@@ -21,12 +22,13 @@ use crate::linalg::small::spectral_radius;
 use crate::signal::block_pulse::{delayed_row, Intersample};
 use crate::state_space::{InputGains, Transition};
 
-/// Difference below which an order or exponent is an integer.
+/// Difference between an order or exponent and an integer below which it counts as that integer.
 const INTEGER_TOLERANCE: f64 = 1e-9;
 /// Maximum order of an equation.
 const MAX_ORDER: usize = 12;
-/// Maximum of the magnitude of a pole times the sampling interval: the Nyquist frequency. The effect of faster poles on
-/// the samples is not distinguishable from noise.
+/// Maximum product of the magnitude of a pole and the sampling interval, which is reached at the Nyquist frequency.
+///
+/// The effect of faster poles on the samples cannot be distinguished from noise.
 const MAX_POLE_PHASE_RAD: f64 = std::f64::consts::PI;
 
 /// Equations of integer orders whose inputs are held or linear in every experiment.
@@ -34,18 +36,18 @@ pub(crate) struct IntegerOrders {
     equations: Vec<EquationOrders>,
 }
 
-/// Orders of one equation.
+/// Orders of the terms of one equation.
 struct EquationOrders {
     order: usize,
-    /// Index and order of the autoregressive terms.
+    /// Term index and order of each autoregressive term.
     own: Vec<(usize, usize)>,
-    /// Input signals, each with index and order of its terms.
+    /// Input signals, each with the term index and the order of its terms.
     inputs: Vec<(usize, Vec<(usize, usize)>)>,
 }
 
 /// Input of a companion form.
 pub(crate) struct SourceInput<'a> {
-    /// A value per pulse if held, per edge if linear.
+    /// Values of the input: one per pulse if it is held, one per pulse edge if it is linear.
     pub(crate) samples: Cow<'a, [f64]>,
     pub(crate) between: Intersample,
     /// Delay of a zero-order-hold input in pulses.
@@ -54,7 +56,7 @@ pub(crate) struct SourceInput<'a> {
     pub(crate) before: f64,
 }
 
-/// Input or initial term of a companion form.
+/// Kind of a source of a companion form: an input or an initial term.
 enum SourceKind {
     /// Index of the input in the equation.
     Input(usize),
@@ -65,20 +67,20 @@ enum SourceKind {
     Power(usize),
 }
 
-/// One source of an equation and its states.
+/// Source of an equation, and the states of its response.
 struct Source<'a> {
     kind: SourceKind,
     input: Option<SourceInput<'a>>,
-    /// States at the compared samples, a row per sample.
+    /// States at the compared samples, row-major with one row per sample.
     states: Vec<f64>,
-    /// Input just after the compared samples.
+    /// Values of the input just after the compared samples.
     values: Vec<f64>,
 }
 
-/// Companion form of A(s) in scaled time.
+/// Companion form of the denominator A(s) of an equation, in scaled time.
 pub(crate) struct Companion {
     pub(crate) order: usize,
-    /// Unit of frequency \[rad/s\].
+    /// Unit of frequency \[rad/s\], the inverse of the scaled unit of time.
     scale: f64,
     /// Autoregressive coefficients in scaled time, a_i scale^(i − n).
     own: Vec<f64>,
@@ -86,18 +88,19 @@ pub(crate) struct Companion {
     step: f64,
     /// Pulse width in seconds.
     width: f64,
-    /// Cache of discretizations, shared by all experiments of this pulse width.
+    /// Cache of discretizations, shared by all experiments with this pulse width.
     known: RefCell<Vec<Rc<Discretization>>>,
 }
 
-/// Key of a discretization: inter-sample behavior of the input (None without an input), fractional part of its delay in
-/// pulses, and output row and direct gain of a series connection.
+/// Key of a discretization: inter-sample behavior, fractional delay in pulses, and first system of two in series.
+///
+/// The inter-sample behavior is None without an input. The first system is given by its output row and direct gain.
 type DiscretizationKey = (Option<Intersample>, u64, Option<(Vec<f64>, f64)>);
 
 /// Exact discretization: transition of the states over one pulse.
 struct Discretization {
     key: DiscretizationKey,
-    /// Transition matrix e^M minus I, column-major.
+    /// Transition matrix over one pulse minus the identity, column-major.
     growth: Vec<f64>,
     gains: Option<InputGains>,
 }
@@ -106,7 +109,7 @@ struct Discretization {
 type Grid = (usize, usize);
 
 impl Companion {
-    /// Companion form of s^n − Σ own_i s^i for pulses of width `step`.
+    /// Return the companion form of s^n − Σ own_i s^i for pulses of width `step` \[s\].
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
     pub(crate) fn new(own: &[f64], step: f64) -> Self {
         let order = own.len();
@@ -117,7 +120,7 @@ impl Companion {
         Self { order, scale, own, step: step * scale, width: step, known: RefCell::default() }
     }
 
-    /// Companion form for this pulse width, from the cache or added to it.
+    /// Return the companion form for the pulse width `step` from the cache, to which it is added if necessary.
     pub(crate) fn of_width(cache: &mut Vec<Rc<Self>>, own: &[f64], step: f64) -> Rc<Self> {
         if let Some(cached) = cache.iter().find(|c| c.width.to_bits() == step.to_bits()) {
             return cached.clone();
@@ -126,13 +129,13 @@ impl Companion {
         cache[cache.len() - 1].clone()
     }
 
-    /// Power of the unit of frequency, scale^power.
+    /// Return scale^power, a power of the unit of frequency.
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     fn power(&self, power: isize) -> f64 {
         self.scale.powi(power as i32)
     }
 
-    /// Output row of Σ coefficient s^j/A over (j, coefficient), and the direct gain.
+    /// Return the output row and the direct gain of Σ c s^j/A over the pairs (j, c) in `terms`.
     #[allow(clippy::cast_possible_wrap)]
     fn output(&self, terms: impl Iterator<Item = (usize, f64)>) -> (Vec<f64>, f64) {
         let (n, mut row, mut direct) = (self.order, vec![0.0; self.order], 0.0);
@@ -147,17 +150,19 @@ impl Companion {
         (row, direct)
     }
 
-    /// Samples of s^j/A applied to an input or impulse, from the response of its states; j is at most the order.
+    /// Return the samples of s^j/A applied to an input or impulse, from the states and input values of its response.
+    ///
+    /// `j` is at most the order.
     pub(crate) fn derivative(&self, (states, values): &(Vec<f64>, Vec<f64>), j: usize) -> Vec<f64> {
         let (read, direct) = self.output(std::iter::once((j, 1.0)));
         let of = |(row, u): (&[f64], &f64)| row.iter().zip(&read).map(|(x, c)| x * c).sum::<f64>() + direct * u;
         states.chunks_exact(self.order.max(1)).zip(values).map(of).collect()
     }
 
-    /// States of 1/A with an input, or with an impulse if `input` is None.
+    /// Return the response of 1/A to an input, or to an impulse if `input` is None.
     ///
-    /// If `behind` has an output row, that output is the input of a second 1/A in series. Return the states at the
-    /// compared samples, and the input just after each; None on overflow.
+    /// `behind` is an output row with a direct gain. Its output is the input of a second 1/A in series. The response
+    /// consists of the states at the compared samples, and the input just after each. None on overflow.
     pub(crate) fn respond(
         &self,
         input: Option<&SourceInput<'_>>,
@@ -175,8 +180,10 @@ impl Companion {
         discretization.advance(start, input, grid)
     }
 
-    /// Discretization of 1/A, where A is the polynomial of the equation. If `behind` holds an output row, a system with
-    /// this output row precedes 1/A in series.
+    /// Return the discretization of 1/A, or of two systems 1/A in series; None on overflow.
+    ///
+    /// `behind` is the output row and direct gain that connect the first system to the second. `fraction` is the
+    /// fractional part of the delay in pulses.
     fn discretization(
         &self,
         between: Option<Intersample>,
@@ -220,7 +227,9 @@ impl Companion {
 }
 
 impl Discretization {
-    /// States at the compared samples, and the input just after each; None on overflow.
+    /// Return the states at the compared samples, and the input just after each; None on overflow.
+    ///
+    /// `state` contains the states before the first pulse.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn advance(
         &self,
@@ -272,7 +281,7 @@ pub(crate) struct ExactSimulation<'a> {
     equations: Vec<EquationSimulation<'a>>,
     /// Orthonormal basis of the weighted responses to the initial terms.
     basis: Vec<Vec<f64>>,
-    /// Change of the weighted samples per unit of each linear coefficient.
+    /// Change of the weighted samples per unit of each linear coefficient, one list of samples each.
     effects: Vec<Vec<f64>>,
 }
 
@@ -290,7 +299,9 @@ fn factorial(n: usize) -> f64 {
 }
 
 impl IntegerOrders {
-    /// Integer orders of a model at a point; None if an order is free or fractional, if equations are coupled, or if an
+    /// Return the integer orders of a model at a point; None if it has no exact simulation.
+    ///
+    /// This is the case if an order is free or fractional, or if equations are coupled. It is also the case if an
     /// experiment has a sensor filter, nonuniform samples, or an input that is neither held nor linear.
     pub(crate) fn of(model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> Option<Self> {
         let structures = model.structures(&point.orders);
@@ -335,7 +346,7 @@ impl IntegerOrders {
         Some(Self { equations })
     }
 
-    /// True if the shortest sampling interval of the experiments resolves every pole.
+    /// Return true if the shortest sampling interval of the experiments resolves every pole.
     pub(crate) fn is_resolved(&self, model: &FreeModel, experiments: &[Experiment], point: &ParameterPoint) -> bool {
         let shortest_interval =
             experiments.iter().map(|e| e.record.step() * e.pulses_per_sample as f64).fold(f64::INFINITY, f64::min);
@@ -346,7 +357,7 @@ impl IntegerOrders {
         })
     }
 
-    /// Coefficients of D^0 y … D^(n − 1) y of an equation.
+    /// Coefficients of D^0 y, …, D^(n − 1) y in equation `i` of order n.
     fn own_coefficients(&self, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
         let mut own = vec![0.0; self.equations[i].order];
         for &(k, nu) in &self.equations[i].own {
@@ -355,7 +366,9 @@ impl IntegerOrders {
         own
     }
 
-    /// Residuals at a point with the `linear` coefficients and the initial terms eliminated.
+    /// Return the residuals at a point, with the `linear` coefficients and the initial terms eliminated.
+    ///
+    /// [`Error::Diverged`] if the simulation is not finite.
     pub(crate) fn evaluate<'a>(
         &self,
         model: &FreeModel,
@@ -388,7 +401,9 @@ impl IntegerOrders {
         Ok(out)
     }
 
-    /// Simulation of an experiment, and the weighted responses to its initial terms, each with its equation.
+    /// Return the simulation of an experiment, and the weighted responses to its initial terms.
+    ///
+    /// Each response has the index of its equation, or None for a constant level of the output.
     #[allow(clippy::type_complexity)]
     fn simulate<'a>(
         &self,
@@ -426,7 +441,7 @@ impl IntegerOrders {
                 add(SourceKind::Impulse, None)?;
             }
             for &e in powers.iter().filter(|&&e| e >= orders.order) {
-                // A constant, or a ramp with a value per edge.
+                // The input is a constant, or a ramp with one value per pulse edge.
                 let (between, length) = match e == orders.order {
                     true => (Intersample::Hold, 1),
                     false => (Intersample::Linear, record.m() + 1),
@@ -468,7 +483,7 @@ impl IntegerOrders {
         Ok((simulation, columns))
     }
 
-    /// Derivatives of the residuals, with the initial terms projected out.
+    /// Derivatives of the residuals, one row per parameter, with the initial terms projected out.
     pub(crate) fn jacobian(
         &self,
         model: &FreeModel,
@@ -518,8 +533,9 @@ impl IntegerOrders {
     }
 }
 
-/// Signal after its delay, saturation or dead zone, as the input of a companion form. It has one mean per pulse if
-/// held, and one value per pulse edge if linear.
+/// Return a signal after its delay, saturation or dead zone, as the input of a companion form.
+///
+/// It has one mean per pulse if it is held, and one value per pulse edge if it is linear.
 pub(crate) fn source_input<'a>(
     model: &FreeModel,
     experiment: &'a Experiment,
@@ -551,7 +567,7 @@ pub(crate) fn source_input<'a>(
 }
 
 impl Source<'_> {
-    /// Add `read`·x + `direct`·u to samples, where x are the states and u is the input.
+    /// Add `read`·x + `direct`·u to `samples`, where x are the states and u is the input.
     fn add_output(&self, read: &[f64], direct: f64, samples: &mut [f64]) {
         let rows = self.states.chunks_exact(read.len().max(1));
         for ((y, row), u) in samples.iter_mut().zip(rows).zip(&self.values) {
@@ -561,7 +577,9 @@ impl Source<'_> {
 }
 
 impl EquationSimulation<'_> {
-    /// Output row and direct gain of the initial terms t^e of one source.
+    /// Output row and direct gain of the initial terms of one source.
+    ///
+    /// The terms have exponents `powers` and coefficients `values`.
     #[allow(clippy::cast_possible_wrap)]
     fn initial_output(&self, kind: &SourceKind, powers: &[usize], values: &[f64]) -> (Vec<f64>, f64) {
         let n = self.companion.order;
@@ -587,7 +605,9 @@ impl ExactSimulation<'_> {
         &self.basis
     }
 
-    /// Output row and direct gain of input q of equation i, with the given coefficient per term.
+    /// Output row and direct gain of input `q` of equation `i`, with the given coefficient of each term.
+    ///
+    /// `shift` is added to the order of each term.
     fn input_output(
         &self,
         orders: &IntegerOrders,
@@ -599,7 +619,7 @@ impl ExactSimulation<'_> {
         self.equations[i].companion.output(terms.map(|&(k, nu)| (nu + shift, coefficient(k))))
     }
 
-    /// Samples of the output of equation i with zero initial conditions, without weights.
+    /// Unweighted samples of the output of equation `i` from zero initial conditions.
     fn response(&self, orders: &IntegerOrders, model: &FreeModel, i: usize, point: &ParameterPoint) -> Vec<f64> {
         let of = |k: usize| model.equations[i].terms[k].2.at(&point.coefficients);
         let mut samples = vec![0.0; self.equations[i].sources.first().map_or(0, |s| s.values.len())];
@@ -612,7 +632,7 @@ impl ExactSimulation<'_> {
         samples
     }
 
-    /// Change of the weighted samples per unit of a coefficient of input terms.
+    /// Change of the weighted samples per unit of coefficient `j`, through the input terms.
     fn input_effect(
         &self,
         orders: &IntegerOrders,
@@ -639,7 +659,7 @@ impl ExactSimulation<'_> {
         column
     }
 
-    /// States of 1/A y of equation i at the compared samples; None on overflow.
+    /// States of y/A at the compared samples, with output y and denominator A of equation `i`; None on overflow.
     fn autoregressive_states(
         &self,
         orders: &IntegerOrders,
@@ -672,7 +692,9 @@ impl ExactSimulation<'_> {
         Some(total)
     }
 
-    /// Add the derivative with respect to a coefficient of autoregressive terms to weighted samples.
+    /// Add the derivative with respect to coefficient `j` to `column`, as far as it is due to autoregressive terms.
+    ///
+    /// `column` contains weighted samples.
     #[allow(clippy::cast_possible_wrap)]
     fn add_autoregressive_effect(
         &self,
@@ -718,7 +740,7 @@ impl ExactSimulation<'_> {
                     continue;
                 }
                 if input.law == InputLaw::Delay {
-                    // −D y. The derivative of the jumps themselves is infinite and left out.
+                    // The derivative is −D y. The infinite derivative of the jumps themselves is omitted.
                     let (read, direct) = self.input_output(orders, (i, q), |k| -of(k), 1);
                     source.add_output(&read, direct, own);
                     continue;

@@ -1,5 +1,7 @@
-//! Derivatives of the residuals of A y = b with respect to parameters. Each derivative A⁻¹(∂b − ∂A y) is a product of
-//! three spectra, with one inverse FFT per parameter and output.
+//! Derivatives of the residuals with respect to the parameters of the equations A y = b.
+//!
+//! A contains the operators of the simulated outputs y, and b is the contribution of the inputs. Each derivative A⁻¹(∂b
+//! − ∂A y) is a product of three spectra, with one inverse FFT per parameter and output.
 
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -15,9 +17,10 @@ use crate::linalg::orthogonal::project_out;
 use crate::series::Kernel;
 
 impl FreeModel {
-    /// Derivatives of the residuals with respect to orders, coefficients (plain coordinates) and input parameters.
+    /// Derivatives of the residuals, one row per order, coefficient (in plain coordinates) and input parameter.
     ///
-    /// Initial terms are projected out. The columns of the linear coefficients are taken from the evaluation.
+    /// Initial terms are projected out. The derivatives with respect to the linear coefficients are taken from the
+    /// evaluation. [`Error::Diverged`] if a derivative is not finite.
     pub(crate) fn jacobian(
         &self,
         experiments: &[Experiment],
@@ -37,7 +40,7 @@ impl FreeModel {
         Ok(jacobian)
     }
 
-    /// Rows of the Jacobian of one experiment.
+    /// Append the derivatives of the residuals of one experiment to the rows of the Jacobian.
     #[allow(clippy::too_many_arguments)]
     fn sensitivities(
         &self,
@@ -119,10 +122,10 @@ impl FreeModel {
         Ok(())
     }
 
-    /// Weight of term k of equation i in the derivative of the right-hand side with respect to a parameter.
+    /// Weight of term `k` of equation `i` in the derivative of the right-hand side with respect to a parameter.
     ///
-    /// The weight multiplies the operator for a coefficient, the derivative of the operator for an order, and the
-    /// derivative of the input for an input parameter.
+    /// For a coefficient, the weight multiplies the operator. For an order, it multiplies the derivative of the
+    /// operator. For an input parameter, it multiplies the derivative of the input.
     fn right_hand_side_weight(&self, (i, k): (usize, usize), point: &ParameterPoint, parameter: usize) -> f64 {
         let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
         let (signal, order, monomial) = &equation.terms[k];
@@ -140,7 +143,7 @@ impl FreeModel {
     }
 }
 
-/// Derivatives of the initial exponents of equation i with respect to a free order.
+/// Derivatives of the exponents of the initial terms of equation `i` with respect to a free order.
 ///
 /// None if they do not depend on the order, or if the number `count` of exponents changes at this order.
 pub(crate) fn initial_exponent_slopes(
@@ -150,7 +153,7 @@ pub(crate) fn initial_exponent_slopes(
     count: usize,
     experiment: &Experiment,
 ) -> Option<Vec<f64>> {
-    // Exponents are linear in the orders, so any shift gives their derivative.
+    // Exponents are linear in the orders, so a difference with any shift is their derivative.
     const SHIFT: f64 = 1e-4;
     if count == 0 || !model.initial.follows_orders() {
         return None;
@@ -162,7 +165,7 @@ pub(crate) fn initial_exponent_slopes(
     };
     let (below, own_exponents, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
     if [&below, &own_exponents, &above].iter().any(|list| list.len() != count) {
-        // The projection adapts in the next evaluation.
+        // The number of initial terms changes at this order. The projection adapts to it in the next evaluation.
         return None;
     }
     let slopes = below.iter().zip(&above).map(|(below, above)| (above - below) / (2.0 * SHIFT));
@@ -170,9 +173,9 @@ pub(crate) fn initial_exponent_slopes(
     Some(slopes.map(|slope| if slope.abs() < SHIFT { 0.0 } else { slope }).collect())
 }
 
-/// Derivative of the weighted initial terms of equation i with respect to a free order, before the filter.
+/// Derivative of the sum of the initial terms of equation `i` with respect to a free order, before the filter.
 ///
-/// None if they do not depend on the order.
+/// `values` contains the coefficients of the terms. Return None if the terms do not depend on the order.
 fn initial_term_derivative(
     model: &FreeModel,
     (i, parameter): (usize, usize),

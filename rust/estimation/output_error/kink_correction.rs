@@ -1,26 +1,30 @@
 //! Kink correction: slope discontinuities of the output near input jumps, at nonuniform sample times.
 //!
 //! Block-pulse means smooth out the kinks after jumps of zero-order-hold inputs. The leading kinks of an output come
-//! from the input terms of its equation, Σ c I^{α−ν} s, and from these terms passed once through the autoregressive
-//! terms. Terms passed through several times are smoother, and their error decreases with the step.
+//! from the input terms of its equation. In these terms, a signal is integrated with the order α − ν. α is the order of
+//! the equation, and ν that of the term. Further kinks come from these terms after one pass through the autoregressive
+//! terms. After several passes the terms are smoother, and their error decreases with the step.
 
 use super::experiment::{Experiment, NonuniformSamples};
 use super::feedthrough::{Feedthrough, FEEDTHROUGH_ORDER_TOLERANCE};
 use super::parameterization::{FreeModel, ParameterPoint};
 use crate::equation::Structure;
 
-/// Step of the central difference in an order, which has an error of 1e−10.
+/// Step in an order of the central difference, whose error is 1e−10.
 const ORDER_DIFFERENCE_STEP: f64 = 1e-5;
 
-/// Integration order above which block pulses represent a kink accurately.
+/// Integration order from which block pulses represent a kink accurately.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
 
-/// Kink of one input term, alone or passed through an autoregressive term. It holds the correction of the samples for
-/// coefficients of 1, and the derivative of this correction with respect to the integration order.
+/// Kink of one input term, either alone or after one pass through an autoregressive term.
 struct Kink {
+    /// Index of the equation.
     equation: usize,
+    /// Indices of the input term and, if there is one, of the autoregressive term.
     terms: Vec<usize>,
+    /// Correction of the compared samples for coefficients of 1.
     values: Vec<f64>,
+    /// Derivative of this correction with respect to the integration order.
     slopes: Vec<f64>,
 }
 
@@ -30,7 +34,7 @@ pub(crate) struct KinkCorrection {
 }
 
 impl KinkCorrection {
-    /// Kinks of the outputs due to the steps of zero-order-hold inputs; None for uniform samples.
+    /// Return the kinks of the outputs due to the steps of zero-order-hold inputs; None for uniform samples.
     pub(crate) fn of(model: &FreeModel, experiment: &Experiment, structures: &[Structure]) -> Option<Self> {
         let NonuniformSamples { readings, jumps } = experiment.nonuniform.as_ref()?;
         let step = experiment.record.step();
@@ -64,7 +68,7 @@ impl KinkCorrection {
         Some(Self { all })
     }
 
-    /// Correction of the weighted samples for an initial term t^e of one equation; zero for uniform samples.
+    /// Correction of the weighted samples for an initial term t^e with e = `exponent`; 0 for uniform samples.
     pub(crate) fn initial_term_correction(experiment: &Experiment, equation: usize, exponent: f64) -> Vec<f64> {
         let mut rows = vec![vec![0.0; experiment.compared_count()]; experiment.samples.len()];
         if let Some(own) = experiment.nonuniform.as_ref().filter(|_| exponent.fract() != 0.0) {
@@ -74,7 +78,9 @@ impl KinkCorrection {
         experiment.weighted_corrections(&rows)
     }
 
-    /// Sum of the kinks, with weights for their values and derivatives, in weighted samples.
+    /// Return the weighted sum of the corrections of all kinks, with all outputs concatenated.
+    ///
+    /// `weights` returns the factors of the values and of the derivatives of a kink.
     fn weighted_sum(
         &self,
         model: &FreeModel,
@@ -94,7 +100,7 @@ impl KinkCorrection {
         })
     }
 
-    /// Kink correction of the weighted output samples of one experiment, concatenated over the outputs.
+    /// Kink correction of the weighted samples of one experiment, with all outputs concatenated.
     pub(crate) fn weighted_correction(
         &self,
         model: &FreeModel,
@@ -109,7 +115,7 @@ impl KinkCorrection {
         self.weighted_sum(model, experiment, direct, weight)
     }
 
-    /// Add the derivative of the correction with respect to a parameter, at constant feedthrough gains.
+    /// Add the derivative of the correction with respect to a parameter to `column`, at constant feedthrough gains.
     pub(crate) fn add_slope(
         &self,
         model: &FreeModel,

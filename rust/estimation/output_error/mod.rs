@@ -1,13 +1,15 @@
 //! Output-error estimation of all equations of a model on all records, with continuous orders, by Levenberg–Marquardt.
 //!
-//! The output error is the measured minus the simulated output. For white output noise the estimate is maximum
-//! likelihood. The simulation (free run: only inputs and initial conditions are used) solves A y = b in series, by
-//! exact division. The sensitivity to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series. With the
-//! spectra of A⁻¹ it costs one inverse transform per parameter and output. Initial terms are linear and projected out
-//! (variable projection in Kaufman's form, doi:10.1007/BF01932995). A sample y_k is compared with the mean of the
-//! pulses on either side of kh, on a grid that can be finer than the samples, plus the direct feedthrough of the
-//! inputs. Missing samples have zero weight. Nonuniform samples are compared at their own times. Integer orders, and any
-//! orders on long records, have exact samples without pulses.
+//! The output error is the measured minus the simulated output. For white output noise, the estimate is maximum
+//! likelihood. The simulation (free run: only inputs and initial conditions are used) solves A y = b by exact division
+//! of power series. A contains the operators of the outputs y, and b is the contribution of the inputs. The sensitivity
+//! to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series. With the spectra of A⁻¹, it costs one inverse
+//! transform per parameter and output. Initial terms are linear and projected out (variable projection in Kaufman's
+//! form, doi:10.1007/BF01932995).
+//!
+//! A sample at a time t is compared with the mean of the two pulses next to t, plus the direct feedthrough of the
+//! inputs. The grid of the pulses can be finer than the samples. Missing samples have zero weight. Nonuniform samples
+//! are compared at their own times. Integer orders, and any orders on long records, have exact samples without pulses.
 
 pub(crate) mod evaluation;
 mod evaluation_cache;

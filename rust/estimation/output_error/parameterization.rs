@@ -1,5 +1,4 @@
-//! Parameterization of a model: free orders, coefficients and input parameters, coordinates, bounds and
-//! time scaling.
+//! Parameterization of a model: free parameters with coordinates and bounds, and time scaling.
 //!
 //! A coefficient of D^ν y in an equation for D^α y has the unit time^−(α − ν), which changes with free orders. Without
 //! scaling, the result of an optimization along a flat valley would depend on the unit of time. The optimization
@@ -31,7 +30,7 @@ pub enum Coordinate {
 const MAX_LOG_DECREASE: f64 = 20.0;
 
 impl Coordinate {
-    /// True if a value is in the range of the coordinate.
+    /// Return true if a value is in the range of the coordinate.
     pub(crate) fn contains(self, value: f64) -> bool {
         match self {
             Self::Plain | Self::Fixed => value.is_finite(),
@@ -40,7 +39,7 @@ impl Coordinate {
         }
     }
 
-    /// Shift a coefficient by `delta` in its coordinate.
+    /// Return a coefficient after a shift by `delta` in its coordinate.
     pub(crate) fn shift(self, value: f64, delta: f64) -> f64 {
         // The linearization is meaningless beyond a factor of e^5.
         let bounded = delta.clamp(-5.0, 5.0);
@@ -52,9 +51,9 @@ impl Coordinate {
         }
     }
 
-    /// Distance of a coefficient from its lower bound in its coordinate.
+    /// Distance of a coefficient from its lower bound in its coordinate; infinite if it has no bound.
     ///
-    /// Below the bound the terms of the coefficient have no effect, and an optimization would not terminate.
+    /// Below the bound, the terms of the coefficient have no effect, and an optimization would not terminate.
     pub(crate) fn distance_to_bound(self, value: f64, start: f64) -> f64 {
         match self {
             Self::Logarithm => libm::log(value / start) + MAX_LOG_DECREASE,
@@ -76,9 +75,9 @@ impl Coordinate {
 /// Monomial of the free coefficients: factor·Π c_i^{n_i}.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Monomial {
-    /// Factor that is fixed.
+    /// Fixed factor.
     pub factor: f64,
-    /// Indices of the free coefficients and their powers.
+    /// Index and power of each free coefficient that occurs.
     pub powers: Vec<(usize, i32)>,
 }
 
@@ -87,7 +86,7 @@ impl Monomial {
         self.powers.iter().fold(self.factor, |product, &(i, n)| product * coefficients[i].powi(n))
     }
 
-    /// Derivative of the monomial with respect to coefficient i.
+    /// Derivative of the monomial with respect to coefficient `i`.
     pub(crate) fn slope(&self, coefficients: &[f64], i: usize) -> f64 {
         let Some(&(_, n)) = self.powers.iter().find(|&&(j, _)| j == i) else { return 0.0 };
         let rest = self.powers.iter().filter(|&&(j, _)| j != i);
@@ -96,14 +95,14 @@ impl Monomial {
     }
 }
 
-/// Equation whose orders and coefficients are functions of shared free parameters.
+/// Equation whose orders and coefficients are functions of the free parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeEquation {
     /// Index of the output in the record.
     pub output: usize,
     /// Highest order α.
     pub order: AffineOrder,
-    /// Signal, order and coefficient of each term.
+    /// Index of the signal, order and coefficient of each term.
     pub terms: Vec<(usize, AffineOrder, Monomial)>,
 }
 
@@ -121,31 +120,31 @@ pub struct ParameterPoint {
 /// Model with free orders, coefficients and input parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeModel {
-    /// The equations.
+    /// Equations, one per output.
     pub equations: Vec<FreeEquation>,
-    /// Bounds of each free order.
+    /// Lower and upper bound of each free order.
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
     pub coordinates: Vec<Coordinate>,
     /// Free input parameters, at most one per input.
     pub inputs: Vec<FreeInput>,
-    /// True if outputs enter other equations as simulated; false if as measured.
+    /// True if simulated outputs enter the other equations, false if measured outputs do.
     pub coupled: bool,
     /// Initial terms of each record.
     pub initial: Initial,
 }
 
-/// Minimum magnitude of the denominator at the Nyquist frequency, relative to its leading coefficient. Points below it
-/// are not admissible.
+/// Minimum ratio of the denominator at the Nyquist frequency to its leading coefficient at an admissible point.
 const MIN_NYQUIST_RESPONSE_RATIO: f64 = 0.02;
 
 impl FreeModel {
     /// Check that the model matches the experiments.
     ///
     /// # Errors
-    /// [`Error::Structure`] for an unknown signal or coefficient, a non-linearity of a signal that is not an input, or
-    /// a lower bound above the upper bound; [`Error::Length`] for experiments or weights of wrong lengths; as
-    /// [`AffineOrder::check`].
+    /// [`Error::Structure`] for an unknown signal or coefficient, a nonlinearity of a signal that is not an input, or a
+    /// lower bound above the upper bound. [`Error::Length`] if there is no experiment, or if the data of an experiment
+    /// have wrong lengths. [`Error::NotFinite`] if a value is not finite. [`Error::OutOfRange`] for an order or
+    /// exponent out of range ([`AffineOrder::check`]).
     pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
         let Some(signals) = experiments.iter().map(|e| e.record.len()).min() else {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
@@ -155,7 +154,9 @@ impl FreeModel {
         self.initial.check()
     }
 
-    /// Check signals, coefficients and bounds for records of `signals` recorded and `derived` derived signals.
+    /// Check signals, coefficients and bounds for records with `signals` recorded and `derived` derived signals.
+    ///
+    /// [`Error::Structure`] if one of them is invalid.
     pub(crate) fn check_structure(&self, signals: usize, derived: usize) -> Result<()> {
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
         let coefficients = self.coordinates.len();
@@ -195,7 +196,9 @@ impl FreeModel {
         Ok(())
     }
 
-    /// Check that an experiment has the outputs of the model, and samples that its inputs allow.
+    /// Check that an experiment is valid and has the outputs of the model.
+    ///
+    /// [`Error::Structure`] if samples are nonuniform and an input parameter is free.
     pub(crate) fn check_experiment(&self, experiment: &Experiment) -> Result<()> {
         experiment.check()?;
         check_length("outputs", self.equations.len(), experiment.samples.len())?;
@@ -206,12 +209,12 @@ impl FreeModel {
         Ok(())
     }
 
-    /// Index of the free input parameter of a signal, if any.
+    /// Index of the free input parameter of a signal; None if it has none.
     pub(crate) fn law_of(&self, signal: usize) -> Option<usize> {
         self.inputs.iter().position(|d| d.signal == signal)
     }
 
-    /// Pulse means of an input after its non-linearity, and their derivative with respect to its parameter.
+    /// Return the pulse means of an input after its nonlinearity, and their derivative with respect to its parameter.
     pub(crate) fn apply_input_law(
         &self,
         record: &Record,
@@ -222,7 +225,9 @@ impl FreeModel {
         input.law.apply(means, value, record.step(), self.value_before(means))
     }
 
-    /// Jumps of an input within pulses after its non-linearity, and their derivatives with respect to its parameter.
+    /// Return the jumps of an input within pulses after its nonlinearity, each with its derivative.
+    ///
+    /// The derivatives are those with respect to the free parameter of the input.
     pub(crate) fn apply_input_law_to_jumps(
         &self,
         record: &Record,
@@ -234,7 +239,7 @@ impl FreeModel {
         input.law.apply_to_jumps(means, record.jumps(input.signal), value, record.step(), before)
     }
 
-    /// Value of a delayed input before its first pulse.
+    /// Value of a delayed input before its first pulse: 0 for a record at rest, else its first pulse mean.
     fn value_before(&self, means: &[f64]) -> f64 {
         if self.initial.is_at_rest() {
             0.0
@@ -254,9 +259,9 @@ impl FreeModel {
             .collect()
     }
 
-    /// Exponents of the initial terms of equation i on an experiment.
+    /// Exponents of the initial terms of equation `i` on an experiment.
     ///
-    /// Impulses are included only if the output passes a sensor filter, for the initial state of the filter.
+    /// Impulses are included only if the output passes a sensor filter. They represent the initial state of the filter.
     pub(crate) fn exponents(&self, experiment: &Experiment, i: usize, structure: &Structure) -> Vec<f64> {
         structure.initial_exponents(if experiment.is_filtered(i) {
             &self.initial
@@ -265,7 +270,7 @@ impl FreeModel {
         })
     }
 
-    /// Index of the output that equals a signal of equation i, if the signal is simulated; None for an input.
+    /// Index of the equation that simulates a signal which occurs in equation `i`; None for an input.
     pub(crate) fn output_index(&self, i: usize, signal: usize) -> Option<usize> {
         if self.coupled {
             self.equations.iter().position(|e| e.output == signal)
@@ -274,7 +279,7 @@ impl FreeModel {
         }
     }
 
-    /// Order of each equation, and coefficients and orders of its autoregressive terms.
+    /// Order of each equation, and pairs of coefficient and order of its autoregressive terms.
     fn autoregressive_terms(&self, point: &ParameterPoint) -> Vec<(f64, Vec<(f64, f64)>)> {
         let own = |(structure, equation): (&Structure, &FreeEquation)| {
             let terms = structure.terms.iter().zip(&equation.terms);
@@ -284,13 +289,13 @@ impl FreeModel {
         self.structures(&point.orders).iter().zip(&self.equations).map(own).collect()
     }
 
-    /// True if an equation is unstable; false for coupled equations, which are not checked.
+    /// Return true if an equation is unstable. Coupled equations are not checked, and the result is false.
     pub(crate) fn is_unstable(&self, point: &ParameterPoint) -> bool {
         let alone = !self.coupled || self.equations.len() == 1;
         alone && self.autoregressive_terms(point).iter().any(|(order, own)| is_unstable(*order, own))
     }
 
-    /// True if every grid resolves the autoregressive terms of each equation; true for coupled equations.
+    /// Return true if every grid resolves the autoregressive terms of each equation, or if equations are coupled.
     ///
     /// The check compares the denominator at the Nyquist frequency ([`nyquist_margin`]) with its leading coefficient.
     /// If their ratio is negative, the discretization has an unstable mode that alternates from pulse to pulse. If it
@@ -316,34 +321,35 @@ fn unrounded_order(law: &AffineOrder, free: &[f64]) -> f64 {
     law.constant + law.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>()
 }
 
-/// Kind of input non-linearity.
+/// Kind of input nonlinearity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputLaw {
     /// Delay by a time \[s\].
     Delay,
-    /// Symmetric saturation at a limit in the unit of the input.
+    /// Symmetric saturation, with a limit in the unit of the input.
     Saturation,
-    /// Symmetric dead zone of a half-width in the unit of the input.
+    /// Symmetric dead zone, with a half-width in the unit of the input.
     DeadZone,
 }
 
-/// Free parameter of an input non-linearity.
+/// Free parameter of an input nonlinearity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FreeInput {
     /// Index of the input in the record; not an output of an equation.
     pub signal: usize,
-    /// Kind of the non-linearity.
+    /// Kind of the nonlinearity.
     pub law: InputLaw,
     /// Lower and upper bound: \[s\] for a delay, else in the unit of the input.
     pub bounds: (f64, f64),
 }
 
 impl InputLaw {
-    /// Apply the non-linearity to pulse means; return them and their derivative with respect to the parameter.
+    /// Apply the nonlinearity to pulse means. Return the new means and their derivative with respect to the parameter.
     ///
-    /// A delay is exact for a zero-order hold, and of second order in the step for linear interpolation. At an integer
-    /// number of steps the derivative is one-sided, towards longer delays. Limits act on every pulse separately, which
-    /// is exact for a zero-order hold.
+    /// `value` is the parameter, `step` the pulse width \[s\], and `before` the input before the first pulse. A delay
+    /// is exact for a zero-order hold, and of second order in the step for linear interpolation. At an integer number
+    /// of steps, its derivative is one-sided, toward longer delays. Limits act on every pulse separately, which is
+    /// exact for a zero-order hold.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a limit that is negative, or a parameter that is not finite.
@@ -387,14 +393,14 @@ impl InputLaw {
         })
     }
 
-    /// Jumps of a zero-order hold within pulses after the non-linearity acted. The second of each pair has the
-    /// derivatives of the share and of both values with respect to the parameter.
+    /// Return the jumps of a zero-order hold within pulses after the nonlinearity, each with its derivatives.
     ///
-    /// A limit acts on both values of each of `jumps`. For a delay, `jumps` is ignored: the input is taken to jump at
-    /// pulse edges, and the delay moves these jumps into the pulses. `before` is the input before the record.
+    /// The second of each pair contains the derivatives of `share`, `before` and `after` with respect to the parameter.
+    /// A limit acts on both values of each of `jumps`. A delay ignores `jumps`: the input is assumed to jump at pulse
+    /// edges, and the delay moves these jumps into the pulses. `before` is the input before the record.
     ///
     /// # Errors
-    /// As [`InputLaw::apply`].
+    /// [`Error::OutOfRange`] for a limit that is negative, or a parameter that is not finite.
     #[allow(clippy::float_cmp)]
     pub(crate) fn apply_to_jumps(
         self,
@@ -428,15 +434,15 @@ impl InputLaw {
     }
 }
 
-/// Maximum logarithm of a scaling factor. Larger logarithms are clipped.
+/// Maximum magnitude of the logarithm of a scaling factor. Larger logarithms are clipped.
 const MAX_LOG_FACTOR: f64 = 300.0;
-/// Difference below which two exponents of time are equal.
+/// Difference below which two exponents of time count as equal.
 const EXPONENT_TOLERANCE: f64 = 1e-9;
 
 /// Exponent of time in the unit of a coefficient: constant, and weights of the free orders.
 type TimePower = (f64, Vec<f64>);
 
-/// Logarithm of the unit of time, and the exponent of time of each coefficient; None for unscaled coefficients.
+/// Logarithm of the unit of time, and the exponent of time of each coefficient; None for an unscaled coefficient.
 #[derive(Debug, Clone)]
 pub(crate) struct TimeUnit {
     unit: f64,
@@ -444,25 +450,28 @@ pub(crate) struct TimeUnit {
 }
 
 impl TimeUnit {
-    /// Unit of time of experiments.
+    /// Return the unit of time of experiments.
     pub(crate) fn from_experiments(model: &FreeModel, experiments: &[Experiment]) -> Self {
         Self::from_log_spans(model, &experiments.iter().map(log_span).collect::<Vec<_>>())
     }
 
-    /// Choose the unit of time: geometric mean of sampling interval and duration over all runs, divided by π. `spans` holds ln(sampling interval × duration) of each run.
+    /// Return the unit of time of a model.
+    ///
+    /// It is the geometric mean of sampling interval and duration over all runs, divided by π. `spans` contains
+    /// ln(sampling interval × duration) of each run, in seconds.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn from_log_spans(model: &FreeModel, spans: &[f64]) -> Self {
-        // Geometric mean of the lowest frequency of the record and the Nyquist frequency.
+        // Inverse of the geometric mean of the lowest frequency, π/duration, and the Nyquist frequency, π/interval.
         let unit = spans.iter().sum::<f64>() / (2.0 * spans.len().max(1) as f64) - libm::log(std::f64::consts::PI);
         Self { unit, powers: time_powers(model) }
     }
 
-    /// Logarithm of the unit of time.
+    /// Natural logarithm of the unit of time in seconds.
     pub(crate) fn log_unit(&self) -> f64 {
         self.unit
     }
 
-    /// Factor that converts a coefficient to the unit of time, at the given orders.
+    /// Factor that converts a coefficient from seconds to the scaled unit of time, at the given orders.
     pub(crate) fn factor(&self, coefficient: usize, orders: &[f64]) -> f64 {
         self.powers[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
             let power = constant + weights.iter().zip(orders).map(|(w, o)| w * o).sum::<f64>();
@@ -471,36 +480,38 @@ impl TimeUnit {
         })
     }
 
-    /// Return the relative decrease of a coefficient in seconds per unit of a free order, if its value in the scaled
-    /// unit of time is constant.
+    /// Relative decrease of a coefficient in seconds per unit of a free order.
+    ///
+    /// The value of the coefficient in the scaled unit of time is constant.
     pub(crate) fn relative_decrease(&self, coefficient: usize, order: usize) -> f64 {
         let weight = |(_, weights): &TimePower| weights.get(order).copied().unwrap_or(0.0);
         self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
     }
 }
 
-/// Logarithm of sampling interval times duration.
+/// Natural logarithm of sampling interval times duration, in seconds.
 fn log_span(experiment: &Experiment) -> f64 {
     let (m, step) = (experiment.record.m() as f64, experiment.record.step());
     let interval = step * experiment.pulses_per_sample as f64;
     libm::log(interval) + libm::log(m * step)
 }
 
-/// Exponent of time of each coefficient; None for unscaled ones.
+/// Exponent of time of each coefficient; None for an unscaled coefficient.
 fn time_powers(model: &FreeModel) -> Vec<Option<TimePower>> {
     consistent_powers(model).unwrap_or_else(|| {
-        // Exponents conflict if one coefficient occurs with several orders. Under a law no coefficient is scaled then.
+        // Exponents conflict if one coefficient occurs with several orders. Under a coefficient law, no coefficient is
+        // then scaled.
         let lawful = model.equations.iter().flat_map(|e| &e.terms).any(|(_, _, c)| c.powers.len() > 1);
         (0..model.coordinates.len()).map(|j| if lawful { None } else { time_power(model, j) }).collect()
     })
 }
 
-/// True if a coefficient is scaled; fixed coefficients and ratios are not.
+/// Return true if a coefficient is scaled. Fixed coefficients and ratios are not.
 fn is_scaled(model: &FreeModel, coefficient: usize) -> bool {
     matches!(model.coordinates[coefficient], Coordinate::Plain | Coordinate::Logarithm)
 }
 
-/// Exponent α − ν of the first term whose coefficient is this one alone.
+/// Exponent α − ν of the first term that has this coefficient alone; None if it is unscaled or there is no such term.
 fn time_power(model: &FreeModel, coefficient: usize) -> Option<TimePower> {
     if !is_scaled(model, coefficient) {
         return None;
@@ -519,7 +530,7 @@ fn order_difference(highest: &AffineOrder, order: &AffineOrder) -> Vec<f64> {
     std::iter::once(highest.constant - order.constant).chain(weights).collect()
 }
 
-/// Exponents of time consistent with all products of coefficients, by elimination; None if they conflict.
+/// Exponents of time that are consistent with all products of coefficients, by elimination; None if they conflict.
 fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
     let (count, orders) = (model.coordinates.len(), model.order_bounds.len());
     // One row per product: exponents of the coefficients, and the exponent of time of the product.
@@ -551,7 +562,7 @@ fn consistent_powers(model: &FreeModel) -> Option<Vec<Option<TimePower>>> {
     if rows[pivots.len()..].iter().flat_map(|(_, power)| power).any(|v| v.abs() > EXPONENT_TOLERANCE) {
         return None;
     }
-    // Coefficients not determined by the products have no unit.
+    // Exponents that the products do not determine are 0.
     let mut powers: Vec<_> = (0..count).map(|j| is_scaled(model, j).then(|| (0.0, vec![0.0; orders]))).collect();
     for ((_, mut power), j) in rows.into_iter().zip(pivots) {
         let constant = power.remove(0);

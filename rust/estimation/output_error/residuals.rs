@@ -1,8 +1,8 @@
 //! Simulation and residuals of a model on every experiment, with linear coefficients and initial terms eliminated.
 //!
-//! Linear coefficients and initial terms are solved for at every point (Golub & Pereyra, doi:10.1137/0710036), so that
-//! only autoregressive coefficients, orders and input parameters are iterated. No sign has to be guessed, and collinear
-//! inputs cause no valley.
+//! Linear coefficients and initial terms are solved for at every point (Golub & Pereyra, doi:10.1137/0710036). Only
+//! autoregressive coefficients, orders and input parameters are therefore iterated. No sign has to be guessed, and
+//! collinear inputs cause no valley of the cost.
 
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -22,21 +22,22 @@ use crate::linalg::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, RunningSumSystem, SumOfProducts};
 
-/// Minimum difference between α and the order of an autoregressive term. At 0 the equation would not depend on the
-/// input.
+/// Minimum difference between the order of an equation and the order of an autoregressive term.
+///
+/// With equal orders, the equation would not depend on the input.
 pub(crate) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
-/// Response of an experiment to an initial term: equation, weighted samples, pulse means.
+/// Response of an experiment to an initial term: index of the equation, weighted samples, pulse means.
 ///
-/// The pulse means are empty for a term that affects only the sensor filter, and for a level of the output, which is in
-/// no equation. The equation of a level is None.
+/// The pulse means are empty for a term that affects only the sensor filter. They are also empty for a level of the
+/// output, which belongs to no equation. The index of a level is None.
 struct InitialTermResponse {
     equation: Option<usize>,
     samples: Vec<f64>,
     means: Rc<PulseMeans>,
 }
 
-/// Simulation of an experiment from rest, before the initial terms are added.
+/// Simulation of an experiment from zero initial conditions, before the initial terms are added.
 struct RestSimulation {
     part: Linearization,
     residuals: Vec<f64>,
@@ -44,7 +45,7 @@ struct RestSimulation {
 }
 
 impl FreeModel {
-    /// Residuals at a point, with the `linear` coefficients eliminated (variable projection, doi:10.1137/0710036).
+    /// Return the residuals at a point, with the `linear` coefficients and the initial terms eliminated.
     pub(crate) fn evaluate(
         &self,
         experiments: &[Experiment],
@@ -170,7 +171,9 @@ impl FreeModel {
         Ok(RestSimulation { part, residuals, free })
     }
 
-    /// Integral operators of the terms of each equation.
+    /// Return the integral operators of the terms, by equation.
+    ///
+    /// [`Error::Diverged`] if a term has a higher order than its equation permits.
     fn term_operators(
         &self,
         experiment: &Experiment,
@@ -203,7 +206,7 @@ impl FreeModel {
         Ok(operators)
     }
 
-    /// Pulse means of the simulation from rest, and the inverse of the equations.
+    /// Return the pulse means of the simulation from zero initial conditions, and the inverse of the system matrix.
     fn rest_response(
         &self,
         experiment: &Experiment,
@@ -295,7 +298,7 @@ impl FreeModel {
         Ok((response, solved))
     }
 
-    /// Pulse means of the input of a term of integration order `eta`, after the input non-linearity.
+    /// Pulse means of the input of a term of integration order `eta`, after the input nonlinearity.
     pub(crate) fn input_means<'a>(
         &self,
         record: &'a Record,
@@ -305,7 +308,9 @@ impl FreeModel {
         self.law_of(signal).map_or_else(|| record.term_signal(signal, eta), |law| &acted[law].0)
     }
 
-    /// Add the initial terms by projection of the residuals on their responses.
+    /// Determine the initial terms of an experiment, and add its residuals and terms to `out`.
+    ///
+    /// The initial terms follow from a projection of the residuals on their responses.
     fn add_initial_terms(answer: RestSimulation, equations: usize, out: &mut Evaluation<Linearization>) -> Result<()> {
         let RestSimulation { mut part, mut residuals, free } = answer;
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
@@ -331,7 +336,7 @@ impl FreeModel {
         Ok(())
     }
 
-    /// True if the integration order of a term depends on a free order.
+    /// Return true if the integration order of a term depends on a free order.
     fn depends_on_free_order(&self, equation: usize, term: usize) -> bool {
         let item = &self.equations[equation];
         let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
@@ -339,7 +344,7 @@ impl FreeModel {
     }
 }
 
-/// First m pulses of every output.
+/// First `m` pulse means of every output.
 fn truncate_means(means: &PulseMeans, m: usize) -> Cow<'_, [Vec<f64>]> {
     match means.iter().all(|row| row.len() == m) {
         true => Cow::Borrowed(means),
@@ -368,7 +373,7 @@ impl FreeModel {
         (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
     }
 
-    /// Effects of the given input coefficients on an experiment.
+    /// Return the effect of each of the given input coefficients on an experiment.
     pub(crate) fn linear_effects(
         &self,
         experiment: &Experiment,
@@ -416,25 +421,25 @@ impl FreeModel {
     }
 }
 
-/// Intermediate results of one experiment for its sensitivities.
+/// Intermediate results of the simulation of one experiment, for its sensitivities.
 pub(crate) struct Linearization {
-    /// Inverse of the equations.
+    /// Inverse of the system matrix.
     pub(crate) system: Rc<SystemInverse>,
     /// Operators of the terms, by equation.
     pub(crate) operators: Vec<Vec<Rc<Operator>>>,
     /// Pulse means of the simulated outputs, including the initial terms.
     pub(crate) response: Vec<Vec<f64>>,
-    /// Orthonormal basis of the sampled responses to the initial terms.
+    /// Orthonormal basis of the weighted responses to the initial terms at the compared samples.
     pub(crate) basis: Vec<Vec<f64>>,
     /// Effects of the linear coefficients.
     pub(crate) linear_effects: Vec<ParameterEffect>,
-    /// Pulse means of each input after its free non-linearity, and their derivative with respect to its parameter.
+    /// Pulse means of each input after its nonlinearity, and their derivative with respect to the input parameter.
     pub(crate) input_means: Vec<(Vec<f64>, Vec<f64>)>,
-    /// Direct feedthrough.
+    /// Direct feedthrough; None if no term has it.
     pub(crate) feedthrough: Option<Feedthrough>,
     /// Correction for jumps of the inputs at the samples.
     pub(crate) jump_correction: JumpCorrection,
-    /// Kink correction at nonuniform samples.
+    /// Kink correction; None for uniform samples.
     pub(crate) kink_correction: Option<KinkCorrection>,
 }
 
@@ -460,7 +465,7 @@ impl Linearization {
     }
 }
 
-/// Effect on an experiment of a change of a parameter by 1.
+/// Effect of a change of a parameter by 1 on an experiment.
 pub(crate) struct ParameterEffect {
     /// Change of the weighted samples.
     pub(crate) samples: Vec<f64>,
@@ -469,7 +474,7 @@ pub(crate) struct ParameterEffect {
 }
 
 impl ParameterEffect {
-    /// Apply a change of the parameter to residuals and pulse means.
+    /// Apply a change of the parameter by `by` to residuals and pulse means.
     pub(crate) fn apply(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
         if by != 0.0 {
             residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);

@@ -2,24 +2,27 @@
 
 use std::f64::consts::PI;
 
-/// Ratio of one term's magnitude to the sum of all other terms. The frequency range ends where it is exceeded.
+/// Ratio of the dominant term to the sum of all others, in magnitude, at the ends of the frequency range.
 const DOMINANCE_RATIO: f64 = 1e3;
-/// Maximum step in ln ω. A pole closer to the imaginary axis than [`MIN_LOG_FREQUENCY_STEP`] counts as on the axis.
+/// Maximum step in ln ω.
 const MAX_LOG_FREQUENCY_STEP: f64 = 0.25;
+/// Minimum step in ln ω. A pole that is closer to the imaginary axis counts as on the axis.
 const MIN_LOG_FREQUENCY_STEP: f64 = 1e-12;
-/// Maximum change of the curve's angle between two points \[rad\].
+/// Maximum change of the angle of the curve between two points \[rad\].
 const MAX_ANGLE_STEP_RAD: f64 = 0.5;
-/// Difference below which two exponents of s are merged: they are distinguishable only beyond ω = e^1000.
+/// Difference below which two exponents of s are merged. They are distinguishable only above ω = e^1000.
 const EXPONENT_TOLERANCE: f64 = 1e-3;
-/// Number of zeros in the right half-plane, as computed, above which the equation is unstable; a zero on the imaginary
-/// axis counts 1/2.
+/// Computed number of zeros in the right half-plane above which the equation counts as unstable.
+///
+/// A zero on the imaginary axis counts 1/2.
 const MIN_UNSTABLE_ZERO_COUNT: f64 = 0.25;
 
-/// Return true if an equation of order α with autoregressive terms (c, ν) is unstable.
+/// Return true if an equation of order α with given autoregressive terms is unstable.
 ///
-/// It is unstable if s^α − Σ c s^ν has a zero in the right half-plane, or on the imaginary axis except the origin.
-/// Zeros are counted by the argument principle on the principal sheet: the angle of the curve over ω from 0 to ∞
-/// changes by (p_high − p_low − 2Z)·π/2 for exponents p and Z zeros in the right half-plane.
+/// `own` contains the coefficient c and the order ν of each term. The equation is unstable if s^α − Σ c s^ν has a zero
+/// in the right half-plane, or on the imaginary axis except the origin. Zeros are counted by the argument principle on
+/// the principal sheet. The angle of the function at s = jω, for ω from 0 to ∞, changes by (p_high − p_low − 2Z)·π/2.
+/// p_high and p_low are the largest and the smallest exponent, and Z is the number of zeros in the right half-plane.
 ///
 /// ```
 /// use ftlm::estimation::output_error::stability::is_unstable;
@@ -54,8 +57,9 @@ pub fn is_unstable(alpha: f64, own: &[(f64, f64)]) -> bool {
     0.5 * (high.1 - low.1) - turned / PI > MIN_UNSTABLE_ZERO_COUNT
 }
 
-/// Merge powers with exponents closer than [`EXPONENT_TOLERANCE`], which cannot be distinguished at any measurable
-/// frequency.
+/// Merge powers (coefficient, exponent) whose exponents are closer than [`EXPONENT_TOLERANCE`].
+///
+/// Such powers cannot be distinguished at any measurable frequency.
 fn merge_close_powers(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     powers.sort_by(|a, b| a.1.total_cmp(&b.1));
     let mut out: Vec<(f64, f64)> = Vec::with_capacity(powers.len());
@@ -69,7 +73,7 @@ fn merge_close_powers(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     out
 }
 
-/// Point of the curve at ω, relative to its largest power.
+/// Point of the curve Σ c (jω)^p at ω, relative to its largest term, as real and imaginary part.
 fn curve_point(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     let logs = || powers.iter().map(|(c, p)| c.abs().ln() + p * log_omega);
     let largest = logs().fold(f64::NEG_INFINITY, f64::max);
@@ -79,7 +83,7 @@ fn curve_point(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     })
 }
 
-/// Change of the angle of the curve between two frequencies, by bisection.
+/// Change of the angle of the curve between two frequencies \[rad\], by bisection; −∞ if the curve passes through 0.
 fn angle_change(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -> f64 {
     let ((a, (x, y)), (b, (u, v))) = (from, to);
     let angle = (x * v - y * u).atan2(x * u + y * v);
@@ -103,7 +107,7 @@ mod tests {
     #[test]
     fn single_power_has_known_poles() {
         assert!(!is_unstable(2.0, &[]) && !is_unstable(2.0, &[(0.0, 1.0)]));
-        // s^α = c: on the principal sheet for c > 0, for c < 0 only beyond α = 2.
+        // s^α = c has a root in the right half-plane for c > 0, and for c < 0 only if α is above 2.
         assert!(is_unstable(0.5, &[(2.0, 0.0)]) && is_unstable(1.7, &[(1e-9, 0.3)]));
         assert!(
             !is_unstable(0.5, &[(-2.0, 0.0)])
@@ -114,7 +118,7 @@ mod tests {
 
     #[test]
     fn commensurate_orders_match_matignon() {
-        // s^1.2 − c s^0.6 + 1: roots in s^0.6 grow where |arg| < 0.3π.
+        // s^1.2 − c s^0.6 + 1 is unstable if a root in s^0.6 has an argument below 0.3π in magnitude.
         for k in 0..200 {
             let c = -2.5 + 0.025 * f64::from(k);
             let disc = 0.25 * c * c - 1.0;

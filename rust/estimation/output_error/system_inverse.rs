@@ -1,4 +1,4 @@
-//! Inverse A⁻¹ of the equations of one experiment, and the integral operators of their terms.
+//! Inverse A⁻¹ of the system matrix of one experiment, and the integral operators of its terms.
 //!
 //! If all integration orders are fixed integers, running sums replace the spectra.
 
@@ -15,24 +15,24 @@ use crate::series::{
     multiply, Buffers, Kernel, RunningSumSystem, Solver, Source, SumOfProducts, MAX_SUMS, RIGHT_SIDE_LANES,
 };
 
-/// Representation of A⁻¹ at a point.
+/// Representation of A⁻¹ at a parameter point.
 pub(crate) enum Inverse {
-    /// Spectra of the entries, and their length for products.
+    /// Spectra of the entries of A⁻¹, and the length to which they are padded for products.
     Spectra { rows: Vec<Vec<Kernel>>, total: usize },
-    /// Running sums, solved once per right-hand side.
+    /// Running sums, which are solved again for each right-hand side.
     Sums(RunningSumSystem),
 }
 
 /// Right-hand sides of the equations: sums of integrals of signals.
 pub(crate) enum RightHandSides<'a> {
-    /// Sum of each equation, with a flag that is true if it is nonzero.
+    /// Sum of each equation, with a flag that is true if the sum is nonzero.
     Spectra(Vec<(bool, SumOfProducts)>),
-    /// Equation, order, weight and signal of each summand.
+    /// Index of the equation, integration order, weight and signal of each summand.
     Sums(Vec<(usize, usize, f64, Cow<'a, [f64]>)>),
 }
 
 impl<'a> RightHandSides<'a> {
-    /// Clear all sums.
+    /// Set all sums to zero.
     pub(crate) fn clear(&mut self) {
         match self {
             Self::Spectra(rights) => {
@@ -45,7 +45,7 @@ impl<'a> RightHandSides<'a> {
         }
     }
 
-    /// True if a summand was added.
+    /// Return true if a summand was added.
     pub(crate) fn is_nonzero(&self) -> bool {
         match self {
             Self::Spectra(rights) => rights.iter().any(|(used, _)| *used),
@@ -53,7 +53,9 @@ impl<'a> RightHandSides<'a> {
         }
     }
 
-    /// Multiply by the spectra of the inverse; None if zero.
+    /// Multiply by the spectra of the inverse, and return `m` pulse means of each output.
+    ///
+    /// Return None if the right-hand sides are zero or have no spectra.
     fn apply_inverse(
         &self,
         rows: &[Vec<Kernel>],
@@ -72,7 +74,7 @@ impl<'a> RightHandSides<'a> {
         self.is_nonzero().then(|| rows.iter().map(of_row).collect())
     }
 
-    /// Summands in the form that the running sums need.
+    /// Return the summands as sources of the running sums; empty for spectra.
     fn sources(&self) -> Vec<Source<'_>> {
         let Self::Sums(sources) = self else { return Vec::new() };
         (sources.iter())
@@ -85,7 +87,9 @@ impl<'a> RightHandSides<'a> {
             .collect()
     }
 
-    /// Add an operator applied to a signal; with `slope` its derivative with respect to the order.
+    /// Add `weight` times an operator applied to a signal to the right-hand side of an equation.
+    ///
+    /// With `slope`, the derivative of the operator with respect to its order is applied instead.
     ///
     /// The series and the spectrum of the signal are computed only if needed.
     pub(crate) fn add(
@@ -111,7 +115,9 @@ impl<'a> RightHandSides<'a> {
         }
     }
 
-    /// Add a series. Only the form that is needed, series or spectrum, is computed.
+    /// Add a series to the right-hand side of an equation.
+    ///
+    /// Only the form that is needed, series or spectrum, is computed.
     pub(crate) fn add_series(
         &mut self,
         equation: usize,
@@ -132,42 +138,43 @@ impl<'a> RightHandSides<'a> {
 /// Pulse means of every output.
 pub(crate) type PulseMeans = Vec<Vec<f64>>;
 
-/// Inverse of the equations A y = b at a point, for right-hand sides up to the length of the longest run.
+/// Inverse of the system matrix A of the equations A y = b, up to the length of the longest run.
 pub(crate) struct SystemInverse {
-    /// Division by A; None with running sums.
+    /// Solver that divides by A; None with running sums.
     solver: Option<RefCell<Solver<'static>>>,
     inverse: OnceCell<Inverse>,
-    /// Cache of the responses to initial terms, by equation and bits of the exponent, if shared by several runs.
+    /// Cache of the responses to initial terms, by equation and bits of the exponent, if several runs share it.
     initial_responses: RefCell<HashMap<(usize, u64), Rc<PulseMeans>>>,
 }
 
 impl SystemInverse {
-    /// Inverse of a matrix A of series.
+    /// Return the inverse of a matrix A of series.
     ///
     /// # Errors
-    /// A singular matrix of leading coefficients, or series of unequal length ([`Solver::new`]).
+    /// An error if the matrix of leading coefficients is singular, or if the series have unequal lengths
+    /// ([`Solver::new`]).
     pub(crate) fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
         let solver = Some(RefCell::new(Solver::from_matrix(matrix)?));
         Ok(Self { solver, inverse: OnceCell::new(), initial_responses: RefCell::default() })
     }
 
-    /// Inverse by running sums.
+    /// Return an inverse by running sums.
     pub(crate) fn from_running_sums(sums: RunningSumSystem) -> Self {
         Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), initial_responses: RefCell::default() }
     }
 
-    /// Solve by division, exact also if A⁻¹ is unstable; None with running sums.
+    /// Solve A y = b by division, which is exact also if A⁻¹ is unstable; None with running sums.
     ///
     /// # Errors
-    /// Series that do not match the matrix ([`Solver::solve`]).
+    /// An error if the series of `rhs` do not match the matrix ([`Solver::solve`]).
     pub(crate) fn solve_by_division(&self, rhs: &[Vec<f64>]) -> Result<Option<PulseMeans>> {
         self.solver.as_ref().map(|solver| solver.borrow_mut().solve(rhs)).transpose()
     }
 
-    /// Inverse A⁻¹, with spectra for products of [`SPECTRUM_FACTORS`] series of the longest run.
+    /// Return the inverse A⁻¹, with spectra for products of [`SPECTRUM_FACTORS`] series of the longest run.
     ///
     /// # Errors
-    /// Series that do not match the matrix ([`Solver::solve`]).
+    /// An error if the series do not match the matrix ([`Solver::solve`]).
     pub(crate) fn inverse(&self) -> Result<&Inverse> {
         if let (None, Some(solver)) = (self.inverse.get(), &self.solver) {
             let mut solver = solver.borrow_mut();
@@ -178,10 +185,13 @@ impl SystemInverse {
         self.inverse.get().ok_or_else(|| Error::Internal { what: "equations that nothing solves".into() })
     }
 
-    /// Responses to the initial terms t^e of equations, m pulses of n outputs; cached if `keep`.
+    /// Return the responses of `n` outputs over `m` pulses to the initial terms t^e of equations.
+    ///
+    /// `terms` contains the pairs (index of the equation, e), and `power` returns the initial term of an exponent. If
+    /// `keep`, the responses are cached.
     ///
     /// # Errors
-    /// Series that do not match the matrix ([`Solver::solve`]).
+    /// An error if the series do not match the matrix ([`Solver::solve`]).
     pub(crate) fn initial_term_responses(
         &self,
         (n, m): (usize, usize),
@@ -218,12 +228,13 @@ impl SystemInverse {
 }
 
 impl Inverse {
-    /// Solve for `count` right-hand sides: `fill` fills each one, `receive` receives the pulse means of the outputs.
+    /// Solve for `count` right-hand sides, with `n` outputs and `m` pulses.
     ///
-    /// The means are None for a zero right-hand side.
+    /// `fill` fills each right-hand side. `receive` receives the pulse means of the outputs, or None for a zero
+    /// right-hand side.
     ///
     /// # Errors
-    /// Those of `fill` and `receive`.
+    /// The errors of `fill` and `receive`.
     pub(crate) fn solve_each<'a>(
         &self,
         (n, m): (usize, usize),
@@ -263,13 +274,13 @@ impl Inverse {
     }
 }
 
-/// Number of series in a product: spectra of this multiple of m multiply without aliasing.
+/// Maximum number of series in a product. Spectra of this multiple of the series length multiply without aliasing.
 pub(crate) const SPECTRUM_FACTORS: usize = 3;
 
 /// Number of pulses above which spectra are not cached, because they need many times the memory of the record.
 pub(crate) const MAX_CACHED_PULSES: usize = 1 << 15;
 
-/// Difference from an integer below which an integration order is an integer.
+/// Difference from an integer below which an integration order counts as that integer.
 const INTEGER_TOLERANCE: f64 = 1e-12;
 
 /// Integral operator of a term: kernel, and its derivative with respect to the order if the order is free.
@@ -284,7 +295,7 @@ pub(crate) struct Operator {
 }
 
 impl Operator {
-    /// Operator of integration order `eta` on a grid of m pulses.
+    /// Return the operator of integration order `eta` on a grid of `m` pulses of width `step` \[s\].
     pub(crate) fn new(eta: f64, free: bool, m: usize, step: f64) -> Self {
         Self { eta, free, m, step, series: OnceCell::new(), spectra: [OnceCell::new(), OnceCell::new()] }
     }
@@ -296,13 +307,16 @@ impl Operator {
         })
     }
 
-    /// Spectrum of the derivative of the kernel. Below order 0 it is a product of three series.
+    /// Spectrum of the derivative of the kernel with respect to the order.
+    ///
+    /// For a negative order, the derivative is a product of three series.
     fn slope(&self) -> Kernel {
         let total = SPECTRUM_FACTORS * self.m;
         if self.eta >= 0.0 || !self.free {
             return Kernel::with_length(&self.series().1, total);
         }
-        // d/dη of 1/F(−η) is F′(−η)/F(−η)².
+        // With the kernel F(η), the kernel of a negative order is 1/F(−η). Its derivative with respect to η is
+        // F′(−η)/F(−η)².
         let (_, turned) = kernel_with_derivative(-self.eta, self.m, self.step);
         let (mut product, spectrum) = (Kernel::with_length(&turned, total), self.spectrum(false));
         product.multiply(&spectrum);
@@ -316,7 +330,7 @@ impl Operator {
         self.eta
     }
 
-    /// True if the operator has this order and this derivative flag.
+    /// Return true if the operator has the order `eta` and the flag `free`.
     pub(crate) fn matches_order(&self, eta: f64, free: bool) -> bool {
         self.eta.to_bits() == eta.to_bits() && self.free == free
     }
@@ -326,7 +340,7 @@ impl Operator {
         &self.series().0
     }
 
-    /// Integration order if it is a fixed integer.
+    /// Integration order if it is a fixed integer from 0 to [`MAX_SUMS`], else None.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(crate) fn integer_order(&self) -> Option<usize> {
         let near = self.eta.round();
@@ -346,7 +360,7 @@ impl Operator {
     }
 }
 
-/// Initial term t^e after the sensor filter of all signals, and its derivative with respect to the exponent.
+/// Initial term t^e after the sensor filter of all signals, and its derivative with respect to the exponent e.
 pub(crate) struct InitialTerm {
     exponent: f64,
     step: f64,
@@ -364,19 +378,19 @@ pub(crate) struct SeriesFilter {
 }
 
 impl SeriesFilter {
-    /// Filter from its series.
+    /// Return the filter with the given series.
     pub(crate) fn new(series: &[f64]) -> Self {
         Self { series: series.to_vec(), spectrum: Kernel::with_length(series, SPECTRUM_FACTORS * series.len()) }
     }
 
-    /// Filter a series.
+    /// Apply the filter to a series.
     pub(crate) fn apply(&self, series: &[f64]) -> Vec<f64> {
         multiply(&self.series, series, series.len())
     }
 }
 
 impl InitialTerm {
-    /// Initial term on a grid of m pulses.
+    /// Return the initial term t^e with e = `exponent` on a grid of `m` pulses of width `step` \[s\].
     pub(crate) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<SeriesFilter>>) -> Self {
         let raw = if filter.is_some() { power_pulses(exponent, m, step) } else { power_means(exponent, m, step) };
         let (series, spectrum, slope) = Default::default();
@@ -397,7 +411,7 @@ impl InitialTerm {
         self.slope.get_or_init(|| of(self.exponent, self.raw.len(), self.step))
     }
 
-    /// Spectrum of the pulse means, for a product with one more series.
+    /// Spectrum of the pulse means after the filter, padded for a product with one more series.
     pub(crate) fn spectrum(&self) -> Rc<Kernel> {
         let compute =
             || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), SPECTRUM_FACTORS * self.raw.len()));
@@ -408,7 +422,7 @@ impl InitialTerm {
     }
 }
 
-/// Spectrum of a filtered series, of length `total`.
+/// Spectrum of a filtered series that is padded to the length `total`.
 pub(crate) fn filtered_spectrum(series: &[f64], filter: Option<&SeriesFilter>, total: usize) -> Kernel {
     let mut spectrum = Kernel::with_length(series, total);
     if let Some(filter) = filter {

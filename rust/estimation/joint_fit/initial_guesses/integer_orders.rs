@@ -1,12 +1,13 @@
 //! Fit of equations of integer orders: initial guesses by refined instrumental variables (SRIVC) and from lower orders,
 //! then variable projection over the poles.
 //!
-//! State-variable filters 1/(s + λ)^n give first coefficients for several λ (Garnier & Young). Refined instrumental
-//! variables improve them: with the exact simulation x as instrument and y − x as residual, the step d of the
-//! coefficients of the denominator A solves Σ_t Ψ_i (y − x − Σ_j Φ_j d_j) = 0, Ψ_i = s^i/A x, Φ_j = s^j/A y. Other
-//! guesses add a pole or a pair of poles to the optimum of a lower order. The best guesses are refined in the
-//! logarithms of p and q of the second-order sections s² + p s + q. In these coordinates every point is stable. Poles
-//! above the Nyquist frequency are excluded by bounds.
+//! State-variable filters 1/(s + λ)^n yield first coefficients for several poles λ (Garnier & Young). Refined
+//! instrumental variables improve the coefficients. The instrument is the exact simulation x, and the residual is y − x
+//! with the measured output y. The step d of the coefficients of the denominator A solves Σ_t Ψ_i (y − x − Σ_j Φ_j d_j)
+//! = 0 for each i. Here Ψ_i = s^i/A x is an instrument and Φ_j = s^j/A y a regressor. Other guesses add a pole or a
+//! pair of poles to the optimum of a lower order. The best guesses are refined in the logarithms of p and q of the
+//! second-order sections s² + p s + q. In these coordinates every point is stable. Poles above the Nyquist frequency
+//! are excluded by bounds.
 
 use std::borrow::Cow;
 use std::f64::consts::PI;
@@ -33,71 +34,74 @@ use crate::signal::block_pulse::Intersample;
 use crate::signal::nonuniform::interpolate_gaps;
 use crate::signal::statistics::{inner, mean, median};
 
-/// Poles λ of the state-variable filters relative to the frequency that halves the power of the output.
+/// Poles λ of the state-variable filters, relative to the frequency below which half of the output power lies.
 const FILTER_RATIOS: [f64; 5] = [0.1, 0.3, 1.0, 3.0, 10.0];
-/// Poles added to an optimum of lower order, relative to the frequency that halves the power of the output.
+/// Magnitudes of poles added to an optimum of lower order, relative to the median frequency of the output power.
 const ADDED_POLE_RATIOS: [f64; 7] = [0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0];
 /// Damping ratio of an added pair of poles.
 const ADDED_PAIR_DAMPING: f64 = 0.05;
-/// Maximum number of steps of the instrumental variables.
+/// Maximum number of iterations of the refined instrumental variables.
 const INSTRUMENT_STEPS: usize = 8;
 /// Maximum number of halvings of a step that does not decrease the cost.
 const MAX_HALVINGS: usize = 5;
-/// Number of initial guesses that are refined.
+/// Maximum number of initial guesses that are refined.
 const CONTINUED_GUESSES: usize = 3;
 /// Maximum number of evaluations of each refined guess.
 const SECTION_EVALUATIONS: usize = 40;
-/// Relative difference of two costs below which they belong to the same optimum.
+/// Relative difference of two costs below which they are attributed to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
 const COST_TOLERANCE: f64 = 1e-8;
-/// Maximum of p/2 times the sampling interval, for a section s² + p s + q. `MAX_FREQUENCY_STEP` is the maximum of √q
-/// times the sampling interval. The samples do not determine faster real poles, nor pole pairs above the Nyquist
-/// frequency.
+/// Maximum of p/2 times the pulse width, for a section s² + p s + q.
+///
+/// The samples do not determine faster real poles, nor pole pairs above the Nyquist frequency.
 const MAX_DECAY_STEP: f64 = 1.0;
+/// Maximum of √q times the pulse width, for a section s² + p s + q.
 const MAX_FREQUENCY_STEP: f64 = PI;
-/// Minimum of the magnitude of a pole times the duration of the longest run.
+/// Minimum product of the magnitude of a pole and the duration of the longest run.
 const MIN_POLE_DURATION: f64 = 1e-4;
 /// Minimum damping ratio of an initial guess.
 const MIN_DAMPING: f64 = 1e-4;
-/// Minimum number of runs on which guesses are compared.
+/// Minimum number of runs on which initial guesses are compared, if there are as many.
 const MIN_RUNS: usize = 2;
-/// Number of delays for which guesses are refined.
+/// Maximum number of delays for which initial guesses are refined.
 const CONTINUED_DELAYS: usize = 3;
 
-/// Exact simulation at a point.
+/// Exact simulation at one parameter point, with its residuals.
 type Evaluation<'a> = evaluation::Evaluation<ExactSimulation<'a>>;
-/// Complex pole.
+/// Real and imaginary part of a pole \[rad/s\].
 type Pole = (f64, f64);
 
-/// One equation of integer orders, whose autoregressive coefficients are the coefficients of its denominator.
+/// One equation of integer orders. The coefficients of its denominator are free parameters.
 struct Equation<'a> {
     model: FreeModel,
     experiments: &'a [Experiment],
-    /// Index of the coefficient of each output derivative, in ascending order. Orders below the lowest are integrators.
+    /// Indices of the coefficients of the output derivatives, by ascending order of the derivative.
+    ///
+    /// The derivatives of lower order do not occur. Their number is `integrators`.
     own: Vec<usize>,
     integrators: usize,
     stop: &'a Stop,
-    /// Frequency \[rad/s\] that halves the power of the output.
+    /// Frequency \[rad/s\] below which half of the output power lies; median over the runs.
     frequency: f64,
-    /// Pulse width \[s\].
+    /// Shortest pulse width \[s\].
     step: f64,
     /// Duration of the longest run \[s\].
     duration: f64,
 }
 
-/// Initial guess with its cost.
+/// Initial guess with its cost and a description of its origin.
 struct Guess {
     cost: f64,
     point: ParameterPoint,
     origin: String,
 }
 
-/// Local optima of a problem of integer orders, best first; None for other problems.
+/// Return the local optima of a problem of integer orders, best first; None for other problems.
 ///
-/// Candidate k has the k-th optimum of every equation.
+/// Candidate k combines the k-th optimum of every equation. `delays` contains the initial guesses of the delays.
 ///
 /// # Errors
-/// [`Error::Interrupted`]; errors of the runs.
+/// An error if a run cannot be simulated. [`Error::Interrupted`] after a stop request.
 pub fn integer_order_optima(
     free: &ParameterSet,
     grid: &Objective<'_>,
@@ -126,7 +130,7 @@ pub fn integer_order_optima(
         if guesses.is_empty() {
             return Ok(None);
         }
-        // Optima of the equations are independent: the k-th candidate has the k-th optimum of each.
+        // Optima of different equations are independent, so the k-th candidate has the k-th optimum of each equation.
         for (k, guess) in guesses.into_iter().enumerate() {
             if i == 0 {
                 let place = Iterate { point: guess.point, states: Vec::new() };
@@ -142,10 +146,10 @@ pub fn integer_order_optima(
     Ok(Some(candidates))
 }
 
-/// Return the runs on which the guesses of an equation are compared: of many runs those with the most excitation.
+/// Return the runs with the most excitation, on which the guesses of an equation are compared.
 ///
-/// Each input in turn adds the run in which it varies most, until there are two runs and enough samples for a coarse
-/// fit. The optima on all runs start from these guesses.
+/// Each input in turn adds the run in which it varies most. This ends with at least two runs, one run per input, and
+/// enough samples for a coarse fit. The fit to all runs starts from the guesses of these runs.
 fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment]) -> Vec<&'a Experiment> {
     let mut inputs: Vec<usize> = equation.terms.iter().map(|(signal, ..)| *signal).collect();
     inputs.retain(|signal| *signal != equation.output);
@@ -182,7 +186,7 @@ fn representative_runs<'a>(equation: &FreeEquation, experiments: &'a [Experiment
     selection.into_iter().map(|run| &experiments[run]).collect()
 }
 
-/// Experiment of one output.
+/// Return the experiment with output `i` alone.
 fn single_output(experiment: &Experiment, i: usize) -> Experiment {
     let mut one = experiment.clone();
     one.samples = vec![experiment.samples[i].clone()];
@@ -192,7 +196,11 @@ fn single_output(experiment: &Experiment, i: usize) -> Experiment {
 }
 
 impl<'a> Equation<'a> {
-    /// Equation i of a model; None if an autoregressive coefficient is fixed or shared.
+    /// Return equation `i` of a model; None if its orders or coefficients are not of the required form.
+    ///
+    /// The orders must be integers. Each autoregressive coefficient must be a free parameter of its own, and input
+    /// terms must be linear in free parameters. None is also returned if the median frequency of the output power is
+    /// undefined.
     #[allow(clippy::cast_precision_loss)]
     fn new(model: &FreeModel, i: usize, experiments: &'a [Experiment], stop: &'a Stop) -> Option<Self> {
         let equation = &model.equations[i];
@@ -216,7 +224,7 @@ impl<'a> Equation<'a> {
         }
         let integrators = own.iter().position(Option::is_some).unwrap_or(order);
         let own: Vec<(usize, f64)> = own[integrators..].iter().copied().collect::<Option<_>>()?;
-        // Factors other than ±1 do not occur beside free coefficients of their own.
+        // An autoregressive coefficient must be the parameter itself.
         if own.iter().any(|(_, factor)| *factor != 1.0) {
             return None;
         }
@@ -237,12 +245,12 @@ impl<'a> Equation<'a> {
         self.integrators + self.own.len()
     }
 
-    /// Coefficients of the equation.
+    /// Indices of the free coefficients of the equation: those of the denominator, then the linear ones.
     fn coefficients(&self) -> Vec<usize> {
         self.own.iter().copied().chain(self.model.linear_coefficients()).collect()
     }
 
-    /// The same equation at a lower order, with the input terms that it can have.
+    /// Return the same equation at a lower order, without the input terms that exceed this order.
     #[allow(clippy::cast_precision_loss)]
     fn at_order(&self, order: usize) -> Self {
         let mut model = self.model.clone();
@@ -258,7 +266,7 @@ impl<'a> Equation<'a> {
         Self { model, own: self.own[..order - self.integrators].to_vec(), ..*self }
     }
 
-    /// Optima of the equation, best first.
+    /// Return the optima of the equation at the most likely delays, best first.
     fn optima(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Guess>> {
         let delays = self.likely_delays(start, delays)?;
         let mut lower: Vec<Vec<Vec<Pole>>> = vec![Vec::new(); delays.len()];
@@ -284,7 +292,9 @@ impl<'a> Equation<'a> {
         Ok(evaluations)
     }
 
-    /// Local minima of the cost of a second-order model over the delay, best first.
+    /// Return the delays at which a model with two poles and the integrators has the least cost, best first.
+    ///
+    /// At most [`CONTINUED_DELAYS`] delays are returned. If there are no more, all are returned unsorted.
     fn likely_delays(&self, start: &ParameterPoint, delays: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         if delays.len() <= CONTINUED_DELAYS {
             return Ok(if delays.is_empty() { vec![Vec::new()] } else { delays.to_vec() });
@@ -306,7 +316,7 @@ impl<'a> Equation<'a> {
         Ok(order.into_iter().take(CONTINUED_DELAYS).map(|i| delays[i].clone()).collect())
     }
 
-    /// Guesses by state-variable filters and refined instrumental variables.
+    /// Return guesses from state-variable filters and refined instrumental variables, at the delays of `start`.
     fn instrumental_variables(&self, start: &ParameterPoint) -> Result<Vec<Guess>> {
         let mut guesses = Vec::new();
         for ratio in FILTER_RATIOS {
@@ -327,7 +337,7 @@ impl<'a> Equation<'a> {
         Ok(guesses)
     }
 
-    /// Guesses with one real pole or one pair more than the optima of lower orders.
+    /// Return guesses with one real pole or one pair of poles added to the optima of lower orders, `lower`.
     fn with_added_poles(&self, start: &ParameterPoint, lower: &[Vec<Pole>]) -> Result<Vec<Guess>> {
         let mut guesses = Vec::new();
         for more in 1..=2_usize {
@@ -359,6 +369,8 @@ impl<'a> Equation<'a> {
     }
 
     /// Refine the best distinct guesses by variable projection over their second-order sections.
+    ///
+    /// Return them in ascending order of cost. Unstable guesses are returned without refinement.
     fn refine(&self, mut guesses: Vec<Guess>) -> Result<Vec<Guess>> {
         guesses.retain(|guess| guess.cost.is_finite());
         guesses.sort_by(|a, b| a.cost.total_cmp(&b.cost));
@@ -393,7 +405,7 @@ impl<'a> Equation<'a> {
         Ok(ends)
     }
 
-    /// Simulation at a point with its best input coefficients; None if it is not finite.
+    /// Simulate at a point with the optimal input coefficients. Return None if the simulation is not finite.
     fn evaluate(&self, point: &ParameterPoint) -> Result<Option<Evaluation<'a>>> {
         self.stop.check()?;
         let Some(exact) = IntegerOrders::of(&self.model, self.experiments, point) else { return Ok(None) };
@@ -401,13 +413,13 @@ impl<'a> Equation<'a> {
         Ok(exact.evaluate(&self.model, self.experiments, point, &linear).ok().filter(|e| cost(e).is_finite()))
     }
 
-    /// Coefficients of s^0 … s^(n − 1) of the denominator.
+    /// Coefficients of s^0, …, s^(n − 1) of the monic denominator of degree n.
     fn divisor(&self, point: &ParameterPoint) -> Vec<f64> {
         let own = self.own.iter().map(|&j| -point.coefficients[j]);
         std::iter::repeat_n(0.0, self.integrators).chain(own).collect()
     }
 
-    /// Poles without the integrators.
+    /// Poles without the integrators; empty if they are not found.
     fn poles(&self, point: &ParameterPoint) -> Vec<Pole> {
         let mut divisor = self.divisor(point)[self.integrators..].to_vec();
         divisor.push(1.0);
@@ -427,7 +439,7 @@ impl<'a> Equation<'a> {
         mirrored
     }
 
-    /// Point with unstable poles reflected at the imaginary axis and fast poles moved below the Nyquist frequency.
+    /// Return the point with unstable poles reflected at the imaginary axis and fast poles below the Nyquist frequency.
     fn stabilize(&self, point: &ParameterPoint) -> ParameterPoint {
         let (fastest, slowest) = (MAX_FREQUENCY_STEP / self.step, MIN_POLE_DURATION / self.duration);
         let poles = self.poles(point);
@@ -443,7 +455,7 @@ impl<'a> Equation<'a> {
         self.at_poles(point, &poles.into_iter().map(within).collect::<Vec<_>>())
     }
 
-    /// Return ln p and ln q of each section s² + p s + q, then the logarithm of the remaining real pole.
+    /// Return ln p and ln q of each section s² + p s + q, then the log magnitude of the remaining real pole, if any.
     fn sections(&self, poles: &[Pole]) -> Vec<f64> {
         let slowest = MIN_POLE_DURATION / self.duration;
         let mut real: Vec<f64> = poles.iter().filter(|(_, im)| *im == 0.0).map(|(re, _)| (-re).max(slowest)).collect();
@@ -460,7 +472,11 @@ impl<'a> Equation<'a> {
         out
     }
 
-    /// Point from filtered samples by least squares: [s^n/F] y = Σ a_i [s^i/F] y + Σ b_j [s^j/F] u, F = (s + λ)^n.
+    /// Estimate the coefficients by least squares on samples that pass state-variable filters.
+    ///
+    /// The regression is [s^n/F] y = Σ a_i [s^i/F] y + Σ b_j [s^j/F] u for output y and inputs u. The filter is F = (s
+    /// + λ)^n with λ = `corner` \[rad/s\]. Return None if a filtered signal is not finite or the coefficients are not
+    /// determined.
     #[allow(clippy::type_complexity)]
     fn filtered_least_squares(&self, start: &ParameterPoint, corner: f64) -> Result<Option<ParameterPoint>> {
         self.stop.check()?;
@@ -525,7 +541,7 @@ impl<'a> Equation<'a> {
         Ok(Some(point))
     }
 
-    /// Improve a point by refined instrumental variables; None if it has no finite simulation.
+    /// Improve a point by refined instrumental variables. Return None if the simulation at `start` is not finite.
     fn refine_instruments(&self, start: &ParameterPoint) -> Result<Option<Evaluation<'a>>> {
         let Some(mut iterate) = self.evaluate(start)? else { return Ok(None) };
         for _ in 0..INSTRUMENT_STEPS {
@@ -552,7 +568,9 @@ impl<'a> Equation<'a> {
         Ok(Some(iterate))
     }
 
-    /// Step of the autoregressive coefficients with the simulation as instrument; None if it is not determined.
+    /// Return the step of the autoregressive coefficients, with the simulation as instrument.
+    ///
+    /// None if the system of linear equations is singular.
     fn instrument_step(&self, evaluation: &Evaluation<'a>) -> Result<Option<Vec<f64>>> {
         let Some(exact) = IntegerOrders::of(&self.model, self.experiments, &evaluation.point) else { return Ok(None) };
         let linear = self.model.linear_coefficients();
@@ -578,7 +596,7 @@ impl<'a> Equation<'a> {
         let k = places.len();
         let (mut cross, mut right) = (vec![0.0; k * k], vec![0.0; k]);
         for (a, &instrument) in places.iter().enumerate() {
-            // The Jacobian is that of the residuals, measured minus simulated samples.
+            // The Jacobian is the derivative of the residuals, which are measured minus simulated samples.
             right[a] = -inner(&jacobian[instrument], &evaluation.residuals);
             for b in 0..k {
                 cross[a * k + b] = match regressors.get(b) {
@@ -593,7 +611,7 @@ impl<'a> Equation<'a> {
     }
 }
 
-/// Samples of the only output, with gaps interpolated.
+/// Samples of the only output, with missing samples interpolated.
 fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
     let samples = &experiment.samples[0];
     let Some(weights) = experiment.sample_weights.first().filter(|w| w.contains(&0.0)) else {
@@ -611,12 +629,12 @@ fn output_samples(experiment: &Experiment) -> Cow<'_, [f64]> {
     Cow::Owned(interpolate_gaps(&marked).into_owned())
 }
 
-/// The measured output as input of a filter, linear between samples.
+/// Measured output as input of a filter, linear between samples.
 fn measured_input(experiment: &Experiment) -> SourceInput<'_> {
     SourceInput { samples: output_samples(experiment), between: Intersample::Linear, delay: 0.0, before: 0.0 }
 }
 
-/// Integer from a fixed order.
+/// Return an order as an integer; None if it is negative, not an integer, or depends on a free order.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn integer(order: &AffineOrder) -> Option<usize> {
     let nearest = order.constant.round();
@@ -629,7 +647,7 @@ fn cost(evaluation: &Evaluation<'_>) -> f64 {
     0.5 * inner(&evaluation.residuals, &evaluation.residuals)
 }
 
-/// Coefficients of s^0 … s^(n − 1) of the monic real polynomial with these zeros.
+/// Coefficients of s^0, …, s^(n − 1) of the monic real polynomial with the n given zeros.
 fn polynomial(zeros: &[Pole]) -> Vec<f64> {
     let mut product = vec![1.0];
     for &(re, im) in zeros {
@@ -653,7 +671,7 @@ fn multiply(a: &[f64], b: &[f64]) -> Vec<f64> {
     product
 }
 
-/// Least squares over the logarithms of the sections and the delays.
+/// Least-squares problem over the logarithms of the section coefficients, and over the delays.
 struct SectionsProblem<'e, 'a> {
     equation: &'e Equation<'a>,
     exact: IntegerOrders,
@@ -662,7 +680,9 @@ struct SectionsProblem<'e, 'a> {
 }
 
 impl SectionsProblem<'_, '_> {
-    /// Sections as polynomials with the derivatives of their coefficients with respect to their logarithms.
+    /// Return the sections as polynomials, and their derivatives with respect to the logarithms of the coefficients.
+    ///
+    /// Coefficients are in ascending order of the power.
     fn factors(&self, sections: &[f64]) -> Vec<(Vec<f64>, Vec<Vec<f64>>)> {
         let pair = |c: &[f64]| match c {
             [p, q] => (vec![q.exp(), p.exp(), 1.0], vec![vec![0.0, p.exp()], vec![q.exp()]]),

@@ -26,17 +26,18 @@ use crate::regressors::Record;
 use crate::signal::block_pulse::Intersample;
 use crate::signal::statistics::median;
 
-/// Maximum number of block pulses of the records for initial guesses.
+/// Maximum number of block pulses of each record from which initial guesses are computed.
 const MAX_START_PULSES: usize = 1024;
-/// Cutoff frequencies of the prefilters relative to the bandwidth of the outputs; None for no prefilter.
+/// Cutoff frequencies of the prefilters, relative to the bandwidth of the outputs; None for no prefilter.
 const PREFILTER_CUTOFF_RATIOS: [Option<f64>; 2] = [Some(2.0), None];
-/// Cutoff frequencies of structures with an order law. Their equation errors have several minima, which depend on the
-/// cutoff.
+/// Cutoff frequencies for structures with an order law, relative to the bandwidth of the outputs.
+///
+/// The equation error of such a structure has several minima, which depend on the cutoff.
 const PREFILTER_CUTOFF_RATIOS_BY_LAW: [Option<f64>; 5] = [Some(1.0), Some(2.0), Some(4.0), Some(8.0), None];
-/// Difference below which two orders are equal.
+/// Difference below which two orders count as equal.
 const ORDER_TOLERANCE: f64 = 1e-9;
 
-/// Initial guesses from coarse order grids, by least squares on records of the runs.
+/// Source of initial guesses from coarse order grids, by least squares on block-pulse records of the runs.
 pub struct OrderGrids<'a> {
     source: &'a Recordings,
     threads: usize,
@@ -46,17 +47,18 @@ pub struct OrderGrids<'a> {
 }
 
 impl<'a> OrderGrids<'a> {
-    /// Order grids on the given runs, with the number of threads and bytes of memory per search.
+    /// Return order grids on the given runs, with the number of threads and the bytes of memory per search.
     #[must_use]
     pub fn new(source: &'a Recordings, threads: usize, memory: u64, stop: &'a Stop) -> Self {
         Self { source, threads, memory, stop, low_passes: LowPassCache::default() }
     }
 
-    /// Initial guesses of a problem on the runs, at several delays and limits if these are free.
+    /// Return initial guesses of a parameter set, at several delays and limits if these are free.
     ///
     /// # Errors
     /// [`Error::Structure`] for a zero-order-hold input with an order above that of its equation, for friction, and for
-    /// duplicate terms; [`Error::EmptyOrderGrid`], [`Error::Interrupted`]; errors of the source and of a search.
+    /// duplicate terms. [`Error::EmptyOrderGrid`] if no grid point satisfies the constraints. [`Error::Interrupted`]
+    /// after a stop request. An error also if the runs have no block-pulse records or if a grid search fails.
     pub fn candidates(&self, free: &ParameterSet) -> Result<Vec<Candidate>> {
         let frequencies = self.frequencies(free)?;
         if free.structure.inputs.is_empty() {
@@ -74,7 +76,7 @@ impl<'a> OrderGrids<'a> {
         Ok(attempts)
     }
 
-    /// Bandwidth \[rad/s\] of the output of each equation, by run.
+    /// Bandwidth \[rad/s\] of the output of each equation, indexed by equation and run.
     fn frequencies(&self, free: &ParameterSet) -> Result<Vec<Vec<f64>>> {
         let spans = self.source.spans();
         let of = |output: usize| {
@@ -85,17 +87,17 @@ impl<'a> OrderGrids<'a> {
         free.structure.equations.iter().map(|e| of(e.output)).collect()
     }
 
-    /// Number of pulses of the records, limited by the shortest run.
+    /// Number of block pulses per record, limited by the samples of the shortest run.
     fn pulse_count(&self, free: &ParameterSet) -> Result<usize> {
         let output = free.structure.equations.first().map_or(0, |e| e.output);
         let shortest = self.source.samples(output)?.iter().map(|run| run.len()).min().unwrap_or(0);
         Ok(MAX_START_PULSES.min(shortest.saturating_sub(1)))
     }
 
-    /// Candidates from order grids on prefiltered records, at given values of the free input parameters.
+    /// Return candidates from order grids on prefiltered records, at given values of the free input parameters.
     ///
-    /// All signals pass the prefilter, which commutes with the equation. The true coefficients are unchanged, while
-    /// noise above the bandwidth is removed.
+    /// All signals pass the prefilter, which commutes with the equation. The true coefficients are therefore unchanged,
+    /// while noise above the bandwidth is removed.
     fn candidates_at_inputs(
         &self,
         free: &ParameterSet,
@@ -151,7 +153,9 @@ impl<'a> OrderGrids<'a> {
         records.iter().map(|record| self.low_passes.filter_record(record, corner)).collect()
     }
 
-    /// Reject a zero-order-hold input whose order exceeds the order of its equation: jumps have no derivative.
+    /// Return [`Error::Structure`] if the order of a zero-order-hold input exceeds that of its equation.
+    ///
+    /// The jumps of such an input have no derivative.
     fn check_hold_orders(&self, free: &ParameterSet) -> Result<()> {
         let (inputs, signals) = (self.source.inputs(), &free.structure.signals);
         for item in free.structure.equations.iter().filter(|e| !e.order.is_free()) {
@@ -189,18 +193,19 @@ impl InitialGuessSource for OrderGrids<'_> {
     }
 }
 
-/// Maximum phase difference at the output's bandwidth between neighboring initial guesses of a delay \[rad\]. There are
-/// at most [`MAX_DELAY_STARTS`] combinations over all inputs with free parameters.
+/// Maximum phase difference \[rad\] between adjacent initial guesses of a delay, at the bandwidth of the outputs.
 const MAX_DELAY_PHASE_RAD: f64 = 1.0;
+/// Maximum number of combinations of initial guesses over all inputs with free parameters.
 const MAX_DELAY_STARTS: f64 = 12.0;
-/// Number of initial guesses of a saturation or dead zone, from [`MIN_LIMIT_RATIO`] of the largest input upwards.
+/// Maximum number of initial guesses of a saturation or dead zone.
 const MAX_LIMIT_STARTS: usize = 4;
+/// Least initial guess of a saturation or dead zone, relative to the largest input magnitude.
 const MIN_LIMIT_RATIO: f64 = 0.1;
 
-/// Initial guesses of free delays and limits, each with a description.
+/// Return initial guesses of the free delays and limits, each with a description.
 ///
-/// From a poor guess of the delay a fit converges to a local optimum shifted by one period of an oscillation. A limit
-/// above all samples has no effect.
+/// `fastest` is the highest bandwidth \[rad/s\] of an output. From a poor guess of the delay, a fit converges to a
+/// local optimum that is shifted by one period of an oscillation. A limit above all samples has no effect.
 pub(super) fn input_points(free: &ParameterSet, source: &Recordings, fastest: f64) -> Result<Vec<(Vec<f64>, String)>> {
     let inputs = &free.structure.inputs;
     let axes = inputs.iter().map(|item| input_axis(item, inputs.len(), source, fastest)).collect::<Result<Vec<_>>>()?;
@@ -232,7 +237,7 @@ fn input_axis(item: &Input, count: usize, source: &Recordings, fastest: f64) -> 
     Ok(values)
 }
 
-/// Description of an initial guess.
+/// Describe the initial guess of a delay or limit as text.
 fn describe_input(item: &Input, value: f64) -> String {
     match item.free.law {
         InputLaw::Delay => format!("delay {} ms", format_general(1e3 * value, 3)),

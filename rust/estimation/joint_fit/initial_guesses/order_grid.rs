@@ -1,4 +1,4 @@
-//! Coarse order grids and the least-squares coefficients at their best points.
+//! Coarse order grids, and least-squares coefficients at their best points.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,23 +18,23 @@ use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::signal::statistics::mean;
 
-/// Row of an order grid: orders and unconstrained coefficient estimates, by name.
+/// Result of an order grid at one point: orders and unconstrained coefficient estimates, by name.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct GridRow {
-    /// Orders, in the sequence of the axes.
+    /// Orders by name, in the sequence of the axes.
     pub orders: Vec<(String, f64)>,
-    /// Coefficients.
+    /// Coefficients by name.
     pub coefficients: BTreeMap<String, f64>,
 }
 
 impl GridRow {
-    /// Values of the orders with these names.
+    /// Return the orders with the given names; NaN for a name without an order.
     pub(super) fn values(&self, names: &[String]) -> Vec<f64> {
         let value = |name: &String| self.orders.iter().find(|(n, _)| n == name).map_or(f64::NAN, |(_, value)| *value);
         names.iter().map(value).collect()
     }
 
-    /// Merge the orders and coefficients of another row into this one.
+    /// Merge the orders and coefficients of another row into this one. Values of the other row take precedence.
     fn merge(&mut self, other: &Self) {
         for (name, value) in &other.orders {
             match self.orders.iter_mut().find(|(n, _)| n == name) {
@@ -49,9 +49,9 @@ impl GridRow {
 /// Settings of the least-squares search of coarse order grids.
 #[derive(Clone, Copy)]
 pub(super) struct GridSearch<'a> {
-    /// Records of the search.
+    /// Block-pulse records that are fitted.
     pub records: &'a [Record],
-    /// True for signals that are inputs.
+    /// One flag per signal; true if it is an input.
     pub inputs: &'a [bool],
     /// Initial terms of each record.
     pub initial: &'a Initial,
@@ -64,12 +64,12 @@ pub(super) struct GridSearch<'a> {
 }
 
 impl GridSearch<'_> {
-    /// Search on other records.
+    /// Return the same search on other records.
     pub(super) fn with_records<'b>(&'b self, records: &'b [Record]) -> GridSearch<'b> {
         GridSearch { records, ..*self }
     }
 
-    /// Best rows of a coarse order grid by least squares, at most `keep`.
+    /// Return the best rows of a coarse order grid by least squares, at most `keep`.
     pub(super) fn best_rows(&self, structure: &ParametricStructure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
         if !structure.has_order_law() {
             let tables: Result<Vec<_>> =
@@ -98,7 +98,7 @@ impl GridSearch<'_> {
         Control { stop: self.stop.clone(), ..Control::default() }
     }
 
-    /// Best rows of coupled equations with an order law.
+    /// Return the best rows of coupled equations with an order law, at most `keep`.
     #[allow(clippy::cast_precision_loss)]
     fn search_coupled(&self, structure: &ParametricStructure, axes: &Axes, keep: usize) -> Result<Vec<GridRow>> {
         let (names, along): (Vec<String>, Vec<Vec<f64>>) = axes.iter().cloned().unzip();
@@ -124,7 +124,7 @@ impl GridSearch<'_> {
         Ok(result.rows.into_iter().map(row).collect())
     }
 
-    /// Best rows of one equation with independent free orders.
+    /// Return the best rows of one equation with independent free orders, at most `keep`.
     fn search_equation(
         &self,
         structure: &ParametricStructure,
@@ -160,7 +160,9 @@ impl GridSearch<'_> {
     }
 }
 
-/// Combine rows of independent tables rank by rank; a shorter table repeats its last row.
+/// Combine the rows of independent tables with the same rank; a shorter table repeats its last row.
+///
+/// Combined rows that lack a coefficient are omitted.
 pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &ParametricStructure) -> Vec<GridRow> {
     let count = structure.coefficient_names().len();
     let merged = |rank: usize| {
@@ -172,7 +174,7 @@ pub(super) fn merge_tables(tables: &[Vec<GridRow>], structure: &ParametricStruct
     (0..ranks).map(merged).filter(|row| row.coefficients.len() == count).collect()
 }
 
-/// Free coefficients by name, from products of factor and coefficient.
+/// Return the free coefficients by name, from the products of factor and coefficient of all terms.
 pub(super) fn named_coefficients<'a>(
     item: &'a ParametricEquation,
     raw: &'a [f64],
@@ -181,12 +183,12 @@ pub(super) fn named_coefficients<'a>(
     pairs.filter_map(|(term, c)| Some((term.coefficient.name()?.clone(), c / term.factor)))
 }
 
-/// Products of factor and coefficient of the fixed terms; None for free ones.
+/// Return the product of factor and coefficient of each term; None if the coefficient is free.
 pub(super) fn fixed_coefficients(item: &ParametricEquation) -> Vec<Option<f64>> {
     item.terms.iter().map(ParametricTerm::fixed_coefficient).collect()
 }
 
-/// Reject friction in methods that are linear in the coefficients.
+/// Return [`Error::Structure`] if an equation has friction, which the method `what` does not support.
 pub(super) fn check_linear(structure: &ParametricStructure, item: &ParametricEquation, what: &str) -> Result<()> {
     if item.friction.is_none() {
         return Ok(());
@@ -198,10 +200,10 @@ pub(super) fn check_linear(structure: &ParametricStructure, item: &ParametricEqu
     })
 }
 
-/// Replace signal numbers by names in error messages.
+/// Replace signal numbers by signal names in an error message.
 fn name_signals(error: Error, signals: &[String]) -> Error {
     let named = |mut text: String| {
-        // Descending, so that no number is a prefix of another.
+        // In descending order, because the text of a number may be a prefix of a larger number.
         for (i, signal) in signals.iter().enumerate().rev() {
             text = text.replace(&format!("signal {i}"), &format!("signal '{signal}'"));
         }
@@ -221,20 +223,23 @@ fn standard_deviation(values: &[f64]) -> f64 {
     mean(&squares).sqrt()
 }
 
-/// Number of best rows of an order grid for which the coefficients are computed by a coefficient law.
+/// Number of best rows of an order grid whose coefficients are computed by a coefficient law.
 const ROWS_BY_LAW: usize = 4;
 /// Maximum number of initial guesses from one order grid under an order law.
 const MAX_GUESSES_UNDER_ORDER_LAW: usize = 8;
 /// Number of best rows of an order grid from which the initial guesses under an order law are chosen.
 const ROWS_UNDER_ORDER_LAW: usize = 4000;
-/// Minimum difference in at least one order between two initial guesses: more than one increment of the grid.
+/// Minimum difference in at least one order between two initial guesses; larger than one increment of the grid.
 const MIN_ORDER_SEPARATION: f64 = 0.35;
-/// Trial ratios of a coefficient law. At a fixed ratio the coefficients of one equation follow from another equation.
+/// Trial values of the other factors of a coefficient law.
+///
+/// A coefficient law is a product of factors. At fixed other factors, a coefficient follows from one in another
+/// equation.
 const LAW_RATIOS: [f64; 3] = [0.25, 1.0, 4.0];
-/// Absolute and relative difference below which two orders are equal.
+/// Absolute and relative difference below which two orders count as equal.
 const ORDER_TOLERANCES: (f64, f64) = (1e-9, 1e-5);
 
-/// Candidate from orders and coefficients.
+/// Candidate at the given orders and coefficients, without input parameters.
 pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &str) -> Candidate {
     Candidate::at(
         Iterate { point: ParameterPoint { orders, coefficients, inputs: Vec::new() }, states: Vec::new() },
@@ -242,11 +247,11 @@ pub(super) fn new_candidate(orders: Vec<f64>, coefficients: Vec<f64>, origin: &s
     )
 }
 
-/// Initial guesses from the best rows of an order grid.
+/// Return initial guesses from the best rows of an order grid.
 ///
-/// Without an order law the only guess is the best row. The equation error under an order law has several minima, so
-/// several rows are returned. Each differs from every better row in at least one order. A row with the orders of a
-/// guess in `before` is omitted, but counts toward the maximum number.
+/// Without an order law, the only guess is the best row. Under an order law the equation error has several minima, so
+/// several rows are returned. Each row differs from every better one by [`MIN_ORDER_SEPARATION`] in at least one order.
+/// A row with the orders of a guess in `before` is omitted, but counts toward the maximum number.
 pub(super) fn grid_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
@@ -279,12 +284,12 @@ fn are_orders_close(values: &[f64], others: &[f64]) -> bool {
     values.iter().zip(others).all(|(a, b)| (a - b).abs() <= ORDER_TOLERANCES.0 + ORDER_TOLERANCES.1 * b.abs())
 }
 
-/// Candidates in which the coefficients of one equation follow from another by the coefficient law, the rest by least
-/// squares.
+/// Return candidates in which the coefficients of one equation follow from another one by the coefficient law.
 ///
-/// The motor hub of a flexible arm is overdamped: current and friction nearly cancel, and the link equation explains
-/// the rest of the acceleration equally well. An unconstrained estimate of the hub equation then converges to the link
-/// equation with the sign of the stiffness reversed.
+/// The other coefficients are estimated by least squares. An example is the motor hub of a flexible arm, which is
+/// overdamped. Current and friction nearly cancel, and the link equation explains the rest of the acceleration equally
+/// well. An unconstrained estimate of the hub equation then converges to the link equation with the sign of the
+/// stiffness reversed.
 pub(super) fn law_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
@@ -334,21 +339,21 @@ pub(super) fn law_candidates(
     Ok(attempts)
 }
 
-/// Increment of the order grid of the initial guesses. A fit from within half an increment converges to the optimum.
+/// Increment of the orders in the grid of initial guesses. A fit that starts within half an increment converges.
 const START_INCREMENT: f64 = 0.2;
-/// Number of grid points above which the orders of other signals get fewer values.
+/// Number of grid points of an equation above which the orders of its input terms get fewer values.
 const MAX_START_CANDIDATES: u128 = 200_000;
-/// Lower end of the typical interval of highest orders without prior knowledge.
+/// Lower end of the interval of the highest orders if there is no prior knowledge.
 const MIN_TYPICAL_ORDER: f64 = 0.2;
-/// Maximum initial guess of the order of a term below the highest derivative.
+/// Maximum initial guess of an order other than the highest order of an equation.
 const MAX_LOWER_TERM_ORDER: f64 = 2.0;
-/// Inverse of the resolution to which orders are rounded.
+/// Number of steps per unit of order to which grid values are rounded.
 const ROUNDING_STEPS_PER_ORDER: f64 = 1e9;
 
-/// Values of free orders, by name.
+/// Grid values of the free orders, by name.
 pub(super) type Axes = Vec<(String, Vec<f64>)>;
 
-/// Coarse grid of the free orders within their bounds.
+/// Return the coarse grid of the free orders within their bounds.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn start_axes(free: &ParameterSet) -> Axes {
     let equations = &free.structure.equations;
@@ -370,7 +375,7 @@ pub(super) fn start_axes(free: &ParameterSet) -> Axes {
         (name.clone(), values)
     };
     let mut axes: Axes = free.orders.iter().zip(free.bounds()).map(axis).collect();
-    // The orders of other signals affect the location of the optimum less than the autoregressive orders.
+    // The orders of input terms affect the location of the optimum less than the autoregressive orders.
     let driving: BTreeSet<&String> = equations
         .iter()
         .flat_map(|e| e.input_terms().flat_map(|term| term.order.names()))
@@ -389,7 +394,7 @@ pub(super) fn start_axes(free: &ParameterSet) -> Axes {
     axes
 }
 
-/// Small grid of the typical orders of a structure; None if no typical orders are known.
+/// Return a small grid of the typical orders of a structure; None if an order has no typical value.
 pub(super) fn natural_axes(free: &ParameterSet) -> Option<Axes> {
     let natural = &free.structure.hints.natural;
     let axis = |(name, &(low, high)): (&String, &(f64, f64))| {
@@ -401,7 +406,7 @@ pub(super) fn natural_axes(free: &ParameterSet) -> Option<Axes> {
     (!natural.is_empty()).then_some(axes)
 }
 
-/// Evenly spaced values including both exact ends.
+/// Return `count` evenly spaced values including both exact ends.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn linspace(low: f64, high: f64, count: usize) -> Vec<f64> {
     let intervals = count.saturating_sub(1);
@@ -410,7 +415,7 @@ pub(super) fn linspace(low: f64, high: f64, count: usize) -> Vec<f64> {
     (0..count).map(value).collect()
 }
 
-/// Values of an order; empty if it is not in the grid.
+/// Return the grid values of an order; empty if it is not in the grid.
 pub(super) fn axis_values<'a>(axes: &'a Axes, name: &str) -> &'a [f64] {
     axes.iter().find(|(n, _)| n == name).map_or(&[], |(_, values)| values)
 }

@@ -13,15 +13,17 @@ use crate::signal::statistics::{mean, sum};
 /// Maximum number of cached low-pass filters.
 const MAX_CACHED_LOW_PASSES: usize = 32;
 
-/// Key of a cached low-pass: bits of the cutoff frequency, number of pulses, bits of the pulse width.
+/// Key of a cached low-pass filter: bits of the cutoff frequency, number of pulses, bits of the pulse width.
 type LowPassKey = (u64, usize, u64);
 
-/// Cache of second-order low-pass series, shared by all problems of a multistart.
+/// Cache of the series of second-order low-pass filters, shared by all problems of a multistart.
 #[derive(Debug, Default)]
 pub(super) struct LowPassCache(Mutex<Vec<(LowPassKey, Arc<Vec<f64>>)>>);
 
 impl LowPassCache {
-    /// Filter all signals and the initial terms of a record by a low-pass with the cutoff frequency `corner` \[rad/s\].
+    /// Return the record with its signals and initial terms filtered by a low-pass filter.
+    ///
+    /// The cutoff frequency is `corner` \[rad/s\]. Without one, the result is a copy of the record.
     pub(super) fn filter_record(&self, record: &Record, corner: Option<f64>) -> Result<Record> {
         let m = record.m();
         let low_pass = corner.map(|corner| self.low_pass_series(corner, m, record.step())).transpose()?;
@@ -38,7 +40,9 @@ impl LowPassCache {
         Record::from_rows(record.step(), signals.map(|s| series::multiply(&low_pass, s, m)).collect(), Some(filter))
     }
 
-    /// Series of a second-order low-pass of cutoff frequency `omega` \[rad/s\].
+    /// Return the series of a second-order low-pass filter with cutoff frequency `omega` \[rad/s\].
+    ///
+    /// The series has `m` pulses of width `step` \[s\].
     fn low_pass_series(&self, omega: f64, m: usize, step: f64) -> Result<Arc<Vec<f64>>> {
         let key = (omega.to_bits(), m, step.to_bits());
         {
@@ -62,11 +66,13 @@ impl LowPassCache {
     }
 }
 
-/// Share of the power below the bandwidth of a signal.
+/// Fraction of the power of a signal that lies below its bandwidth.
 const POWER_SHARE: f64 = 0.9;
 
-/// Bandwidth \[rad/s\] that contains 90 % of the power of samples with the sampling interval `step` \[s\]; NaN without
-/// samples. O(N log N).
+/// Bandwidth \[rad/s\] of a signal: the frequency below which 90 % of its power lies.
+///
+/// `step` is the sampling interval \[s\]. Missing samples (NaN) are interpolated. The result is NaN without samples.
+/// The cost is O(N log N) for N samples.
 ///
 /// ```
 /// use ftlm::estimation::joint_fit::initial_guesses::power_frequency;
@@ -80,7 +86,7 @@ pub fn power_frequency(samples: &[f64], step: f64) -> f64 {
     power_share_frequency(samples, step, POWER_SHARE)
 }
 
-/// Frequency \[rad/s\] below which this share of the power of samples lies.
+/// Frequency \[rad/s\] below which the fraction `share` of the power of the samples lies.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn power_share_frequency(samples: &[f64], step: f64, share: f64) -> f64 {
     let count = samples.len();
@@ -108,7 +114,7 @@ pub(super) fn power_share_frequency(samples: &[f64], step: f64, share: f64) -> f
     2.0 * PI * at.max(1) as f64 / (count as f64 * step)
 }
 
-/// Interpolate missing samples linearly, with the nearest value at the ends.
+/// Return the samples with missing ones (NaN) interpolated linearly, and with the nearest value at the ends.
 #[allow(clippy::cast_precision_loss)]
 fn interpolate_gaps(samples: &[f64]) -> Vec<f64> {
     let mut out = samples.to_vec();

@@ -1,9 +1,9 @@
-//! Initial guesses from a scan over the resonance frequency. With fixed autoregressive terms the output error is linear
-//! in the other coefficients.
+//! Initial guesses from a scan over the resonance frequency.
 //!
 //! With feedback between signals or autocorrelated residuals, equation-error least squares does not identify the
-//! autoregressive terms. Here the autoregressive terms are placed on a grid of frequencies and damping ratios. All
-//! other coefficients and the initial terms follow by linear least squares on the output error.
+//! autoregressive terms. Here the autoregressive terms are fixed at points of a grid of frequencies and damping ratios.
+//! The output error is then linear in all other coefficients and in the initial terms. These follow by linear least
+//! squares.
 
 use std::collections::BTreeMap;
 
@@ -35,16 +35,17 @@ const FREQUENCY_RATIOS: [f64; 14] = [
     5.891_744_851_769_920_5,
     8.0,
 ];
-/// Damping ratios of the scan over resonance frequencies.
+/// Damping ratios of the scan.
 const DAMPING_RATIOS: [f64; 4] = [0.03, 0.15, 0.5, 1.0];
 /// Maximum number of points of a scan that become candidates.
 const MAX_SCAN_CANDIDATES: usize = 4;
-/// Difference below which two exponents of t are equal.
+/// Difference below which two exponents of t count as equal.
 const EXPONENT_TOLERANCE: f64 = 1e-9;
 
-/// Candidates from a scan over frequency and damping, at integer orders and at the best orders of the grid.
+/// Return candidates from a scan over frequency and damping, at integer orders and at the best orders of the grid.
 ///
-/// `frequencies` are the bandwidths of the output of each equation, by run.
+/// `frequencies` are the bandwidths \[rad/s\] of the output of each equation, by run. The first of `attempts` has the
+/// best orders of the grid. The result is empty for a structure with an order law or a coefficient law.
 pub(super) fn scan_candidates(
     free: &ParameterSet,
     coarse: &GridSearch<'_>,
@@ -60,7 +61,7 @@ pub(super) fn scan_candidates(
     let mut out = Vec::new();
     for values in points {
         let point: BTreeMap<String, f64> = free.orders.iter().cloned().zip(values.iter().copied()).collect();
-        // Integer orders that coincide at the bounds give no valid equation.
+        // Integer orders that coincide after they are limited to their bounds give no valid equation.
         let Ok(fixed) = structure.with_orders(&point) else { continue };
         if has_duplicate_offset(&fixed) {
             continue;
@@ -91,7 +92,10 @@ fn has_duplicate_offset(fixed: &ParametricStructure) -> bool {
         .any(|power| exponents.iter().any(|e| (power - e).abs() < EXPONENT_TOLERANCE))
 }
 
-/// Autoregressive coefficients of D^alpha y = -2 zeta w^(alpha - nu) D^nu y - w^alpha y; None if any is fixed.
+/// Return the autoregressive coefficients, by name, of a resonance at the frequency `omega` \[rad/s\].
+///
+/// The equation is D^α y = −2 ζ ω^(α − ν) D^ν y − ω^α y with damping ratio ζ. Several terms D^ν y share the damping
+/// equally. Return None if a coefficient is fixed or there is no autoregressive term.
 #[allow(clippy::cast_precision_loss)]
 fn resonance_coefficients(item: &ParametricEquation, omega: f64, damping: f64) -> Option<Vec<(String, f64)>> {
     let mut own: Vec<(usize, &ParametricTerm)> = item.autoregressive_terms().enumerate().collect();
@@ -106,9 +110,9 @@ fn resonance_coefficients(item: &ParametricEquation, omega: f64, damping: f64) -
     Some(out).filter(|out| !out.is_empty())
 }
 
-/// Best points of the scan of one equation with fixed orders, with the best damping of each frequency.
+/// Return the best points of the scan of one equation with fixed orders, sorted by root-mean-square output error.
 ///
-/// The scan is relative to `frequency` \[rad/s\]. Points are sorted by their root mean square output error.
+/// Each point has the best damping ratio of its frequency. The frequencies are relative to `frequency` \[rad/s\].
 fn scan_equation(
     structure: &ParametricStructure,
     item: &ParametricEquation,
@@ -145,7 +149,7 @@ fn scan_equation(
     for (evaluations, candidates) in
         evaluations.chunks(DAMPING_RATIOS.len()).zip(candidates.chunks(DAMPING_RATIOS.len()))
     {
-        // Missing points are too fast for the step, or have collinear regressors.
+        // A point without a result is too fast for the step, or has collinear regressors.
         let finite_evaluations =
             evaluations.iter().zip(candidates).filter_map(|(at, values)| Some((at.as_ref()?, values)));
         let finite_evaluations = finite_evaluations.filter(|(at, _)| at.error.is_finite());

@@ -1,4 +1,4 @@
-//! Coarse grid of the multistart: subsampled records on which candidates compete.
+//! Coarse grid of the multistart: subsampled records on which candidates are compared.
 
 use crate::error::Result;
 use crate::estimation::joint_fit::initial_guesses::power_frequency;
@@ -6,24 +6,24 @@ use crate::estimation::joint_fit::parameter_set::ParameterSet;
 use crate::recording::{Recordings, Sampling};
 use crate::signal::statistics::mean;
 
-/// Samples of the coarse fits over all runs; each run has at least `MIN_RUN_SAMPLES`.
+/// Approximate number of samples of a coarse fit over all runs.
 pub const MAX_COARSE_SAMPLES: usize = 1200;
+/// Minimum number of samples of each run in a coarse fit.
 const MIN_RUN_SAMPLES: usize = 400;
-/// Maximum decimation without a check of the bandwidth. For a larger decimation, let f be the frequency below which 90
-/// % of the power lies. Half a period of f must then have at least [`MIN_SAMPLES_PER_HALF_PERIOD`] samples. The first
-/// part of a record represents the record if its outputs have at least [`MIN_DEVIATION_RATIO`] times the standard
-/// deviation of the whole record.
+/// Maximum decimation that does not require a check of the bandwidth.
 const MAX_UNCHECKED_DECIMATION: usize = 10;
+/// Minimum number of samples per half period at the bandwidth of the outputs, after a larger decimation.
 const MIN_SAMPLES_PER_HALF_PERIOD: f64 = 6.0;
+/// Minimum ratio of the standard deviation of an output in the first part of a record to that in the whole record.
 const MIN_DEVIATION_RATIO: f64 = 0.7;
 
-/// Sampling of the runs for the multistart.
+/// Return the sampling of the runs for the multistart.
 ///
 /// Decimation must not alias the signals. If a long record would need too large a decimation, its first part is used
-/// instead, provided that it varies like the whole record.
+/// instead. The outputs must vary there as much as in the whole record.
 ///
 /// # Errors
-/// If an output of the structure is no signal of the runs.
+/// [`Error::Structure`](crate::error::Error::Structure) if an output of the structure is not a signal of the runs.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampling> {
     let spans = source.spans();
@@ -48,23 +48,25 @@ pub fn coarse_sampling(free: &ParameterSet, source: &Recordings) -> Result<Sampl
     Ok(Sampling { decimation: carried, leading_intervals: Some(first), ..all })
 }
 
-/// Number of leading intervals of each run that represents long records, about `count` over all runs; None for short
-/// records.
+/// Return the number of leading sampling intervals of each run that represent a long record.
+///
+/// Over all runs, this is about `count` intervals. Return None if a record is short, or if its outputs vary less in
+/// these intervals than in the whole record.
 ///
 /// # Errors
-/// If an output of the structure is no signal of the runs.
+/// [`Error::Structure`](crate::error::Error::Structure) if an output of the structure is not a signal of the runs.
 pub fn leading_part(free: &ParameterSet, source: &Recordings, count: usize) -> Result<Option<usize>> {
     let (outputs, each) = (output_samples(free, source)?, (count / source.spans().len().max(1)).max(MIN_RUN_SAMPLES));
     let is_long = outputs.iter().flatten().all(|samples| samples.len() > 2 * each);
     Ok((is_long && varies_like_whole(&outputs, each)).then_some(each))
 }
 
-/// Samples of the outputs of all equations, by run.
+/// Samples of the output of each equation, by run.
 fn output_samples<'a>(free: &ParameterSet, source: &'a Recordings) -> Result<Vec<Vec<&'a [f64]>>> {
     free.structure.equations.iter().map(|equation| source.samples(equation.output)).collect()
 }
 
-/// True if the outputs have a similar standard deviation in the first intervals as in the whole record.
+/// Return true if every output has a similar standard deviation in the first `first` intervals as in the whole record.
 fn varies_like_whole(outputs: &[Vec<&[f64]>], first: usize) -> bool {
     outputs.iter().flatten().all(|samples| {
         standard_deviation(&samples[..=first.min(samples.len() - 1)])
@@ -72,7 +74,7 @@ fn varies_like_whole(outputs: &[Vec<&[f64]>], first: usize) -> bool {
     })
 }
 
-/// Standard deviation of the present samples.
+/// Standard deviation of the samples that are not missing (NaN).
 fn standard_deviation(samples: &[f64]) -> f64 {
     let finite: Vec<f64> = samples.iter().copied().filter(|v| !v.is_nan()).collect();
     let middle = mean(&finite);

@@ -1,9 +1,9 @@
 //! Multistart for equations with friction: linear fits with the measured sign of the velocity are the initial guesses.
 //!
-//! With the measured sign of the velocity the equation is linear. While the body sticks, the sign is noise; the bias is
-//! acceptable for an initial guess. Fits without friction add guesses with several amounts of friction. If no guess
-//! leads to the noise level, the optima of the structure without friction are initial guesses, too. Stribeck friction
-//! starts from the best fits with Coulomb friction.
+//! With the measured sign of the velocity, the equation is linear. While the body sticks, the sign is noise. The
+//! resulting bias is acceptable for an initial guess. Fits without friction add guesses with several amounts of
+//! friction. If no guess leads to the noise level, the optima of the structure without friction are further initial
+//! guesses. Stribeck friction starts from the best fits with Coulomb friction.
 
 use std::collections::BTreeMap;
 
@@ -25,23 +25,23 @@ use crate::recording::{Channel, Recording, Recordings, Role, Sampling};
 use crate::signal::nonuniform::interpolate_gaps;
 use crate::signal::statistics::{root_mean_square, white_noise_deviation};
 
-/// Samples of the coarse fits.
+/// Approximate number of samples of the shortest run in the coarse fits.
 const COARSE_SAMPLES: usize = 1200;
-/// Highest order of a body with friction.
+/// Highest order in the equation of a body with friction.
 const MAX_BODY_ORDER: f64 = 2.0;
-/// Initial Coulomb friction relative to the largest input force on the body.
+/// Initial guesses of Coulomb friction, relative to the largest input force on the body.
 const COULOMB_FORCE_RATIOS: [f64; 4] = [0.01, 0.05, 0.2, 0.5];
-/// Initial Coulomb friction relative to its estimate from the linear equation with the measured sign of the velocity.
+/// Initial guesses of Coulomb friction, relative to its estimate from the equation with measured velocity sign.
 const MEASURED_SIGN_RATIOS: [f64; 2] = [1.0, 0.3];
-/// Initial Stribeck friction relative to Coulomb friction.
+/// Initial guesses of Stribeck friction, relative to Coulomb friction.
 const STRIBECK_COULOMB_RATIOS: [f64; 3] = [0.02, 0.2, 1.0];
-/// Initial Stribeck velocity relative to the root-mean-square speed of the body.
+/// Initial guesses of the Stribeck velocity, relative to the root-mean-square speed of the body.
 const STRIBECK_SPEED_RATIOS: [f64; 3] = [0.05, 0.2, 0.6];
-/// Initial inertia of the attached bodies relative to the inertia of the body.
+/// Initial guesses of the inertia of the attached bodies, relative to the inertia of the body.
 const LOAD_INERTIA_RATIOS: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
 /// Maximum number of initial guesses in which each body has its own fraction of attached inertia.
 const MAX_LOAD_COMBINATIONS: usize = 64;
-/// Maximum difference of the orders of two terms that are action and reaction of two coupled equations.
+/// Maximum difference of the orders of two terms that count as action and reaction between coupled equations.
 const MAX_REACTION_ORDER_GAP: f64 = 0.5;
 /// Minimum peak-to-peak motion of a body, in standard deviations of its noise.
 const MIN_MOTION_NOISE_RATIO: f64 = 10.0;
@@ -51,10 +51,12 @@ const SIGN_PREFIX: &str = "coulomb_";
 /// Values by name: orders, coefficients and input parameters.
 pub(super) type Values = BTreeMap<String, f64>;
 
-/// Run the multistart of a problem with friction; return the candidates best first.
+/// Run the multistart of a problem with friction and return the candidates, best first.
 ///
 /// # Errors
-/// [`Error::Recording`] if a body moves in no run; as [`run_multistart`]; [`Error::Interrupted`].
+/// [`Error::Recording`] if a body moves in no run. [`Error::Interrupted`] after a stop request. An error also if the
+/// runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener if it returns
+/// one.
 pub fn run_friction_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     if !structure.has_friction() {
@@ -77,7 +79,7 @@ pub fn run_friction_multistart(free: &ParameterSet, course: MultistartContext<'_
     Ok(reached)
 }
 
-/// Initial guesses from the optima without friction. Friction starts at zero and at fractions of the input force.
+/// Return initial guesses from the optima without friction, with zero friction and with fractions of the input force.
 fn guesses_from_frictionless_optima(
     free: &ParameterSet,
     course: MultistartContext<'_>,
@@ -95,7 +97,7 @@ fn guesses_from_frictionless_optima(
     Ok(guesses)
 }
 
-/// Problem and recordings without friction.
+/// Return the parameter set and the recordings without friction.
 fn without_friction(structure: &ParametricStructure, source: &Recordings) -> Result<(ParameterSet, Recordings)> {
     let mut runs = source.runs().to_vec();
     runs.iter_mut().for_each(|run| run.has_friction = false);
@@ -114,15 +116,15 @@ fn initial_guesses(free: &ParameterSet, course: MultistartContext<'_>, grid: &Ob
     }
     let mut starts = Vec::new();
     if 1 < bodies && bodies < structure.equations.len() {
-        // Attached equations are fitted by themselves. That of a body, which all attached ones act on, may be explained
-        // by their measured motion.
+        // Equations of attached bodies without friction are fitted separately. The equation of a body with friction is
+        // not, because the measured motion of all attached bodies may explain it.
         for orders in order_sets(free) {
             let values = fit_frictionless_equations(structure, course, &orders)?;
             starts.extend(loaded_body_guesses(free, course, &values, false)?);
         }
         return Ok(starts);
     }
-    // With measured signals as inputs, the equation of each of several bodies does not depend on the others.
+    // With measured signals as inputs, the equation of each body does not depend on the other equations.
     let (signed, source) = with_measured_sign(structure, course.source)?;
     let signed = ParameterSet::from_structure(signed)?;
     let reached = run_on(&signed, &source, course)?;
@@ -141,12 +143,12 @@ fn run_on(free: &ParameterSet, source: &Recordings, course: MultistartContext<'_
     run_multistart(free, MultistartContext { source, starts: starts.as_ref(), ..course })
 }
 
-/// Equations with friction.
+/// Equations of the bodies with friction, with their friction parameters.
 fn bodies(structure: &ParametricStructure) -> impl Iterator<Item = (&ParametricEquation, &FrictionParameters)> {
     structure.equations.iter().filter_map(|item| Some((item, item.friction.as_ref()?)))
 }
 
-/// Return an error if a body with friction moves in no run.
+/// Return [`Error::Recording`] if a body with friction moves in no run.
 fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<()> {
     for (item, _) in bodies(structure) {
         let still = |samples: &&[f64]| {
@@ -168,7 +170,7 @@ fn check_motion(structure: &ParametricStructure, source: &Recordings) -> Result<
     Ok(())
 }
 
-/// Structure with the friction parameters that the function `other` returns.
+/// Return the structure with the friction of each body replaced by the result of `other`; None removes it.
 fn with_friction(
     structure: &ParametricStructure,
     other: impl Fn(&FrictionParameters) -> Option<FrictionParameters>,
@@ -193,14 +195,16 @@ fn without_stribeck(friction: &FrictionParameters) -> FrictionParameters {
     FrictionParameters { stribeck: fixed(0.0), speed: fixed(1.0), ..friction.clone() }
 }
 
-/// Values of all parameters of a candidate, with the coefficients that a law determines.
+/// Return the values of all parameters of a candidate, including the coefficients that a coefficient law determines.
 pub(super) fn values_of(free: &ParameterSet, runner: &Candidate) -> Values {
     let mut values: Values = free.names().cloned().zip(runner.result.values()).collect();
     values.extend(free.coefficients_by_name(&runner.result.iterate.point.coefficients));
     values
 }
 
-/// Initial guess at values by name. A parameter without a value is in the middle of its bounds.
+/// Return the initial guess at values by name.
+///
+/// A parameter without a value is in the middle of its bounds, or 0 if these are infinite.
 pub(super) fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> Result<Candidate> {
     let of = |(name, (low, high)): (&String, (f64, f64))| {
         let middle = 0.5 * (low + high);
@@ -210,7 +214,7 @@ pub(super) fn guess_at(free: &ParameterSet, values: &Values, origin: String) -> 
     Ok(Candidate::at(Iterate { point: free.problem.point(&at)?, states: Vec::new() }, origin))
 }
 
-/// Structure and recordings of some equations alone, with measured signals as inputs.
+/// Return the structure and recordings of some equations alone, with the other measured signals as inputs.
 fn with_measured_inputs(
     structure: &ParametricStructure,
     source: &Recordings,
@@ -263,7 +267,9 @@ fn with_measured_inputs(
     Ok((ParametricStructure { equations, coupled: false, ..alone }, Recordings::new(runs)?))
 }
 
-/// Structure and recordings with the sign of the measured velocity of each body as an input in place of its friction.
+/// Replace the friction of each body by an input, the sign of its measured velocity.
+///
+/// Return the structure and the recordings.
 fn with_measured_sign(
     structure: &ParametricStructure,
     source: &Recordings,
@@ -284,7 +290,7 @@ fn with_measured_sign(
             let samples = interpolate_gaps(&channels[output].samples);
             let sign = |w: &[f64]| if w[1] == w[0] { 0.0 } else { (w[1] - w[0]).signum() };
             let mut signs: Vec<f64> = samples.windows(2).map(sign).collect();
-            // The sign of the last interval repeats, so that there are as many samples.
+            // The sign of the last interval is repeated, so that there are as many signs as samples.
             signs.extend(signs.last().copied());
             channels.push(Channel::new(name, signs, Role::Derived));
         }
@@ -297,9 +303,10 @@ fn with_measured_sign(
     with_measured_inputs(&signed, &Recordings::new(runs)?, equations)
 }
 
-/// Order sets of the linear fits: integer orders, and the typical orders of the prior knowledge.
+/// Return the order sets of the linear fits: integer orders and, if known, the typical orders.
 ///
-/// Equations that share orders determine each of them poorly. An overdamped body has another optimum at every order.
+/// Orders that several equations share are poorly determined. An overdamped body has a different optimum at every
+/// order.
 fn order_sets(free: &ParameterSet) -> Vec<Values> {
     let natural = |name: &String| free.structure.hints.natural.get(name).filter(|values| !values.is_empty());
     let (mut whole, mut other) = (Values::new(), Values::new());
@@ -320,7 +327,9 @@ fn order_sets(free: &ParameterSet) -> Vec<Values> {
     vec![whole, mixed]
 }
 
-/// Orders, and coefficients of each equation without friction fitted by itself; 0 for those of the other equations.
+/// Fit each equation without friction by itself, at the given orders.
+///
+/// Return orders and coefficients by name. The coefficients of the other equations are 0.
 fn fit_frictionless_equations(
     structure: &ParametricStructure,
     course: MultistartContext<'_>,
@@ -343,11 +352,11 @@ fn fit_frictionless_equations(
     Ok(values)
 }
 
-/// Initial guesses of isolated bodies with the coupling forces of the attached bodies added.
+/// Return initial guesses from bodies that are fitted in isolation, with the coupling forces of attached bodies added.
 ///
-/// Coupling forces follow from action and reaction. The measured motion of its neighbors may explain a body without its
-/// input and friction, so each body is fitted in isolation first. If `together`, the attached inertia is the same
-/// fraction of the inertia of every body; otherwise each body has its own fraction.
+/// Coupling forces follow from action and reaction. The measured motion of its neighbors may explain the motion of a
+/// body without its input and friction. Therefore each body is fitted in isolation first. If `together`, the attached
+/// inertia is the same fraction of the inertia of every body. Otherwise each body has its own fraction.
 fn loaded_body_guesses(
     free: &ParameterSet,
     course: MultistartContext<'_>,
@@ -394,7 +403,9 @@ fn loaded_body_guesses(
     shares.into_iter().map(guess).collect()
 }
 
-/// Orders and coefficients of an isolated body with friction, fitted to its inputs; none if there is no solution.
+/// Fit an isolated body with friction to its inputs.
+///
+/// Return orders and coefficients by name. There are no coefficients if the fit has no solution.
 fn fit_isolated_body(
     free: &ParameterSet,
     MultistartContext { source, stop, .. }: MultistartContext<'_>,
@@ -405,7 +416,7 @@ fn fit_isolated_body(
     let is_output = |signal: usize| structure.equations.iter().any(|e| e.output == signal);
     let mut alone = item.clone();
     alone.terms.retain(|term| term.signal == item.output || !is_output(term.signal));
-    // Orders that depend on several free orders are those of the usual derivatives.
+    // Orders that depend on several free orders are fixed: 1 for the motion of the body itself, 0 for inputs.
     for term in alone.terms.iter_mut().filter(|term| term.order.is_free() && !term.order.is_single()) {
         term.order = Order::number(if term.signal == item.output { 1.0 } else { 0.0 });
     }
@@ -441,7 +452,7 @@ fn value_at(values: &Values, name: &str) -> f64 {
     values.get(name).copied().unwrap_or(0.0)
 }
 
-/// Coefficients of the reaction forces of attached bodies on a body, scaled by the inertia ratio.
+/// Return the coefficients of the reaction forces of attached bodies on a body, scaled by the inertia ratio `share`.
 fn reaction_coefficients(
     structure: &ParametricStructure,
     item: &ParametricEquation,
@@ -482,7 +493,9 @@ fn number((factor, coefficient): (f64, &Coefficient), values: &Values) -> f64 {
         }
 }
 
-/// Initial guesses of Coulomb friction from a linear fit, and from fractions of the input force.
+/// Return initial guesses of Coulomb friction from the fit `runner` with measured velocity sign.
+///
+/// Further guesses are fractions of the input force.
 fn coulomb_guesses(
     free: &ParameterSet,
     grid: &Objective<'_>,
@@ -515,14 +528,14 @@ fn coulomb_guesses(
     Ok(out)
 }
 
-/// Free Coulomb coefficients, with their equations and factors.
+/// Free Coulomb coefficients, each with its equation and its factor.
 fn free_coulomb_coefficients(structure: &ParametricStructure) -> Vec<(&ParametricEquation, f64, &String)> {
     bodies(structure)
         .filter_map(|(item, friction)| Some((item, friction.coulomb.0, friction.coulomb.1.name()?)))
         .collect()
 }
 
-/// Initial guess whose Coulomb friction of each body is a multiple of a force.
+/// Return the initial guess in which the Coulomb friction of each body is `ratio` times its force in `forces`.
 fn guess_with_friction(
     free: &ParameterSet,
     values: &Values,
@@ -537,7 +550,7 @@ fn guess_with_friction(
     guess_at(free, &values, format!("{origin}, friction times {}", format_general(ratio, 6)))
 }
 
-/// Initial guesses of Coulomb friction from fractions of the largest input force on each body.
+/// Return initial guesses of Coulomb friction: fractions of the largest input force on each body.
 fn coulomb_force_guesses(
     free: &ParameterSet,
     grid: &Objective<'_>,
@@ -558,7 +571,7 @@ fn coulomb_force_guesses(
         .collect()
 }
 
-/// Initial guesses of Stribeck friction from a fit with Coulomb friction alone.
+/// Return initial guesses of Stribeck friction, from a fit with Coulomb friction alone.
 fn stribeck_guesses(
     free: &ParameterSet,
     grid: &Objective<'_>,
@@ -598,7 +611,9 @@ fn stribeck_guesses(
     Ok(out)
 }
 
-/// Root-mean-square speed of an output, over sample intervals long enough to exceed the noise.
+/// Root-mean-square speed of an output, in its unit per second.
+///
+/// Speeds are averages over sampling intervals that are long enough for the motion to exceed the noise.
 #[allow(clippy::cast_precision_loss)]
 fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
     let every = grid.sampling.decimation;
@@ -610,7 +625,7 @@ fn rms_speed(grid: &Objective<'_>, output: usize) -> Result<f64> {
     Ok(root_mean_square(&speeds))
 }
 
-/// Largest root-mean-square force of one input of a body, in the unit of D^α y.
+/// Largest root-mean-square force of one input on a body, in the unit of D^α y for the output y and order α.
 fn largest_input_force(source: &Recordings, item: &ParametricEquation, values: &Values) -> Result<f64> {
     let mut largest: f64 = 0.0;
     for term in item.input_terms().filter(|term| !term.order.is_free() && term.order.constant == 0.0) {

@@ -11,31 +11,32 @@ use crate::estimation::joint_fit::progress::ProgressListener;
 use crate::estimation::output_error::{Experiment, MinimizationSettings, Status};
 use crate::parallel::Stop;
 
-/// Number of evaluations of every candidate in the first budget. Candidates near the best then get
-/// [`SECOND_BUDGET_EVALUATIONS`].
+/// Number of evaluations of every candidate in the first budget.
 pub(in crate::estimation::joint_fit) const FIRST_BUDGET_EVALUATIONS: usize = 15;
+/// Number of evaluations in the second budget, for candidates with a cost near the best.
 pub(super) const SECOND_BUDGET_EVALUATIONS: usize = 60;
-/// Minimum number of initial guesses of a submodel that continue after the prescreening.
+/// Number of initial guesses of a submodel that continue after the prescreening.
 pub(super) const MIN_SURVIVORS: usize = 8;
 /// Number of evaluations of each candidate in the prescreening.
 pub(super) const PRESCREEN_EVALUATIONS: usize = 2;
 /// Maximum number of candidates that continue on all samples.
 pub(super) const MAX_FINAL_SURVIVORS: usize = 3;
-/// Ratio to the best coarse cost above which a candidate does not continue.
+/// Ratio of a coarse cost to the best coarse cost above which the candidate does not continue.
 pub(super) const MAX_SURVIVOR_COST_RATIO: f64 = 3.0;
-/// Ratio to its initial guess below which a coefficient counts as 0. In logarithmic coordinates an optimization stops
-/// at e^-20.
+/// Ratio of a coefficient to its initial guess below which it counts as 0.
+///
+/// In logarithmic coordinates, an optimization stops at e^-20 times the initial guess.
 const ZERO_COEFFICIENT_RATIO: f64 = 1e-8;
 /// Ratio of the cost per residual to the noise floor up to which the residuals count as noise.
 const MAX_NOISE_COST_RATIO: f64 = 1.2;
 /// Relative difference of two costs below which they can belong to the same optimum.
 const SAME_COST_TOLERANCE: f64 = 1e-3;
-/// Relative difference of all parameters, or absolute difference of the orders, below which two candidates coincide.
+/// Relative difference of all parameters, or absolute difference of orders, below which two candidates are the same.
 const SAME_PARAMETER_TOLERANCE: f64 = 0.02;
 /// Relative tolerance of the orders of the same optimum, added to the absolute tolerance.
 const SAME_ORDER_RELATIVE_TOLERANCE: f64 = 1e-5;
 
-/// Executor of one rung of successive halving: number of starts, threads and progress callback.
+/// Executor of one rung of successive halving, with the number of starts, the threads and the progress callback.
 #[derive(Clone, Copy)]
 pub(super) struct RungExecutor<'a> {
     pub starts: usize,
@@ -44,7 +45,7 @@ pub(super) struct RungExecutor<'a> {
 }
 
 impl RungExecutor<'_> {
-    /// Optimize candidates with a budget of evaluations; return them best first.
+    /// Optimize candidates with a budget of evaluations each; return those with a finite simulation, best first.
     pub(super) fn run(
         &self,
         free: &ParameterSet,
@@ -56,7 +57,7 @@ impl RungExecutor<'_> {
         Ok(sort_by_cost(ended.into_iter().flatten().collect()))
     }
 
-    /// Optimize each candidate with a budget of evaluations; None if its simulation is not finite.
+    /// Optimize each candidate with a budget of evaluations; the result is None if its simulation is not finite.
     pub(super) fn run_each(
         &self,
         free: &ParameterSet,
@@ -125,7 +126,7 @@ impl RungExecutor<'_> {
     }
 }
 
-/// Common settings of the candidates of one budget.
+/// Common settings of the optimizations of one rung.
 struct Rung<'a> {
     free: &'a ParameterSet,
     experiments: &'a [Experiment],
@@ -135,7 +136,7 @@ struct Rung<'a> {
 }
 
 impl Rung<'_> {
-    /// Optimize one candidate; None if its simulation is not finite.
+    /// Optimize one candidate. Return None if its simulation is not finite.
     fn optimize(&self, runner: &Candidate) -> Result<Option<Candidate>> {
         let settings = MinimizationSettings { evaluations: self.evaluations, tolerance: RELATIVE_COST_TOLERANCE };
         let place = &runner.result.iterate;
@@ -161,16 +162,16 @@ fn zero_vanishing_coefficients(free: &ParameterSet, start: &Candidate, mut ended
     ended
 }
 
-/// Sort candidates by cost, stable for ties.
+/// Sort candidates by cost per residual; equal costs keep their sequence.
 pub(in crate::estimation::joint_fit) fn sort_by_cost(mut runners: Vec<Candidate>) -> Vec<Candidate> {
     runners.sort_by(|a, b| a.cost_per_residual().total_cmp(&b.cost_per_residual()));
     runners
 }
 
-/// Candidates of a short fit that continue, and the others.
+/// Split the candidates of a short fit into those that continue and the others.
 ///
-/// A candidate continues if its budget is exhausted. If another has converged at the noise floor, its cost must not
-/// exceed the cost of that one. `floor` is the noise floor of the cost per residual.
+/// A candidate continues if its budget is exhausted. `floor` is the cost per residual of the noise alone. If some
+/// candidate has converged at this noise floor, only candidates without a larger cost continue.
 pub(in crate::estimation::joint_fit) fn split_unfinished(
     runners: Vec<Candidate>,
     floor: f64,
@@ -183,7 +184,7 @@ pub(in crate::estimation::joint_fit) fn split_unfinished(
     runners.into_iter().partition(continues)
 }
 
-/// Survivors that continue on all samples: the best distinct optima within the cost ratio.
+/// Return the survivors that continue on all samples: the best distinct optima within the cost ratio.
 #[must_use]
 pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
     let mut first = merge_duplicates(reached, is_same_optimum);
@@ -191,37 +192,38 @@ pub fn select_survivors(reached: &[Candidate]) -> Vec<Candidate> {
     competitive_candidates(&first)
 }
 
-/// Candidates with a cost within a fixed ratio (`MAX_SURVIVOR_COST_RATIO`) of the best; the first candidate of the
-/// input must be the best.
+/// Return the candidates whose cost is at most `MAX_SURVIVOR_COST_RATIO` times that of the first, best one.
 #[must_use]
 pub fn competitive_candidates(reached: &[Candidate]) -> Vec<Candidate> {
     let limit = reached.first().map_or(0.0, |best| MAX_SURVIVOR_COST_RATIO * best.cost_per_residual());
     reached.iter().filter(|runner| runner.cost_per_residual() <= limit).cloned().collect()
 }
 
-/// True if two candidates agree in cost, orders and input parameters.
+/// Return true if two candidates agree in cost, orders and input parameters.
 #[must_use]
 pub fn is_same_optimum(one: &Candidate, other: &Candidate) -> bool {
     let orders = |runner: &Candidate| runner.result.iterate.point.orders.clone();
     let inputs = |runner: &Candidate| runner.result.iterate.point.inputs.clone();
     (one.cost_per_residual() - other.cost_per_residual()).abs() <= SAME_COST_TOLERANCE * one.cost_per_residual()
         && are_all_close(&orders(other), &orders(one), SAME_ORDER_RELATIVE_TOLERANCE, SAME_PARAMETER_TOLERANCE)
-        // A delay of another period is another optimum.
+        // Delays that differ by a period belong to different optima.
         && are_all_close(&inputs(other), &inputs(one), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
-/// True if two candidates agree in all parameters, such as candidates from order grids with common points.
+/// Return true if two candidates agree in all parameters.
+///
+/// Order grids with common points yield such candidates.
 #[must_use]
 pub fn is_same_iterate(one: &Candidate, other: &Candidate) -> bool {
     are_all_close(&other.result.values(), &one.result.values(), SAME_PARAMETER_TOLERANCE, 0.0)
 }
 
-/// True if all values agree within a relative and an absolute tolerance.
+/// Return true if all values agree within the sum of a relative tolerance `share` and an absolute one, `distance`.
 pub(super) fn are_all_close(numbers: &[f64], others: &[f64], share: f64, distance: f64) -> bool {
     numbers.iter().zip(others).all(|(a, b)| (a - b).abs() <= distance + share * b.abs())
 }
 
-/// Merge candidates that duplicate an earlier one; their origins are added to it.
+/// Merge each candidate into an earlier one that is the same, and append the origins to that candidate.
 #[must_use]
 pub fn merge_duplicates(runners: &[Candidate], same: impl Fn(&Candidate, &Candidate) -> bool) -> Vec<Candidate> {
     let mut distinct: Vec<Candidate> = Vec::new();
@@ -282,7 +284,7 @@ mod tests {
 
     #[test]
     fn candidate_beyond_the_limit_hides_no_later_one() {
-        // The order comes from a finer grid; the cost of the last one is within the ratio nevertheless.
+        // The sequence is that of a finer grid. The cost of the last candidate is within the ratio nevertheless.
         let reached = [candidate_at(1.0, 0.5), candidate_at(3.5, 1.0), candidate_at(2.0, 1.5)];
         let orders: Vec<f64> = select_survivors(&reached).iter().map(|r| r.result.iterate.point.orders[0]).collect();
         assert_eq!(orders, [0.5, 1.5]);

@@ -1,10 +1,10 @@
-//! Multistart with successive halving: short fits on subsampled records, of which the best continue.
+//! Multistart with successive halving: short fits on subsampled records, after which the best candidates continue.
 //!
 //! Candidates are optimized with growing budgets, from a prescreening to the few survivors that continue on all
-//! samples. They start from optima of integer orders with the orders freed ([`IntegerOrderProblem`]) and from order
-//! grids. Optima of submodels are further candidates of the full problem. A submodel has one term less
-//! ([`ReducedProblem`]) or one fixed order ([`FixedOrderProblem`]). Equations with friction start from linear fits
-//! ([`run_friction_multistart`]). Equations with non-linear terms start from fits with the measured values of their
+//! samples. Some candidates start from optima of integer orders, with the orders freed ([`IntegerOrderProblem`]),
+//! others from order grids. Optima of submodels are further candidates of the full problem. A submodel has one term
+//! less ([`ReducedProblem`]) or one fixed order ([`FixedOrderProblem`]). Equations with friction start from linear fits
+//! ([`run_friction_multistart`]). Equations with nonlinear terms start from fits with the measured values of their
 //! expressions ([`run_nonlinear_multistart`]).
 
 mod coarse_grid;

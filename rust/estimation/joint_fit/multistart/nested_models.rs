@@ -1,4 +1,4 @@
-//! Submodels: one term less, one fixed order, or integer orders.
+//! Submodels of a structure: one term less, one fixed order, or integer orders.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use crate::estimation::joint_fit::problem::{Candidate, Iterate, OptimizationResu
 use crate::estimation::joint_fit::structure::{Coefficient, Order, ParametricEquation};
 use crate::estimation::output_error::ParameterPoint;
 
-/// Submodel with one term removed or its coefficient fixed.
+/// Submodel with one term removed, or with one coefficient fixed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReducedProblem {
     /// Remaining free parameters.
@@ -21,7 +21,7 @@ pub struct ReducedProblem {
 }
 
 impl ReducedProblem {
-    /// Restrict a candidate of the full problem to this one.
+    /// Restrict a candidate of the full problem, which has the parameter set `whole`, to this submodel.
     #[must_use]
     pub fn restrict(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
         let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
@@ -35,8 +35,9 @@ impl ReducedProblem {
         Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
     }
 
-    /// Embed a candidate in the full problem. The free order of a term with coefficient 0 is set to half of the highest
-    /// order.
+    /// Embed a candidate of this submodel in the full problem, which has the parameter set `whole`.
+    ///
+    /// The free order of a removed term is set to half of the highest order of its equation.
     #[must_use]
     pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
         let ParameterPoint { orders, coefficients, inputs } = &runner.result.iterate.point;
@@ -62,11 +63,12 @@ impl ReducedProblem {
     }
 }
 
-/// Submodels with one term less; empty if the structure has an order law or a coefficient law.
+/// Return the submodels with one term less; empty if the structure has an order law or a coefficient law.
 ///
-/// A free input term of fixed order is removed if it is not the only one and the equations are not coupled. The signals
-/// of one machine are correlated, so there can be optima in which one signal replaces the others. For the same reason a
-/// coefficient with a known physical value is first fixed at that value.
+/// An autoregressive term is removed if its equation has several. The coefficient of an input term of fixed order is
+/// set to 0 if there are several input terms and the equations are not coupled. The signals of one machine are
+/// correlated, so there can be optima in which one signal replaces the others. For the same reason, a coefficient with
+/// a known physical value is fixed at that value.
 #[must_use]
 pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
     let structure = &free.structure;
@@ -75,7 +77,7 @@ pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
     }
     let mut out = Vec::new();
     let mut add = |reduced, name: &String, order: &Order, value, driven| {
-        // Some give no valid equation.
+        // Some submodels are no valid structure.
         if let Ok(free) = ParameterSet::from_structure(reduced) {
             out.push(ReducedProblem {
                 free,
@@ -99,7 +101,7 @@ pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
         let driving: Vec<_> = item.input_terms().filter(|term| term.coefficient.name().is_some()).collect();
         for term in driving.iter().filter(|term| !structure.coupled && driving.len() > 1 && !term.order.is_free()) {
             if let Some(name) = term.coefficient.name() {
-                // The signal stays with coefficient 0, because the records contain it.
+                // The term remains with coefficient 0, because the records contain its signal.
                 let values_by_name = BTreeMap::from([(name.clone(), 0.0)]);
                 add(structure.with_coefficients(&values_by_name), name, &item.order, 0.0, true);
             }
@@ -114,8 +116,9 @@ pub fn reduced_problems(free: &ParameterSet) -> Vec<ReducedProblem> {
     out
 }
 
-/// Integer values of a free order; at most [`MAX_INTEGER_ORDER_PROBLEMS`] combinations are tried.
+/// Integer values of a free order that are tried by default.
 const DEFAULT_INTEGER_ORDERS: [f64; 4] = [0.0, 1.0, 2.0, 3.0];
+/// Maximum number of combinations of integer orders that are tried.
 const MAX_INTEGER_ORDER_PROBLEMS: usize = 12;
 
 /// Submodel with every free order fixed at an integer value.
@@ -123,7 +126,7 @@ const MAX_INTEGER_ORDER_PROBLEMS: usize = 12;
 pub struct IntegerOrderProblem {
     /// Remaining free parameters.
     pub free: ParameterSet,
-    /// The orders.
+    /// Integer values of the free orders of the full problem.
     pub orders: Vec<f64>,
 }
 
@@ -138,10 +141,10 @@ impl IntegerOrderProblem {
     }
 }
 
-/// Submodels with integer orders: the usual ones, the nearest to a point, and each with one order changed.
+/// Return submodels with integer orders: the usual ones, those nearest to `near`, and each with one order changed.
 ///
-/// Between two integer orders an input coefficient may change its sign, which an optimization cannot cross. The nearest
-/// integer orders need not be the best. Combinations without a valid equation are omitted.
+/// An input coefficient may change its sign between two integer orders, and an optimization cannot cross that change.
+/// The nearest integer orders therefore need not be the best. Combinations without a valid equation are omitted.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn integer_order_problems(free: &ParameterSet, near: &[f64]) -> Vec<IntegerOrderProblem> {
@@ -185,7 +188,7 @@ fn nearest_value(values: &[f64], at: f64) -> f64 {
     values.iter().copied().reduce(|best, v| if (v - at).abs() < (best - at).abs() { v } else { best }).unwrap_or(at)
 }
 
-/// Submodel at given integer orders; None if they give no valid equation.
+/// Return the submodel at given integer orders; None if they give no valid equation.
 fn integer_order_problem(free: &ParameterSet, orders: Vec<f64>) -> Option<IntegerOrderProblem> {
     let values_by_name: BTreeMap<String, f64> = free.orders.iter().cloned().zip(orders.iter().copied()).collect();
     let reduced = free.structure.with_orders(&values_by_name).and_then(ParameterSet::from_structure).ok()?;
@@ -193,19 +196,19 @@ fn integer_order_problem(free: &ParameterSet, orders: Vec<f64>) -> Option<Intege
     (reduced.coefficients == free.coefficients).then_some(IntegerOrderProblem { free: reduced, orders })
 }
 
-/// Submodel with one free order fixed at its integer value.
+/// Submodel with one free order fixed at an integer value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FixedOrderProblem {
     /// Remaining free parameters.
     pub free: ParameterSet,
-    /// Index of the order in the full problem.
+    /// Index of the fixed order among the free orders of the full problem.
     pub order: usize,
-    /// Value of the order.
+    /// Value at which the order is fixed.
     pub value: f64,
 }
 
 impl FixedOrderProblem {
-    /// Restrict a candidate of the full problem to this one, with the coefficients kept in scaled time.
+    /// Restrict a candidate of the full problem to this submodel, without a change of the coefficients in scaled time.
     #[must_use]
     pub fn restrict(&self, runner: &Candidate, clock: &TimeScaling) -> Candidate {
         let mut scaled_values = clock.to_scaled(&runner.result.values());
@@ -218,7 +221,7 @@ impl FixedOrderProblem {
         Candidate::at(Iterate { point, states: Vec::new() }, runner.origin.clone())
     }
 
-    /// Embed a candidate of this problem in the full problem.
+    /// Embed a candidate of this submodel in the full problem, which has the parameter set `whole`.
     #[must_use]
     pub fn embed(&self, runner: &Candidate, whole: &ParameterSet) -> Candidate {
         let mut candidate = runner.clone();
@@ -229,7 +232,9 @@ impl FixedOrderProblem {
     }
 }
 
-/// Submodels with one order fixed, if there are several orders. No submodel may fit better than the full problem.
+/// Return the submodels with one order fixed at an integer, if there are several free orders.
+///
+/// The optima of the submodels are candidates, because no submodel may fit better than the full problem.
 #[must_use]
 #[allow(clippy::float_cmp)]
 pub fn fixed_order_problems(free: &ParameterSet) -> Vec<FixedOrderProblem> {
@@ -239,7 +244,7 @@ pub fn fixed_order_problems(free: &ParameterSet) -> Vec<FixedOrderProblem> {
             continue;
         }
         let values_by_name = BTreeMap::from([(free.orders[order].clone(), value)]);
-        // Some give no valid equation.
+        // Some submodels are no valid structure.
         let Ok(reduced) = free.structure.with_orders(&values_by_name).and_then(ParameterSet::from_structure) else {
             continue;
         };

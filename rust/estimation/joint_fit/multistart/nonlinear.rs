@@ -1,9 +1,10 @@
-//! Multistart for equations with non-linear terms: linear fits with the measured values of the expressions.
+//! Multistart for equations with nonlinear terms: linear fits with the measured values of the expressions.
 //!
-//! With measured values a derived signal is one more input, and the order grids of linear equations give initial
-//! guesses, ranked by simulations of the non-linear equations. Derivatives of measured signals are taken of raw and of
-//! smoothed samples. With friction, output-error fits of these equations are the guesses. Without friction such fits
-//! add guesses only if no other guess reaches the noise level. The same holds for fits without the non-linear terms.
+//! With measured values, a derived signal is one more input. The order grids of these linear equations give initial
+//! guesses, which are ranked by simulations of the nonlinear equations. Derivatives of measured signals are computed
+//! from raw and from smoothed samples. With friction, the guesses are output-error fits of the linear equations.
+//! Without friction, such fits add guesses only if no other guess reaches the noise level. In the same case, fits
+//! without the nonlinear terms add guesses, too.
 
 use super::coarse_grid::coarse_sampling;
 use super::friction::{guess_at, run_friction_multistart, values_of};
@@ -25,17 +26,17 @@ use crate::series;
 use crate::signal::block_pulse::{delay_samples, Intersample};
 use crate::signal::nonuniform::interpolate_gaps;
 
-/// Half the width of the smoothing window of measured signals whose derivatives enter expressions, in samples.
+/// Half the width, in samples, of the smoothing window for measured signals whose derivatives enter expressions.
 const SMOOTHING_HALF_WIDTH: usize = 15;
 
-/// Finest grid of the initial guesses, in block pulses per sampling interval.
+/// Maximum number of block pulses per sampling interval in the simulation of the initial guesses.
 const MAX_START_PULSES_PER_SAMPLE: usize = 4;
 
-/// Run the multistart of a problem with non-linear terms; return the candidates best first.
+/// Run the multistart of a problem with nonlinear terms and return the candidates, best first.
 ///
 /// # Errors
-/// The errors of the experiments, initial guesses and callback ([`run_multistart`]);
-/// [`crate::error::Error::Interrupted`] after a stop request.
+/// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
+/// if it returns one. [`crate::error::Error::Interrupted`] after a stop request.
 pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let structure = &free.structure;
     let linear = ParameterSet::from_structure(ParametricStructure { derived: Vec::new(), ..structure.clone() })?;
@@ -75,7 +76,7 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
             break;
         }
     }
-    // Fast responses need shorter pulses before a residual says anything of a guess.
+    // With fast responses, the residuals rank the guesses only if the pulses are short enough.
     while let Some(best) = reached.first().filter(|_| !is_at_noise(&reached))
         && grid.sampling.pulses_per_sample < MAX_START_PULSES_PER_SAMPLE
         && grid.is_refinement_significant(&best.result.iterate, &grid.finer()?)?
@@ -85,7 +86,7 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
     }
     if !is_at_noise(&reached) {
         let mut more = Vec::new();
-        // With friction these fits have already given the guesses.
+        // With friction, these fits are the initial guesses already.
         let others = if structure.has_friction() { &[][..] } else { &sources };
         for source in others {
             let starts = course.starts.for_recordings(source);
@@ -109,6 +110,8 @@ pub fn run_nonlinear_multistart(free: &ParameterSet, course: MultistartContext<'
 }
 
 /// Return the best candidates of a problem with fewer parameters as initial guesses of the full problem.
+///
+/// At most [`MAX_FINAL_SURVIVORS`] candidates are returned. Missing coefficients are 0.
 fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> Result<Vec<Candidate>> {
     let of = |runner: &Candidate| {
         let mut values = values_of(less, runner);
@@ -120,7 +123,7 @@ fn embed(free: &ParameterSet, less: &ParameterSet, candidates: &[Candidate]) -> 
     candidates.iter().take(MAX_FINAL_SURVIVORS).map(of).collect()
 }
 
-/// Problem without the non-linear terms; None if an equation has only non-linear terms.
+/// Return the parameter set without the nonlinear terms; None if the remaining structure is invalid.
 fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterSet> {
     let recorded = structure.recorded_count();
     let of = |item: &ParametricEquation| {
@@ -138,7 +141,10 @@ fn without_nonlinear_terms(structure: &ParametricStructure) -> Option<ParameterS
     ParameterSet::from_structure(ParametricStructure { bounds, ..less }).ok()
 }
 
-/// Recordings in which the derived signals are measured signals. Samples are smoothed before they are differentiated.
+/// Return recordings that contain the derived signals as measured signals.
+///
+/// Samples are smoothed before they are differentiated. `half_width` is half the smoothing window in samples.
+/// Recordings with nonuniform samples are an error.
 fn with_derived_signals(structure: &ParametricStructure, source: &Recordings, half_width: usize) -> Result<Recordings> {
     let of = |run: &Recording| {
         if run.has_nonuniform_samples() {
@@ -173,7 +179,7 @@ fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_wi
     let of = |k: usize| {
         at.iter_mut().zip(&rows).for_each(|(v, row)| *v = row[k]);
         let value = derived.expression.evaluate(&at, &mut values);
-        // Noise may leave the domain of a function.
+        // Noise may move an argument out of the domain of a function.
         if value.is_finite() {
             value
         } else {
@@ -185,7 +191,9 @@ fn derived_channel(run: &Recording, derived: &DerivedSignal, name: &str, half_wi
     Ok(Channel { is_filtered, ..Channel::new(name, samples, role) })
 }
 
-/// Grünwald–Letnikov derivative of smoothed samples.
+/// Grünwald–Letnikov derivative of smoothed samples, in their unit per second^`order`.
+///
+/// It is the derivative of the deviation from the first sample, or from 0 if the run starts at rest.
 fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usize) -> Vec<f64> {
     let first = if run.is_at_rest { 0.0 } else { samples[0] };
     let deviations: Vec<f64> = smooth(&samples, half_width).iter().map(|v| v - first).collect();
@@ -194,7 +202,7 @@ fn differentiate(samples: Vec<f64>, order: f64, run: &Recording, half_width: usi
     series::multiply(&weights, &deviations, deviations.len()).into_iter().map(|v| scale * v).collect()
 }
 
-/// Samples smoothed by local cubic polynomials (Savitzky–Golay filter), with shorter windows near the ends.
+/// Return samples smoothed by local cubic polynomials (Savitzky–Golay filter), with shorter windows near the ends.
 #[allow(clippy::cast_precision_loss)]
 fn smooth(samples: &[f64], half_width: usize) -> Vec<f64> {
     let of = |k: usize| {

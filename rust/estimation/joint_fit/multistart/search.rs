@@ -19,29 +19,30 @@ use crate::estimation::joint_fit::structure::ParametricStructure;
 use crate::parallel::Stop;
 use crate::recording::{Recordings, Sampling};
 
-/// Ratio of the best cost to the noise floor above which problems with one free order get a multistart of their own.
+/// Ratio of the best cost per residual to the noise floor up to which a fit counts as having reached the noise.
+///
+/// If no candidate reaches the noise, further initial guesses are computed.
 pub(super) const NOISE_FLOOR_FACTOR: f64 = 2.0;
-/// Approximate number of intervals, over all runs, of each of the two samplings of a long record on which initial guesses
-/// of integer orders are found.
+/// Approximate number of intervals, over all runs, of a sampling on which initial guesses of integer orders are found.
 const GUESS_INTERVALS: usize = 2000;
-/// Leading intervals of a long record, over all runs, on which problems of integer orders and survivors are fitted.
+/// Number of leading intervals of a long record, over all runs, to which submodels and survivors are fitted.
 pub const SELECTION_INTERVALS: usize = 6000;
 
 /// Source of initial guesses.
 pub trait InitialGuessSource {
-    /// Initial guesses of a problem on the runs.
+    /// Return initial guesses of a parameter set on the runs.
     ///
     /// # Errors
-    /// If its equations cannot be searched; [`Error::Interrupted`].
+    /// An error if the orders of the equations cannot be searched. [`Error::Interrupted`] after a stop request.
     fn initial_guesses(&self, free: &ParameterSet) -> Result<Vec<Candidate>>;
 
-    /// Source of initial guesses on other recordings.
+    /// Return a source of initial guesses for other recordings.
     fn for_recordings<'b>(&'b self, source: &'b Recordings) -> Box<dyn InitialGuessSource + 'b>;
 
-    /// Optima of a problem of integer orders on the samples of a grid; None for other problems.
+    /// Return the optima of a problem of integer orders on the samples of `_grid`; None for other problems.
     ///
     /// # Errors
-    /// Equations that cannot be searched, or a stop request ([`InitialGuessSource::initial_guesses`]).
+    /// An error if the equations cannot be searched. [`Error::Interrupted`] after a stop request.
     fn integer_order_optima(&self, _free: &ParameterSet, _grid: &Objective<'_>) -> Result<Option<Vec<Candidate>>> {
         Ok(None)
     }
@@ -50,24 +51,24 @@ pub trait InitialGuessSource {
 /// Common data of the multistarts of a problem and of its submodels.
 #[derive(Clone, Copy)]
 pub struct MultistartContext<'a> {
-    /// The runs.
+    /// Runs that are fitted.
     pub source: &'a Recordings,
     /// Source of initial guesses.
     pub starts: &'a dyn InitialGuessSource,
     /// Cancellation flag.
     pub stop: &'a Stop,
-    /// Weights of the outputs, equal relative to their standard deviations.
+    /// Weights of the outputs, which are equal relative to the standard deviations of the outputs.
     pub weights: &'a [f64],
-    /// Noise floor of the cost per residual.
+    /// Cost per residual of noise alone.
     pub floor: f64,
-    /// Number of threads; results do not depend on it.
+    /// Number of threads. Results do not depend on it.
     pub threads: usize,
-    /// Progress callback of (starts done, all starts); None in a nested multistart.
+    /// Progress callback with the numbers of finished and of all starts; None in a nested multistart.
     pub listener: Option<&'a ProgressListener<'a>>,
 }
 
 impl<'a> MultistartContext<'a> {
-    /// Context of a nested multistart.
+    /// Context of a nested multistart, which does not report progress.
     fn for_submodel(self) -> Self {
         Self { listener: None, ..self }
     }
@@ -77,10 +78,11 @@ impl<'a> MultistartContext<'a> {
     }
 }
 
-/// Run the multistart on subsampled records; return the candidates best first.
+/// Run the multistart on subsampled records and return the candidates, best first.
 ///
 /// # Errors
-/// As the source, the initial guesses and the callback; [`Error::Interrupted`].
+/// An error if the runs cannot be sampled or the initial guesses cannot be computed. The error of the progress listener
+/// if it returns one. [`Error::Interrupted`] after a stop request.
 pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     if let Some(candidates) = integer_order_multistart(free, course, None)? {
         return Ok(candidates);
@@ -91,7 +93,9 @@ pub fn run_multistart(free: &ParameterSet, course: MultistartContext<'_>) -> Res
     Ok(multistart_without_history(free, course)?.0)
 }
 
-/// Optima of a problem of integer orders on all samples or the leading intervals, best first; None for other problems.
+/// Return the optima of a problem of integer orders, best first; None for other problems.
+///
+/// The fit uses the first `leading_intervals` intervals of each run, or all samples if it is None.
 fn integer_order_multistart(
     free: &ParameterSet,
     course: MultistartContext<'_>,
@@ -120,8 +124,10 @@ fn integer_order_multistart(
     Ok((!candidates.is_empty()).then_some(candidates))
 }
 
-/// Samplings on which initial guesses of integer orders are found. A long record has two: its first part, for fast poles
-/// and delays, and the whole record, decimated, for slow poles. A short record has none: all its samples serve.
+/// Return the samplings on which initial guesses of integer orders are found.
+///
+/// A long record has two samplings. Its first part is for fast poles and delays. The whole record, decimated, is for
+/// slow poles. A short record has none, because all its samples are used.
 fn guess_samplings(
     free: &ParameterSet,
     source: &Recordings,
@@ -137,7 +143,7 @@ fn guess_samplings(
     Ok(vec![leading, Sampling { leading_intervals, decimation, ..Sampling::default() }])
 }
 
-/// Convert the error of an invalid model to None.
+/// Convert the error of an invalid model ([`Kind::Model`]) to None.
 pub(super) fn none_if_invalid_model<T>(outcome: Result<T>) -> Result<Option<T>> {
     match outcome {
         Err(error) if error.kind() == Kind::Model => Ok(None),
@@ -151,17 +157,19 @@ struct MultistartState<'a> {
     course: MultistartContext<'a>,
     laps: RungExecutor<'a>,
     coarse: Objective<'a>,
-    /// Grid with half the step; None if it was not needed.
+    /// Objective on a grid with half the step; None if it was not needed.
     half: Option<Objective<'a>>,
     starts: Vec<Candidate>,
     /// Candidates of the full problem after the first budget.
     first: Vec<Candidate>,
-    /// Optima with integer orders.
+    /// Optima with integer orders, embedded in the full problem.
     integer_order_optima: Vec<Candidate>,
     candidates: Vec<Candidate>,
 }
 
-/// Run the multistart of a problem with few initial terms; return the candidates and their grid.
+/// Run the multistart of a problem with few initial terms.
+///
+/// Return the candidates, best first, and the objective on which they were optimized.
 fn multistart_without_history<'a>(
     free: &'a ParameterSet,
     course: MultistartContext<'a>,
@@ -185,7 +193,9 @@ fn multistart_without_history<'a>(
     Ok(candidates)
 }
 
-/// Best candidate of each problem of integer orders, near the usual ones and near the first guess.
+/// Return the best candidate of each submodel of integer orders, embedded in the full problem.
+///
+/// The integer orders are near the usual ones and near those of the first guess.
 fn integer_order_optima(
     free: &ParameterSet,
     course: MultistartContext<'_>,
@@ -196,17 +206,18 @@ fn integer_order_optima(
     let near = starts.first().map_or(&usual, |start| &start.result.iterate.point.orders);
     let mut candidates = Vec::new();
     for less in integer_order_problems(free, near) {
-        // With fixed orders most initial guesses lead to the same optimum.
+        // With fixed orders, most initial guesses lead to the same optimum.
         let ended = optimize_submodel(&less.free, course, coarse, MAX_FINAL_SURVIVORS, f64::INFINITY)?;
         candidates.extend(ended.iter().take(1).map(|runner| less.embed(runner)));
     }
     Ok(candidates)
 }
 
-/// Optimize a submodel from its initial guesses. The best `going` guesses continue after the prescreening.
+/// Optimize a submodel from its initial guesses and return its optima, best first.
 ///
-/// The second budget is for optima that can compete with `level`, the cost per residual of the full problem, and for
-/// the best one. For integer orders the leading intervals of long records suffice. Empty if two of its terms coincide.
+/// The best `going` guesses continue after the prescreening. `level` is the cost per residual of the full problem.
+/// Optima that can compete with it, and the best one, get the second budget. For integer orders, the leading intervals
+/// of long records suffice. The result is empty if the submodel is invalid, such as with two equal terms.
 fn optimize_submodel(
     free: &ParameterSet,
     course: MultistartContext<'_>,
@@ -230,17 +241,18 @@ fn optimize_submodel(
 }
 
 impl<'a> MultistartState<'a> {
-    /// Optimize all initial guesses on a grid that does not change the best of them.
+    /// Optimize all initial guesses with a step that is short enough for the best candidate.
     ///
     /// A stiff equation may have no stable scheme on a coarse grid, and a coarse grid has spurious optima. The step is
-    /// halved until the best candidate no longer changes. Optima of integer orders start again on each grid.
+    /// halved until this no longer changes the simulation of the best candidate significantly. Optima of integer orders
+    /// are initial guesses on each grid.
     fn optimize_starts(&mut self) -> Result<()> {
         let mut starts = self.starts.clone();
         loop {
             let screened = self.laps.run(self.free, &self.coarse, &starts, PRESCREEN_EVALUATIONS)?;
             let mut screened = merge_duplicates(&screened, is_same_iterate);
             if self.coarse.sampling.pulses_per_sample > 1 {
-                // Nearly all of these were optimized on the coarser grid.
+                // Nearly all candidates were already optimized on the coarser grid.
                 screened.truncate(competitive_candidates(&screened).len().max(MIN_SURVIVORS));
             }
             self.candidates = self.laps.run(self.free, &self.coarse, &screened, FIRST_BUDGET_EVALUATIONS)?;
@@ -261,7 +273,7 @@ impl<'a> MultistartState<'a> {
         }
     }
 
-    /// Add the optima of submodels as candidates: a coefficient at 0, or a fixed order.
+    /// Add the optima of submodels as candidates: with one term less, with one fixed order, and without offsets.
     fn add_nested_models(&mut self) -> Result<()> {
         if self.candidates.is_empty() {
             return Ok(());
@@ -281,7 +293,7 @@ impl<'a> MultistartState<'a> {
         self.candidates = sort_by_cost(std::mem::take(&mut self.candidates));
     }
 
-    /// Evaluate candidates on the grid of this problem and add them.
+    /// Evaluate candidates with the full problem on the coarse grid and add them.
     fn evaluate_and_add(&mut self, runners: &[Candidate]) -> Result<()> {
         let evaluated = self.laps.run(self.free, &self.coarse, runners, 1)?;
         self.add(evaluated);
@@ -290,8 +302,8 @@ impl<'a> MultistartState<'a> {
 
     fn add_reduced_model(&mut self, less: &ReducedProblem) -> Result<()> {
         if less.keeps_signals {
-            // Input coefficients are eliminated at every iterate, also with one term less. Candidates differ in the
-            // autoregressive terms only, so those of the full problem suffice.
+            // Input coefficients are eliminated at every iterate, also with one term less. Candidates therefore differ
+            // in the autoregressive terms only, and those of the full problem suffice.
             let first = merge_duplicates(&self.first, is_same_optimum);
             let from = first.iter().take(MAX_FINAL_SURVIVORS).chain(&self.starts);
             let runners: Vec<Candidate> = from.map(|runner| less.restrict(runner, self.free)).collect();
@@ -305,11 +317,11 @@ impl<'a> MultistartState<'a> {
         self.evaluate_and_add(&ended.iter().take(1).map(|r| less.embed(r, self.free)).collect::<Vec<_>>())
     }
 
-    /// Add the optimum with one order fixed: the full problem must not fit worse.
+    /// Add the optimum with one order fixed, because the full problem must not fit worse.
     fn add_fixed_order_model(&mut self, one: &FixedOrderProblem, unit: &TimeScaling) -> Result<()> {
         let level = self.candidates.first().map_or(0.0, Candidate::cost_per_residual);
         if one.free.orders.len() == 1 && level > NOISE_FLOOR_FACTOR * self.course.floor {
-            // Bounds may leave no order grid.
+            // Within its bounds, the submodel may have no order grid.
             if let Some((ended, _)) =
                 none_if_invalid_model(multistart_without_history(&one.free, self.course.for_submodel()))?
             {
@@ -336,8 +348,9 @@ impl<'a> MultistartState<'a> {
         self.evaluate_and_add(&ended.iter().take(1).map(|runner| one.embed(runner, self.free)).collect::<Vec<_>>())
     }
 
-    /// Add the optima of the model without offsets. With a free offset per run, a fit may converge without the true
-    /// input.
+    /// Add the optima of the model without offsets.
+    ///
+    /// With a free offset per run, a fit may converge to an optimum that does not use the true input.
     fn add_model_without_offset(&mut self) -> Result<()> {
         let structure = &self.free.structure;
         let plain = structure.initial.without_offset();
@@ -351,7 +364,9 @@ impl<'a> MultistartState<'a> {
         Ok(())
     }
 
-    /// Fit the survivors again, the unfinished ones with the second budget, and rank them before the other candidates.
+    /// Continue the survivors and rank them before the other candidates. Unfinished ones get the second budget.
+    ///
+    /// Return the candidates and the objective on which they were optimized.
     fn promote_survivors(self) -> Result<(Vec<Candidate>, Objective<'a>)> {
         let reached = merge_duplicates(&self.candidates, is_same_optimum);
         let (survivors, rest) = reached.split_at(competitive_candidates(&reached).len());
@@ -365,7 +380,9 @@ impl<'a> MultistartState<'a> {
     }
 }
 
-/// Sort candidates by the larger of their costs on a grid and on half its step; by the former if the latter fails.
+/// Sort candidates by the larger of their costs on a grid and on the grid with half the step.
+///
+/// If the finer grid fails, sort them by their cost on the first grid.
 fn rank_candidates(
     coarse: &Objective<'_>,
     half: Option<Objective<'_>>,
@@ -384,10 +401,10 @@ fn rank_candidates(
     Ok(order.into_iter().filter_map(|i| runners[i].take()).collect())
 }
 
-/// Run the multistart of a problem with many initial terms per run, which are added for the survivors only.
+/// Run the multistart of a problem with many initial terms per run, and return the candidates, best first.
 ///
-/// The initial terms shift most optima by less than the distance between two optima. The survivors are ranked again
-/// after a budget with all initial terms.
+/// The initial terms are added for the survivors only, because they shift most optima by less than the distance between
+/// two optima. The survivors are ranked again after a budget with all initial terms.
 fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -> Result<Vec<Candidate>> {
     let few = free.with_initial_terms(free.structure.initial.with_under(Initial::Caputo), false)?;
     let (reached, coarse) = multistart_without_history(&few, course)?;
@@ -408,10 +425,12 @@ fn multistart_with_history(free: &ParameterSet, course: MultistartContext<'_>) -
     Ok(merge_duplicates(&leaders, is_same_optimum))
 }
 
-/// Optimize candidates on coarse grids; return them best first.
+/// Optimize candidates on coarse grids and return the best ones, best first.
+///
+/// The step is halved as long as no candidate has a finite simulation.
 ///
 /// # Errors
-/// As the source, [`crate::error::Error::Interrupted`].
+/// An error if the runs cannot be sampled at a shorter step. [`crate::error::Error::Interrupted`] after a stop request.
 pub(super) fn optimize_on_coarse_grids(
     free: &ParameterSet,
     coarse: &Objective<'_>,

@@ -14,28 +14,34 @@ use crate::regressors::Record;
 use crate::series;
 use crate::signal::statistics::white_noise_deviation;
 
-/// Time over which a velocity is measured, as a fraction of the duration of the run.
+/// Time over which a velocity is averaged, as a fraction of the duration of the run.
 const VELOCITY_SPAN_FRACTION: f64 = 0.01;
-/// Minimum motion within that time that counts as sliding, in standard deviations of the noise.
+/// Minimum displacement within that time that counts as sliding, in standard deviations of the noise.
 const VELOCITY_NOISE_RATIO: f64 = 5.0;
-/// Iterations in which the friction force at rest is recomputed from the input forces.
+/// Maximum number of iterations in which the friction force at rest is recomputed from the input forces.
 const MAX_REST_ITERATIONS: usize = 4;
 
-/// Pulse means of one run, and the sign of the measured velocity, which is 0 at rest.
+/// Block-pulse record of one run, and the friction force of each pulse relative to Coulomb friction.
+///
+/// While the body slides, this is the sign of the measured velocity. At rest it is between −1 and 1.
 struct Part {
     record: Record,
     sign: Vec<f64>,
 }
 
-/// Coefficients of one equation with friction and given orders, fitted to its integrals on all runs.
+/// Estimate the coefficients of one equation with friction and given orders, and return them by name.
 ///
-/// Least squares of the integrated equation, in which terms of the output and friction have the signs of a passive body;
-/// inputs may have any sign. The friction sign is that of the measured velocity where it exceeds the noise. Elsewhere
-/// the body sticks, and friction is minus the net force. Each run has its own offset, initial velocity and constant of
-/// integration. Empty if friction is known, or no finite solution exists.
+/// The estimate is a least-squares fit of the integrated equation to all runs. Terms of the output and friction have
+/// the signs of a passive body. Inputs may have any sign. The friction sign is that of the measured velocity where it
+/// exceeds the noise. Elsewhere the body sticks, and friction balances the input forces. Each run has its own initial
+/// position, initial velocity and constant force.
+///
+/// The result is empty if the Coulomb coefficient is fixed, or a term has a higher order than the equation. It is also
+/// empty if no finite solution exists.
 ///
 /// # Errors
-/// As [`Recording::pulses`]; [`Error::Interrupted`](crate::error::Error::Interrupted).
+/// An error if the block-pulse means of a run cannot be computed ([`Recording::pulses`]).
+/// [`Error::Interrupted`](crate::error::Error::Interrupted) after a stop request.
 pub(super) fn fit_sliding_body(
     runs: &[Recording],
     item: &ParametricEquation,
@@ -99,12 +105,13 @@ impl Part {
     }
 }
 
-/// Least-squares solution with correct signs; empty if it is not finite.
+/// Return the least-squares coefficients by name, under the sign constraints; empty if the columns are not finite.
 fn signed_least_squares(item: &ParametricEquation, parts: &[Part]) -> BTreeMap<String, f64> {
     let (alpha, rows) = (item.order.constant, parts.iter().map(|part| part.sign.len()).sum());
     let stacked = |of: &dyn Fn(&Part) -> Vec<f64>| parts.iter().flat_map(of).collect::<Vec<f64>>();
     let mut target = stacked(&|part| part.record.signal(item.output).to_vec());
-    // Columns, each with the name of its coefficient. Columns of any sign occur with both.
+    // Columns, each with the name of its coefficient. A column occurs with both signs if its coefficient may have any
+    // sign.
     let (mut names, mut columns) = (Vec::new(), Vec::new());
     let mut add = |name: Option<&String>, sides: &[f64], column: &[f64]| {
         for side in sides {
@@ -116,7 +123,7 @@ fn signed_least_squares(item: &ParametricEquation, parts: &[Part]) -> BTreeMap<S
         let column = stacked(&|part| part.record.integral(term.signal, alpha - term.order.constant));
         match term.fixed_coefficient() {
             Some(value) => target.iter_mut().zip(&column).for_each(|(t, c)| *t -= value * c),
-            // A coefficient times its factor is negative of an own term.
+            // The product of coefficient and factor is negative for a term of the output itself.
             None if term.signal == item.output => {
                 let column: Vec<f64> = column.iter().map(|v| term.factor * v).collect();
                 add(term.coefficient.name(), &[-term.factor.signum()], &column);
@@ -152,7 +159,7 @@ fn signed_least_squares(item: &ParametricEquation, parts: &[Part]) -> BTreeMap<S
     for (column, size) in columns.iter_mut().zip(&sizes).filter(|(_, size)| **size > 0.0) {
         column.iter_mut().for_each(|v| *v /= size);
     }
-    // Inner products are those of the triangular factor, which is small.
+    // The triangular factor has the same inner products as the columns, but is small.
     columns.push(target);
     let (k, factor) = (columns.len(), triangular_factor(&columns));
     let mut small: Vec<Vec<f64>> = (0..k).map(|j| (0..k).map(|i| factor[i * k + j]).collect()).collect();
@@ -213,7 +220,7 @@ mod tests {
         for (name, truth) in [("v", -2.0), ("b", 3.0), ("fc", 0.5)] {
             assert!((estimates[name] / truth - 1.0).abs() < 0.1, "{name}: {estimates:?}");
         }
-        // There is no spring, and one that does not restore is excluded.
+        // The body has no spring, and the sign constraint excludes one that does not restore.
         assert!(estimates["k"] <= 0.0 && estimates["k"] > -0.2, "{estimates:?}");
         Ok(())
     }

@@ -4,53 +4,58 @@ use super::likelihood::{ProfileLikelihood, Refit, MAX_REFIT_EVALUATIONS};
 use crate::error::Result;
 use crate::estimation::joint_fit::problem::OptimizationResult;
 
-/// Tolerance of a bound: maximum difference of the root of the cost rise from its threshold. Newton's next step must
-/// also be shorter than [`BOUND_TOLERANCE`] times the distance from the optimum.
+/// Maximum relative difference between the root of the cost rise and its threshold at a converged bound.
+///
+/// Newton's next step must also be shorter than [`BOUND_TOLERANCE`] times the distance from the optimum.
 const RISE_TOLERANCE: f64 = 0.1;
 /// Maximum Newton step at a converged bound, relative to the distance from the optimum.
 const BOUND_TOLERANCE: f64 = 0.02;
 /// Maximum number of refits for one bound.
 pub(super) const MAX_REFITS_PER_BOUND: usize = 40;
-/// Maximum distance of a bound from the optimum, in half-widths of the Wald interval. Beyond it the interval counts as
-/// unbounded.
+/// Maximum distance of a bound from the optimum, relative to the length of the first step.
+///
+/// Beyond this distance, the interval of a parameter counts as unbounded.
 const MAX_BOUND_DISTANCE: f64 = 1e3;
-/// Minimum length of the first step, relative to the Wald half-width.
+/// Minimum length of the first step, relative to the half-width of the Wald interval.
 const MIN_FIRST_STEP_RATIO: f64 = 0.01;
-/// A bracket is narrow if its width is [`BOUND_TOLERANCE`] times the value inside it, or times this fraction of its
-/// distance from the optimum.
+/// Minimum scale of a bracket, relative to the distance of its outer end from the optimum.
+///
+/// The scale is the magnitude of the parameter at the inner end, at most the distance of the outer end. A bracket is
+/// narrow if its width is at most [`BOUND_TOLERANCE`] times this scale.
 const BRACKET_SCALE_RATIO: f64 = 0.1;
 /// Minimum factor by which one step increases the distance from the optimum.
 const MIN_STEP_FACTOR: f64 = 1.1;
 /// Maximum factor by which one step increases the distance from the optimum.
 const MAX_STEP_FACTOR: f64 = 4.0;
-/// Maximum ratio of the rises of the root cost in two successive steps at which the cost counts as leveling off. The
-/// root cost must also be below this fraction of the threshold.
+/// Maximum ratio of the rises of the root cost in two successive steps at which the cost counts as leveling off.
 const LEVELING_RATIO: f64 = 0.5;
+/// Minimum relative margin of the extrapolated root cost to the threshold at which the cost counts as leveling off.
 const LEVELING_MARGIN: f64 = 0.05;
 /// Minimum distance of a step from both ends of its bracket, as a fraction of the bracket width.
 const BRACKET_MARGIN: f64 = 0.05;
 
-/// Interval of one parameter, or one side of it.
+/// Interval of one parameter, or the part of it on one side of the optimum.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Interval {
     /// Lower bound.
     pub low: f64,
     /// Upper bound.
     pub high: f64,
-    /// (parameter value, rise of the sum of squares in units of the noise variance) at each refit.
+    /// Parameter value and rise of the sum of squares, in units of the noise variance, at each refit.
     pub points: Vec<(f64, f64)>,
-    /// Number of simulations.
+    /// Number of simulations of the search.
     pub evaluations: usize,
 }
 
 impl Interval {
-    /// The whole line, without a refit.
+    /// Unbounded interval, without a refit.
     pub(super) fn whole_line() -> Self {
         Self { low: f64::NEG_INFINITY, high: f64::INFINITY, points: Vec::new(), evaluations: 0 }
     }
 
-    /// Interval shifted by the difference between the optima on the extrapolated grid and on the profile grid, then
-    /// limited to the bounds of its parameter.
+    /// Shift the finite bounds by `by` and limit them to the bounds of the parameter.
+    ///
+    /// `by` is the difference between the optima on the extrapolated grid and on the profile grid.
     pub(super) fn shift(mut self, by: f64, (low, high): (f64, f64)) -> Self {
         for end in [&mut self.low, &mut self.high].into_iter().filter(|end| end.is_finite()) {
             *end = (*end + by).clamp(low, high);
@@ -58,7 +63,7 @@ impl Interval {
         self
     }
 
-    /// Intersection of the two sides.
+    /// Intersection of the intervals of the two sides, with the points of both.
     pub(super) fn intersect(mut self, other: Self) -> Self {
         self.points.extend(other.points);
         self.points.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
@@ -69,49 +74,58 @@ impl Interval {
 
 /// Result of a search for a bound.
 pub enum BoundOutcome {
-    /// The interval on this side of the optimum.
+    /// Interval with the bound on this side of the optimum.
     Found(Interval),
-    /// The budget is exhausted, or the search was cancelled.
+    /// The budget is exhausted, or the search was canceled.
     Paused,
-    /// Parameters of an optimum with a lower cost than the fit.
+    /// Parameter values of an optimum with a lower cost than the fit.
     Lower(Vec<f64>),
 }
 
 /// Search for one bound of the interval of a parameter.
 ///
-/// At a refit the slope of the cost along the parameter is the slope of the profile. The root of its rise is linear if
-/// the cost is a parabola, so one refit then suffices.
+/// At a refit, the derivative of the cost with respect to the parameter is the slope of the profile. If the cost is a
+/// parabola, the root of its rise is a linear function of the parameter. One refit then suffices.
 pub struct BoundSearch {
     /// Index of the parameter.
     pub parameter: usize,
+    /// −1 for the lower bound, 1 for the upper bound.
     side: f64,
+    /// Half-width of the interval, in standard deviations.
     width: f64,
+    /// Value of the parameter at the optimum.
     start: f64,
+    /// Distance of the first refit from the optimum.
     first: f64,
+    /// Maximum distance of a refit from the optimum.
     farthest: f64,
     /// Distance of the next refit from the optimum.
     way: f64,
-    /// Distance of the last refit below the threshold, and of the first refit above it.
+    /// Distance from the optimum of the last refit whose cost is below the threshold.
     inside: f64,
+    /// Distance from the optimum of the first refit whose cost is above the threshold.
     outside: f64,
+    /// Result of the last refit whose cost is below the threshold.
     within: OptimizationResult,
-    /// Result of the refit that the budget interrupted.
+    /// Result of the refit that the exhausted budget interrupted.
     origin: Option<OptimizationResult>,
     refits: usize,
+    /// Root of the cost rise at the previous step.
     reached: f64,
+    /// Increase of this root in the previous step.
     gained: f64,
     points: Vec<(f64, f64)>,
     evaluations: usize,
 }
 
 impl BoundSearch {
-    /// Search of the lower (−1) or upper (1) bound at a half-width in standard deviations.
+    /// Return a search for the lower (`side` −1) or upper (`side` 1) bound; `width` is in standard deviations.
     #[must_use]
     pub fn new(around: &ProfileLikelihood<'_>, parameter: usize, side: f64, width: f64) -> Self {
         let (start, half) = (around.values()[parameter], around.errors[parameter] * width);
         let (low, high) = around.bounds()[parameter];
         let limit = if side < 0.0 { low } else { high };
-        // In a valley without end standard errors are no measure of it.
+        // In an unbounded valley, the standard error is no measure of its length.
         let first = half.min(start.abs().max(MIN_FIRST_STEP_RATIO * half));
         let farthest = (MAX_BOUND_DISTANCE * first).min((limit - start).abs());
         Self {
@@ -140,10 +154,10 @@ impl BoundSearch {
         self.evaluations
     }
 
-    /// Continue with a total budget of simulations.
+    /// Continue the search until it ends or `allowed` simulations have been performed in total.
     ///
     /// # Errors
-    /// [`Error::Interrupted`](crate::error::Error::Interrupted).
+    /// [`Error::Interrupted`](crate::error::Error::Interrupted) after a stop request.
     pub fn advance(
         &mut self,
         around: &ProfileLikelihood<'_>,
@@ -172,7 +186,7 @@ impl BoundSearch {
             let took = refit_result.as_ref().map_or(lap, |refit_result| refit_result.evaluations);
             self.evaluations += took;
             if lap < MAX_REFIT_EVALUATIONS && took >= lap {
-                // An interrupted refit is no bound of the profile.
+                // The result of an interrupted refit is not a point of the profile.
                 self.origin = Some(refit_result.unwrap_or(origin));
                 return Ok(BoundOutcome::Paused);
             }
@@ -187,7 +201,7 @@ impl BoundSearch {
         Ok(BoundOutcome::Found(self.side_of(bound)))
     }
 
-    /// Interval on this side of the optimum.
+    /// Return the interval on this side of the optimum that ends at `bound`.
     fn side_of(&mut self, bound: f64) -> Interval {
         let mut interval = Interval::whole_line();
         *(if self.side < 0.0 { &mut interval.low } else { &mut interval.high }) = bound;
@@ -195,7 +209,7 @@ impl BoundSearch {
         interval
     }
 
-    /// Choose the distance of the next refit. Return the distance of the bound if it is found; NaN ends the search.
+    /// Set the distance of the next refit, or NaN to end the search. Return the distance of the bound if it is found.
     fn step(&mut self, around: &ProfileLikelihood<'_>, refit_result: Option<OptimizationResult>) -> Option<f64> {
         let (i, width) = (self.parameter, self.width);
         let (mut rise, mut following, mut near) = (f64::INFINITY, f64::INFINITY, false);
@@ -217,7 +231,7 @@ impl BoundSearch {
             Some(refit_result) if rise <= width => {
                 (self.inside, self.within) = (self.way, refit_result);
                 if self.way >= self.outside {
-                    // The refit at the outer point did not find the optimum.
+                    // The earlier refit at the outer point did not find the optimum.
                     self.outside = f64::INFINITY;
                 }
                 if self.way >= self.farthest {
@@ -264,7 +278,7 @@ impl BoundSearch {
         None
     }
 
-    /// Midpoint of the bracket; geometric if both values have the same sign.
+    /// Distance of the midpoint of the bracket from the optimum; a geometric mean if both values have the same sign.
     fn bracket_midpoint(&self) -> f64 {
         let (near, far) = (self.start + self.side * self.inside, self.start + self.side * self.outside);
         if near * far > 0.0 {

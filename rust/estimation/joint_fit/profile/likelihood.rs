@@ -1,4 +1,4 @@
-//! Cost of a joint fit around its optimum: rise, refits of all parameters but one, and the cost over two parameters.
+//! Cost of a joint fit around its optimum: rise, refits with one parameter fixed, and the cost over two parameters.
 
 use crate::error::{check_length, Error, Result};
 use crate::estimation::joint_fit::covariance::{covariance, covariance_of_residuals};
@@ -14,40 +14,40 @@ use crate::signal::statistics::inner;
 
 /// Maximum number of evaluations of one refit.
 pub const MAX_REFIT_EVALUATIONS: usize = 120;
-/// The profile uses a grid twice as coarse if that moves the optimum by less than this many standard errors.
+/// Maximum shift of the optimum, in standard errors, at which the profile uses a grid twice as coarse.
 const MAX_OPTIMUM_SHIFT_ERRORS: f64 = 2.0;
-/// The shift must also be less than this fraction of each parameter.
+/// Maximum shift of the optimum, relative to the parameter. A shift within this or the previous limit is accepted.
 const MAX_OPTIMUM_SHIFT_RATIO: f64 = 1e-3;
-/// Tolerance of a refit, as a fraction of the threshold.
+/// Tolerance of a refit, as a fraction of the rise of the sum of squares at one standard error.
 const REFIT_TOLERANCE: f64 = 1e-4;
-/// Decrease of the cost that indicates another optimum, as a fraction of the threshold.
+/// Decrease of the sum of squares that indicates another optimum, as a fraction of its rise at one standard error.
 const LOWER_OPTIMUM_MARGIN: f64 = 0.02;
-/// Relative change of another parameter in one step above which power laws are also tried as initial guesses.
+/// Relative change of another parameter in one step above which initial guesses by power laws are also tried.
 const POWER_LAW_MOVE_RATIO: f64 = 0.3;
-/// Maximum exponent of these power laws.
+/// Maximum magnitude of the exponent of a power law for initial guesses.
 const MAX_POWER_LAW_EXPONENT: f64 = 4.0;
-/// Relative singular value below which a direction of the other parameters has no effect.
+/// Relative singular value below which a direction of the other parameters counts as having no effect.
 const SINGULAR_VALUE_TOLERANCE: f64 = 1e-12;
 
-/// State of a fit around which the cost is evaluated.
+/// State of a fit around whose optimum the cost is evaluated.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitState {
-    /// Estimates, extrapolated to step 0.
+    /// Estimates of all free parameters, extrapolated to step 0.
     pub estimate: Vec<f64>,
-    /// Parameters at the optimum of the finest grid.
+    /// Values of all free parameters at the optimum of the finest grid.
     pub on_grid: Vec<f64>,
     /// Weights of outputs and samples.
     pub weights: Weights,
-    /// Block pulses per sampling interval of the finest grid.
+    /// Number of block pulses per sampling interval of the finest grid.
     pub pulses_per_sample: usize,
-    /// True if halving the step no longer moves the optimum.
+    /// True if halving the step no longer changes the optimum significantly.
     pub step_converged: bool,
-    /// True if no step leads from a stable model to an unstable one.
+    /// True if an optimization must not move from a stable model to an unstable one.
     pub requires_stability: bool,
 }
 
 impl FitState {
-    /// Objective of the fit with these pulses per sampling interval.
+    /// Return the objective of the fit with the given number of block pulses per sampling interval.
     fn objective<'a>(
         &self,
         (free, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
@@ -62,11 +62,11 @@ impl FitState {
 
 /// Result of a refit.
 pub enum Refit {
-    /// The optimum of the other parameters.
+    /// Optimum of the other parameters.
     Optimum(OptimizationResult),
-    /// An optimum with a lower cost than the fit.
+    /// Optimum with a lower cost than the fit.
     Lower(OptimizationResult),
-    /// No initial guess can be simulated.
+    /// No initial guess of the refit can be simulated.
     Infeasible,
 }
 
@@ -74,25 +74,29 @@ pub enum Refit {
 pub struct ProfileLikelihood<'a> {
     free: &'a ParameterSet,
     grid: Objective<'a>,
-    /// The optimum on the grid.
+    /// Optimum on the grid of the profile.
     pub best: OptimizationResult,
-    /// Difference between the estimate, extrapolated to step 0, and this optimum.
+    /// Difference between the estimate, extrapolated to step 0, and the optimum on the grid, per parameter.
     pub shift: Vec<f64>,
-    /// Inverse of the Hessian of the cost, row-major.
+    /// Inverse of the Gauss–Newton Hessian of the cost, row-major.
     bread: Vec<f64>,
-    /// Standard errors.
+    /// Standard errors of all free parameters.
     pub errors: Vec<f64>,
-    /// Rise of the sum of squares at one standard error: the noise variance, widened for colored residuals.
+    /// Rise of the sum of squares at one standard error of each parameter.
+    ///
+    /// This is the noise variance, widened for colored residuals.
     pub units: Vec<f64>,
-    /// Parameters of the fit on its finest grid.
+    /// Values of all free parameters of the fit on its finest grid.
     on_grid: Vec<f64>,
 }
 
 impl<'a> ProfileLikelihood<'a> {
-    /// Profile likelihood around the optimum that is found from the fit with at most `evaluations` evaluations.
+    /// Return the profile likelihood around the optimum that is reached from the fit.
+    ///
+    /// `evaluations` is the maximum number of evaluations.
     ///
     /// # Errors
-    /// A simulation that fails at the first point, or a stop request ([`Objective::minimize`]).
+    /// The error of the simulation of the fit if it fails. [`Error::Interrupted`] after a stop request.
     pub fn new(
         sources: (&'a ParameterSet, &'a Recordings, &'a Stop),
         fit: &FitState,
@@ -100,7 +104,8 @@ impl<'a> ProfileLikelihood<'a> {
     ) -> Result<Self> {
         let difference = |best: &[f64]| fit.estimate.iter().zip(best).map(|(a, b)| a - b).collect();
         if fit.step_converged && fit.pulses_per_sample > 1 {
-            // Half as fine a grid moved the optimum by less than its errors, and how steep it is by less still.
+            // Halving the step no longer changes the optimum. A grid half as fine changes it by less than its errors,
+            // and its curvature by even less.
             let coarse = fit.objective(sources, fit.pulses_per_sample / 2);
             match coarse.and_then(|grid| Self::at(sources.0, grid, &fit.on_grid, evaluations)) {
                 Err(Error::Interrupted) => return Err(Error::Interrupted),
@@ -133,10 +138,10 @@ impl<'a> ProfileLikelihood<'a> {
         })
     }
 
-    /// Profile likelihood around the optimum reached from another point.
+    /// Return the profile likelihood around the optimum that is reached from the parameter values `values`.
     ///
     /// # Errors
-    /// A simulation that fails at the first point, or a stop request ([`Objective::minimize`]).
+    /// The error of the simulation at `values` if it fails. [`Error::Interrupted`] after a stop request.
     pub fn moved_to(&self, values: &[f64]) -> Result<Self> {
         let likelihood = Self::at(self.free, self.grid.clone(), values, MAX_REFIT_EVALUATIONS)?;
         Ok(Self { on_grid: self.on_grid.clone(), ..likelihood })
@@ -155,19 +160,19 @@ impl<'a> ProfileLikelihood<'a> {
         self.errors.len()
     }
 
-    /// Parameters at the optimum.
+    /// Values of all free parameters at the optimum.
     #[must_use]
     pub fn values(&self) -> Vec<f64> {
         self.best.values()
     }
 
-    /// Half the sum of squares at the optimum.
+    /// Half the sum of squared residuals at the optimum.
     #[must_use]
     pub fn cost(&self) -> f64 {
         self.best.cost
     }
 
-    /// Bounds of all free parameters.
+    /// Lower and upper bound of each free parameter.
     #[must_use]
     pub fn bounds(&self) -> Vec<(f64, f64)> {
         self.free.problem.bounds()
@@ -179,21 +184,21 @@ impl<'a> ProfileLikelihood<'a> {
         self.grid.stop()
     }
 
-    /// True if the data determine a parameter at all.
+    /// Return true if the data determine parameter `i`.
     #[must_use]
     pub fn is_identifiable(&self, i: usize) -> bool {
         [self.errors[i], self.units[i]].into_iter().all(|v| v > 0.0 && v.is_finite())
     }
 
-    /// Rise of a sum of squares above the optimum, in standard deviations.
+    /// Root of the rise of a sum of squares above that of the optimum, in standard deviations of parameter `i`.
     #[must_use]
     pub fn rise(&self, i: usize, squares: f64) -> f64 {
         ((squares - 2.0 * self.cost()).max(0.0) / self.units[i]).sqrt()
     }
 
-    /// True if the optimum has a lower cost than the fit on the next finer grid as well.
+    /// Return true if the optimum has a lower cost than the fit on the next finer grid as well.
     ///
-    /// Both are evaluated there and not refitted, because a refit could exploit the discretization error of that grid.
+    /// Both points are evaluated on that grid and not refitted, because a refit could exploit its discretization error.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -206,10 +211,11 @@ impl<'a> ProfileLikelihood<'a> {
         Ok(finite(costs)?.is_some_and(|(after, before)| after < before))
     }
 
-    /// Relative error of the Wald interval of a parameter, from one evaluation at each bound.
+    /// Relative error of the Wald interval of parameter `i` with half-width `width` in standard deviations.
     ///
-    /// Each bound is moved along the conditional optimum, and all other parameters follow by one linear step. Infinite
-    /// if a bound violates a constraint or its simulation is not finite.
+    /// At each bound, the other parameters follow the linearized profile and one linear step. The rise of the cost
+    /// there is compared with the expected one. The error is infinite if a bound violates a constraint or its
+    /// simulation is not finite. It is 0 for a parameter that is not identifiable.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -236,7 +242,7 @@ impl<'a> ProfileLikelihood<'a> {
         Ok(worst)
     }
 
-    /// Refit all other parameters at a value of one, from a nearby optimum.
+    /// Refit all other parameters with parameter `i` fixed at `value`, starting from a nearby optimum.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -251,11 +257,11 @@ impl<'a> ProfileLikelihood<'a> {
         Ok(Refit::Infeasible)
     }
 
-    /// Half the derivative of the sum of squares by one parameter; 0 on overflow.
+    /// Half the derivative of the sum of squares with respect to parameter `i`; 0 on overflow.
     #[must_use]
     pub fn slope(&self, refit: &OptimizationResult, i: usize) -> f64 {
         let slope = inner(&refit.jacobian[i], &refit.residuals);
-        // Near where a simulation diverges its derivatives overflow.
+        // Near a point at which a simulation diverges, its derivatives overflow.
         if slope.is_finite() {
             slope
         } else {
@@ -263,11 +269,11 @@ impl<'a> ProfileLikelihood<'a> {
         }
     }
 
-    /// Initial guesses with parameter `i` fixed at `value`, most promising first.
+    /// Return initial guesses with parameter `i` fixed at `value`, most promising first.
     ///
-    /// The other parameters follow the tangent or stay; if the tangent moves them far, also power laws, for all parameters
-    /// or for the orders only.
-    /// Unbounded valleys often have the form d mu = const, d + a = const.
+    /// The other parameters follow the tangent of the profile, or they are unchanged. If the tangent changes them
+    /// strongly, power laws are also tried, for all parameters or for the orders only. The reason is that unbounded
+    /// valleys often have the form d·μ = const and d + a = const, for parameters d, μ and a.
     fn refit_starts(&self, i: usize, value: f64, near: &OptimizationResult) -> Result<Vec<Vec<f64>>> {
         let (values, tangent) = (near.values(), tangent(near, i)?);
         let (orders, by) = (self.free.orders.len(), value - values[i]);
@@ -298,7 +304,7 @@ impl<'a> ProfileLikelihood<'a> {
         Ok(ranked.into_iter().map(|(_, point)| point).collect())
     }
 
-    /// Point with a given value of one parameter, the others moved as far as feasible.
+    /// Return the point with parameter `i` at `value`, and the others moved along `direction` as far as feasible.
     fn point_along(&self, i: usize, values: &[f64], direction: &[f64], value: f64) -> Result<Vec<f64>> {
         let mut at = values.to_vec();
         at[i] = value;
@@ -324,21 +330,23 @@ impl<'a> ProfileLikelihood<'a> {
     }
 }
 
-/// Cost of a joint fit over two of its parameters.
+/// Cost of a joint fit as a function of two of its parameters.
 pub struct CostSurface<'a> {
     free: &'a ParameterSet,
     grid: Objective<'a>,
     best: OptimizationResult,
     pair: [usize; 2],
-    /// Orthonormal basis of the sensitivities of the other parameters; None if these stay fixed.
+    /// Orthonormal basis of the sensitivities of the other parameters; None if these are fixed.
     sensitivities: Option<Sensitivities>,
 }
 
 impl<'a> CostSurface<'a> {
-    /// Surface around the optimum of the finest grid. With `refit`, all other parameters follow by one linear step.
+    /// Return the cost surface of the two parameters `pair` around the optimum of the finest grid.
+    ///
+    /// If `refit` is true, all other parameters follow by one linear step at each point. Otherwise they are fixed.
     ///
     /// # Errors
-    /// A simulation that fails at the first point, or a stop request ([`Objective::minimize`]).
+    /// The error of the simulation of the fit if it fails. [`Error::Interrupted`] after a stop request.
     pub fn new(
         (free, source, stop): (&'a ParameterSet, &'a Recordings, &'a Stop),
         fit: &FitState,
@@ -352,7 +360,9 @@ impl<'a> CostSurface<'a> {
         Ok(Self { free, grid, best, pair, sensitivities })
     }
 
-    /// Values of one of the two parameters around the optimum, within its bounds.
+    /// Return `points` evenly spaced values of one of the two parameters, `of` = 0 or 1.
+    ///
+    /// They are within bounds and at most `half` from the optimum.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn axis(&self, of: usize, half: f64, points: usize) -> Vec<f64> {
@@ -362,7 +372,7 @@ impl<'a> CostSurface<'a> {
         (0..points).map(|k| if k + 1 == points { high } else { low + k as f64 * step }).collect()
     }
 
-    /// Sum of squares at the optimum.
+    /// Sum of squared residuals at the optimum.
     #[must_use]
     pub fn least(&self) -> f64 {
         self.squares(&self.best)
@@ -376,8 +386,9 @@ impl<'a> CostSurface<'a> {
         inner(&rest, &rest)
     }
 
-    /// Return the sum of squares at each pair of parameter values, with one row per value in `second`. It is infinite
-    /// if the simulation is not finite.
+    /// Return the sum of squares at each pair of parameter values, with one row per value in `second`.
+    ///
+    /// It is infinite if the simulation is not finite.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.
@@ -408,7 +419,7 @@ fn minimize(
     problem.minimize(grid.experiments(), &start, settings, grid.requires_stability, grid.stop())
 }
 
-/// None where a point cannot be simulated.
+/// Convert the error of a failed simulation to None. [`Error::Interrupted`] remains an error.
 fn finite<T>(outcome: Result<T>) -> Result<Option<T>> {
     match outcome {
         Ok(outcome) => Ok(Some(outcome)),
@@ -417,16 +428,17 @@ fn finite<T>(outcome: Result<T>) -> Result<Option<T>> {
     }
 }
 
-/// Significant singular vectors and values of sensitivities with unit rows.
+/// Significant singular values and vectors of sensitivities whose rows have unit norm.
 type Sensitivities = SingularValues;
 
-/// Return the singular value decomposition of the sensitivities, without the parameters `without`, and the norms of the
-/// rows. Rows are first scaled to norm 1.
+/// Return the significant singular values and vectors of the sensitivities, and the norms of the rows.
+///
+/// The parameters `without` are omitted. Rows are first scaled to norm 1.
 fn other_sensitivities(result: &OptimizationResult, without: &[usize]) -> Result<(Sensitivities, Vec<f64>)> {
     let others = result.jacobian.iter().enumerate().filter(|(j, _)| !without.contains(j)).map(|(_, row)| row);
     let (mut scaled, mut lengths) = (Vec::new(), Vec::new());
     for row in others {
-        // Far out, sensitivities may be so large that their squares overflow.
+        // Far from the optimum, sensitivities may be so large that their squares overflow.
         let peak = row.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
         let unit: Vec<f64> = row.iter().map(|v| v / if peak > 0.0 { peak } else { 1.0 }).collect();
         let length = norm(&unit).max(1.0);
@@ -447,8 +459,9 @@ fn other_sensitivities(result: &OptimizationResult, without: &[usize]) -> Result
     Ok((factors, lengths))
 }
 
-/// Return the residuals after one least-squares step of the linearized parameters: the projection orthogonal to
-/// `sensitivities`.
+/// Return the residuals after one least-squares step of the linearized parameters.
+///
+/// This is the projection of the residuals orthogonal to `sensitivities`.
 fn projected_residuals(result: &OptimizationResult, sensitivities: &Sensitivities) -> Vec<f64> {
     let mut rest = result.residuals.clone();
     for direction in &sensitivities.left {
@@ -458,7 +471,7 @@ fn projected_residuals(result: &OptimizationResult, sensitivities: &Sensitivitie
     rest
 }
 
-/// Direction of all parameters along the profile when one moves by 1.
+/// Derivative of all parameters with respect to parameter `i` along the profile. The derivative of parameter `i` is 1.
 fn tangent(result: &OptimizationResult, i: usize) -> Result<Vec<f64>> {
     let (SingularValues { left, values, right }, lengths) = other_sensitivities(result, &[i])?;
     let weights: Vec<f64> =

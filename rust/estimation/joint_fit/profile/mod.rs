@@ -1,7 +1,8 @@
-//! Profile likelihood of a joint fit: bounds of the intervals on which the cost rises by no more than the noise explains.
+//! Profile likelihood of a joint fit: intervals in which the cost rises by no more than the noise explains.
 //!
-//! At each value of one parameter all others are refitted (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al.,
-//! doi:10.1093/bioinformatics/btp358). [`ProfileLikelihood`] is the cost around an optimum, [`BoundSearch`] one bound.
+//! At each value of one parameter, all others are refitted (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al.,
+//! doi:10.1093/bioinformatics/btp358). [`ProfileLikelihood`] evaluates the cost around an optimum, and [`BoundSearch`]
+//! finds one bound.
 
 mod bound_search;
 mod likelihood;
@@ -19,40 +20,42 @@ pub use likelihood::{CostSurface, FitState, ProfileLikelihood, MAX_REFIT_EVALUAT
 
 use bound_search::MAX_REFITS_PER_BOUND;
 
-/// Maximum relative error of a bound of the Wald interval. It is estimated with one linear step of all other
-/// parameters. Above it the parameter is profiled.
+/// Maximum relative error of the Wald interval of a parameter; above it, the parameter is profiled.
+///
+/// The error is estimated with one linear step of all other parameters.
 const MAX_QUADRATIC_ERROR: f64 = 0.1;
-/// Minimum remaining number of simulations with which the search for a bound continues.
+/// Minimum number of remaining simulations per bound with which the search continues.
 const MIN_BUDGET_PER_BOUND: usize = 10;
-/// A lower optimum is reported if it lowers the sum of squares by more than this fraction of the rise at one standard
-/// error.
+/// Minimum decrease of the sum of squares at which a lower optimum is reported.
+///
+/// It is relative to the rise of the sum of squares at one standard error.
 const MIN_COST_REDUCTION: f64 = 0.1;
-/// Maximum number of optima below the fit from which the search is restarted.
+/// Maximum number of searches. A lower optimum ends a search, and the next one starts around it.
 const MAX_LOWER_OPTIMA: usize = 5;
 
 /// Settings of profile-likelihood intervals: parameters, confidence level and resources.
 #[derive(Debug, Clone)]
 pub struct ProfileSettings {
-    /// Parameters; None for those whose Wald interval is inaccurate.
+    /// Indices of the parameters; None for those whose Wald interval is inaccurate.
     pub parameters: Option<Vec<usize>>,
     /// Half-width of the interval, in standard deviations.
     pub width: f64,
-    /// Maximum number of simulations for all bounds, and the smallest initial budget of each bound; None for no limit.
+    /// Maximum number of simulations for all bounds, and minimum initial budget of each bound; None for no limit.
     pub budget: Option<(usize, usize)>,
-    /// Threads; results do not depend on it.
+    /// Number of threads. Results do not depend on it.
     pub threads: usize,
 }
 
 /// Profile-likelihood intervals, and any lower optimum found during the search.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ProfileResult {
-    /// Interval of each profiled parameter.
+    /// Index and interval of each profiled parameter.
     pub intervals: Vec<(usize, Interval)>,
-    /// Parameters of an optimum with a significantly lower cost than the fit.
+    /// Parameter values of an optimum with a significantly lower cost than the fit; None if no such optimum was found.
     pub lower_optimum: Option<Vec<f64>>,
     /// True if that optimum also has a lower cost than the fit on the next finer grid.
     pub lower_on_finer_grid: bool,
-    /// Parameters whose profile needed more simulations than allowed.
+    /// Indices of the parameters whose profile needed more simulations than allowed.
     pub incomplete: Vec<usize>,
     /// Total number of simulations.
     pub evaluations: usize,
@@ -60,12 +63,14 @@ pub struct ProfileResult {
 
 /// Compute profile-likelihood intervals around an optimum.
 ///
-/// Each bound is searched from the optimum independently. After a lower optimum the search starts again around it. The
-/// budget is distributed evenly, and the unused part goes to the bounds that are not found yet. A parameter that the
-/// data do not determine has the whole line as its interval. Progress is (bounds found, all bounds).
+/// Each bound is searched from the optimum independently of the others. If a lower optimum is found, the search starts
+/// again around it. The budget is distributed evenly, and unused simulations go to the bounds that are not found yet.
+/// The interval of a parameter that the data do not determine is unbounded. Progress is reported as the number of
+/// bounds found and the number of all bounds.
 ///
 /// # Errors
-/// [`Error::Interrupted`](crate::error::Error::Interrupted), those of the listener, and of a covariance.
+/// [`Error::Interrupted`](crate::error::Error::Interrupted) after a stop request. Also the error of the listener, and
+/// the error of a covariance that cannot be computed.
 pub fn profile_intervals(
     start: ProfileLikelihood<'_>,
     settings: &ProfileSettings,
@@ -93,7 +98,7 @@ pub fn profile_intervals(
         let bounds_result = search_bounds(&around, &parameters, settings, budget, report)?;
         (bounds, spent) = (bounds_result.bounds, spent + bounds_result.evaluations);
         let Some(lower) = bounds_result.lower else { break };
-        // The limit for step 0 of another optimum is not known.
+        // For another optimum, the extrapolation to step 0 is not known.
         around = around.moved_to(&lower)?;
     }
     let units: Vec<f64> = around.units.iter().copied().filter(|unit| unit.is_finite()).collect();
@@ -116,14 +121,16 @@ pub fn profile_intervals(
     Ok(result)
 }
 
-/// Bounds that were found, the lower optimum that ended the search, and the number of simulations.
+/// Result of the search for all bounds: one interval per parameter and side, or None if it is not found.
+///
+/// `lower` is a lower optimum that ended the search, and `evaluations` the number of simulations.
 struct FoundBounds {
     bounds: Vec<(usize, Option<Interval>)>,
     lower: Option<Vec<f64>>,
     evaluations: usize,
 }
 
-/// Search both bounds of every identifiable parameter.
+/// Search for both bounds of every identifiable parameter.
 ///
 /// The search stops at the first lower optimum, because the other bounds would belong to the wrong optimum.
 fn search_bounds(
@@ -143,7 +150,7 @@ fn search_bounds(
     let mut lower = None;
     while bounds.iter().any(|(_, bound)| bound.is_none()) {
         let open = bounds.iter().filter(|(_, bound)| bound.is_none()).count();
-        // In whole rounds, so that what a bound may take does not depend on the number of threads.
+        // Budgets are assigned in whole rounds, so that they do not depend on the number of threads.
         let share = budget.map_or(2 * MAX_REFIT_EVALUATIONS * MAX_REFITS_PER_BOUND, |most| {
             most.saturating_sub(took.iter().sum()) / open
         });
