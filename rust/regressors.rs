@@ -1,9 +1,9 @@
-//! Regressors of records: a bank of distinct columns I^η s, shared by all candidates, with filter transients as
-//! impulses.
+//! Regressors of records: a bank of distinct columns I^η s (fractional integrals of signals), shared by all candidates.
+//! Also initial terms and transients of sensor filters.
 //!
-//! Filter transients are written as initial terms with the exponents −1, −2, …. They affect only the sensor, so they
-//! are added to the output of the equation. If the whole equation is filtered and its output was not measured through
-//! the filter, they enter the equation as inputs instead.
+//! Filter transients are represented by impulses and their derivatives, as initial terms with the exponents −1, −2, ….
+//! They affect only the sensor, so they are added to the output of the equation. If the whole equation is filtered and
+//! its output was not measured through the filter, they enter the equation as inputs instead.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -14,38 +14,44 @@ use crate::parallel::{self, Stop};
 use crate::series::{self, Buffers, Kernel};
 use crate::signal::block_pulse::{pulse_means, Intersample, PulseJump, PulseMeans};
 
-/// Memory limit of a single bank, and default limit of a search, in bytes.
+/// Memory limit of a single bank, and default limit of a search \[bytes\].
 pub const BANK_LIMIT: u64 = 2 << 30;
 
-/// Run as pulse means: all signals over the same m pulses of length `step`.
+/// Run as pulse means (means over sampling intervals): all signals over the same m pulses of length `step` \[s\].
 #[derive(Debug, Clone)]
 pub struct Record {
     step: f64,
+    /// Pulse means of each signal.
     signals: Vec<Vec<f64>>,
+    /// Series of the sensor filter that the signals passed, if there is one.
     filter: Option<Vec<f64>>,
+    /// Pulse means of a low-noise substitute of each signal, for instrumental variables.
     clean: Option<Vec<Vec<f64>>>,
-    /// Signals whose own sensor filter may have an initial transient. Empty if there is no transient.
+    /// True for each signal whose sensor filter may have an initial transient. Empty if there is no transient.
     filter_transients: Vec<bool>,
-    /// Signals minus their initial level, if it is not zero. Empty if all levels are zero.
+    /// Signal minus its initial level, `None` if the level is zero. Empty if no levels were given.
     deviations: Vec<Option<Vec<f64>>>,
-    /// Filter responses to an impulse and its derivatives, if known more accurately than from the pulse grid.
+    /// Pulse means of the filter responses to an impulse and to its derivatives, if they are known more accurately than
+    /// from the pulse grid.
     impulse_responses: Vec<Vec<f64>>,
     /// Jumps of each zero-order-hold signal within pulses, in the sequence of time. Empty if unknown.
     jumps: Vec<Vec<PulseJump>>,
 }
 
 impl Record {
-    /// Record of finite pulse means. All signals have the same nonzero length.
+    /// Build a record from pulse means. All signals must be finite and have the same nonzero length m.
     ///
-    /// `filter` is the series of a known sensor filter that the signals passed. It is applied to initial terms.
+    /// `filter` is the series (m terms) of a known sensor filter that the signals passed. It is applied to initial
+    /// terms.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`] naming the signal by number, [`Error::OutOfRange`] for the step.
+    /// [`Error::Length`] for wrong lengths, [`Error::NotFinite`] with the number of the signal, [`Error::OutOfRange`]
+    /// for the step.
     pub fn new(step: f64, signals: Vec<PulseMeans>, filter: Option<Vec<f64>>) -> Result<Self> {
         Self::from_rows(step, signals.into_iter().map(PulseMeans::into_vec).collect(), filter)
     }
 
-    /// Record of the values of pulse means.
+    /// Build a record from the values of pulse means, as [`Record::new`] does.
     pub(crate) fn from_rows(step: f64, signals: Vec<Vec<f64>>, filter: Option<Vec<f64>>) -> Result<Self> {
         check_step(step)?;
         let m = signals.first().map_or(0, Vec::len);
@@ -73,11 +79,12 @@ impl Record {
         })
     }
 
-    /// Record of the pulse means of sampled signals, one pulse per sampling interval.
+    /// Build a record from the pulse means of sampled signals, one pulse per sampling interval. Each signal is given by
+    /// its samples and its intersample behavior.
     ///
     /// # Errors
-    /// Fewer than two samples or a sample that is not finite ([`pulse_means`]); signals of unequal length or an invalid
-    /// step ([`Record::new`]).
+    /// An error for fewer than two samples or a sample that is not finite ([`pulse_means`]). An error for signals of
+    /// unequal length or an invalid step ([`Record::new`]).
     ///
     /// ```
     /// # use ftlm::regressors::Record;
@@ -94,11 +101,13 @@ impl Record {
         Self::new(step, signals.iter().map(means).collect::<Result<_>>()?, None)
     }
 
-    /// Add the jumps of each signal within pulses. Dry friction needs them: a body at rest starts to slide at a jump.
+    /// Return the record with the jumps of each signal within pulses. Dry friction needs them, because a body at rest
+    /// may start to slide at a jump.
     ///
     /// # Errors
-    /// [`Error::Length`] for another number of signals; [`Error::Structure`] for a jump outside of the pulses, at an
-    /// edge, or not later than the previous one of its signal; [`Error::NotFinite`].
+    /// [`Error::Length`] for a wrong number of signals. [`Error::Structure`] for a jump outside of the pulses, at the
+    /// edge of a pulse, or not later than the previous jump of its signal. [`Error::NotFinite`] for values around a
+    /// jump that are not finite.
     pub fn with_jumps(mut self, jumps: Vec<Vec<PulseJump>>) -> Result<Self> {
         check_length("jumps of signals", self.len(), jumps.len())?;
         for (signal, row) in jumps.iter().enumerate() {
@@ -126,16 +135,17 @@ impl Record {
         Ok(self)
     }
 
-    /// Jumps of a signal within pulses.
+    /// Return the jumps of a signal within pulses.
     #[must_use]
     pub fn jumps(&self, index: usize) -> &[PulseJump] {
         self.jumps.get(index).map_or(&[], Vec::as_slice)
     }
 
-    /// Add a low-noise substitute of every signal, for instrumental variables.
+    /// Return the record with a low-noise substitute of every signal, for instrumental variables.
     ///
     /// # Errors
-    /// [`Error::Length`] for a wrong number of substitutes, and as [`Record::new`].
+    /// [`Error::Length`] for a wrong number of substitutes or pulse means. [`Error::NotFinite`] for a value that is not
+    /// finite.
     pub fn with_clean(mut self, clean: Vec<PulseMeans>) -> Result<Self> {
         let clean: Vec<_> = clean.into_iter().map(PulseMeans::into_vec).collect();
         check_length("clean signals", self.signals.len(), clean.len())?;
@@ -148,7 +158,7 @@ impl Record {
         Ok(self)
     }
 
-    /// Record of the substitutes, or a copy if there are none.
+    /// Return a record in which every signal is replaced by its low-noise substitute. Return a copy if there are none.
     #[must_use]
     pub fn clean_record(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
@@ -166,7 +176,7 @@ impl Record {
         }
     }
 
-    /// Record in which every signal except this one is replaced by its substitute for noise-free regressors.
+    /// Return a record in which every signal except this one is replaced by its low-noise substitute.
     ///
     /// # Panics
     /// If the signal does not exist.
@@ -177,10 +187,11 @@ impl Record {
         cleaned
     }
 
-    /// Record whose signals and initial terms pass a causal filter, given as a series of m terms.
+    /// Return the record with all signals and initial terms passed through a causal filter, given as a series of m
+    /// terms.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`] if the filter overflows.
+    /// [`Error::Length`] for another number of terms, [`Error::NotFinite`] if a filtered signal overflows.
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -200,16 +211,18 @@ impl Record {
         Ok(through)
     }
 
-    /// Record with nonzero initial conditions.
+    /// Return the record with nonzero initial conditions.
     ///
-    /// `transients` marks signals whose sensor filter may have an initial transient. `levels` are the initial levels of
-    /// the signals. `answers` are pulse means of the known responses of the filter to an impulse and its derivatives.
+    /// `transients` is true for each signal whose sensor filter may have an initial transient. `levels` are the initial
+    /// levels of the signals. `answers` are pulse means of the known responses of the filter to an impulse and its
+    /// derivatives.
     ///
-    /// An improper term differentiates the deviation of a signal from its level, so that the start of the record does
-    /// not act as a jump. Initial terms describe the effect of earlier inputs.
+    /// A term whose order exceeds the order of its equation differentiates the deviation of a signal from its initial
+    /// level. The start of the record therefore does not act as a jump. Initial terms describe the effect of earlier
+    /// inputs.
     ///
     /// # Errors
-    /// [`Error::Length`] for a wrong number of flags or levels, or responses of other lengths; [`Error::NotFinite`] for
+    /// [`Error::Length`] for a wrong number of flags or levels, or responses of wrong length. [`Error::NotFinite`] for
     /// a level or a response.
     ///
     /// ```
@@ -237,7 +250,7 @@ impl Record {
         Ok(self)
     }
 
-    /// Pulse means of a signal minus its initial level, see [`Record::with_initial_state`].
+    /// Return the pulse means of a signal minus its initial level ([`Record::with_initial_state`]).
     ///
     /// # Panics
     /// If the signal does not exist.
@@ -246,8 +259,8 @@ impl Record {
         self.deviations.get(index).and_then(Option::as_ref).unwrap_or(&self.signals[index])
     }
 
-    /// Pulse means of the signal of a term that is integrated by `eta`. For `eta` below 0 they are deviations from the
-    /// initial level.
+    /// Return the pulse means of the signal of a term with the order of integration `eta`. For `eta` below 0 they are
+    /// deviations from the initial level.
     pub(crate) fn term_signal(&self, index: usize, eta: f64) -> &[f64] {
         if eta < 0.0 {
             self.deviation_signal(index)
@@ -256,48 +269,48 @@ impl Record {
         }
     }
 
-    /// Whether a signal passed a sensor filter that may have an initial transient.
+    /// Return true if a signal passed a sensor filter that may have an initial transient.
     #[must_use]
     pub fn has_filter_transient(&self, index: usize) -> bool {
         self.filter_transients.get(index).copied().unwrap_or(false)
     }
 
-    /// Whether signals and initial terms passed a sensor filter.
+    /// Return true if signals and initial terms passed a sensor filter.
     #[must_use]
     pub fn is_filtered(&self) -> bool {
         self.filter.is_some()
     }
 
-    /// Series of the sensor filter.
+    /// Return the series of the sensor filter, `None` without a filter.
     pub(crate) fn filter(&self) -> Option<&[f64]> {
         self.filter.as_deref()
     }
 
-    /// Number of pulses.
+    /// Return the number m of pulses (sampling intervals).
     #[must_use]
     pub fn m(&self) -> usize {
         self.signals[0].len()
     }
 
-    /// Pulse width in seconds.
+    /// Return the pulse length \[s\].
     #[must_use]
     pub fn step(&self) -> f64 {
         self.step
     }
 
-    /// Number of signals.
+    /// Return the number of signals.
     #[must_use]
     pub fn len(&self) -> usize {
         self.signals.len()
     }
 
-    /// Whether the record has no signals; always false, since a record has at least one.
+    /// Return false, because a record has at least one signal.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.signals.is_empty()
     }
 
-    /// Pulse means of a signal, [`Record::m`] of them.
+    /// Return the [`Record::m`] pulse means of a signal.
     ///
     /// # Panics
     /// If the signal does not exist.
@@ -306,8 +319,8 @@ impl Record {
         &self.signals[index]
     }
 
-    /// Fractional integral I^η of a signal as [`Record::m`] pulse means, η in (−1, 10]. Below 0 it is a derivative. O(m
-    /// log m).
+    /// Return the fractional integral I^η of a signal as [`Record::m`] pulse means, for η = `eta` in (−1, 10]. For η
+    /// below 0 it is a derivative. O(m log m).
     ///
     /// # Panics
     /// If the signal does not exist.
@@ -328,9 +341,10 @@ impl Record {
         series::multiply(&kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
     }
 
-    /// Pulse means of the initial term t^exponent, t in seconds, after the sensor filter if there is one.
+    /// Return the pulse means of the initial term t^exponent, with t in seconds. They pass the sensor filter if there
+    /// is one.
     ///
-    /// Exponents −1, −2, … are an impulse and its derivatives.
+    /// The exponents −1, −2, … stand for an impulse and its derivatives.
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -344,7 +358,8 @@ impl Record {
         self.impulse_response(exponent).unwrap_or_else(|| self.apply_filter(power_means(exponent, self.m(), self.step)))
     }
 
-    /// Response of the filter to an impulse or to a derivative of one, if known.
+    /// Return the pulse means of the filter response to an impulse or its derivative, given by the exponent −1, −2, ….
+    /// `None` if the response is not known or the exponent is another one.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn impulse_response(&self, exponent: f64) -> Option<Vec<f64>> {
         if !is_impulse(exponent) {
@@ -353,7 +368,8 @@ impl Record {
         self.impulse_responses.get((-1.0 - exponent) as usize).cloned()
     }
 
-    /// Pulse means of an initial term as an input of a simulation ([`power_pulses`], or filtered means).
+    /// Return the pulse means of an initial term t^exponent as an input of a simulation. With a sensor filter, they are
+    /// corrected as in [`power_pulses`] and filtered.
     pub(crate) fn forcing_term(&self, exponent: f64) -> Vec<f64> {
         match &self.filter {
             None => self.initial_term(exponent),
@@ -364,13 +380,14 @@ impl Record {
         }
     }
 
-    /// Initial term t^e as an input before the filter. None for an unfiltered record and for a known filter response.
+    /// Return the pulse means of an initial term t^exponent as an input, not filtered. `None` for a record without
+    /// filter or if the filter response is known.
     pub(crate) fn unfiltered_term(&self, exponent: f64) -> Option<Vec<f64>> {
         let passes = self.filter.is_some() && self.impulse_response(exponent).is_none();
         passes.then(|| power_pulses(exponent, self.m(), self.step))
     }
 
-    /// Output of the record's sensor filter for a series.
+    /// Return a series after the record's sensor filter, unchanged without a filter.
     pub(crate) fn apply_filter(&self, powers: Vec<f64>) -> Vec<f64> {
         match &self.filter {
             None => powers,
@@ -379,38 +396,39 @@ impl Record {
     }
 }
 
-/// Key of a column of a bank: a regressor.
+/// Key of a column of a bank, which identifies a regressor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Key {
-    /// Integral I^η of a signal, η as an integer multiple of the order resolution.
+    /// Fractional integral I^η of a signal.
     Integral {
-        /// Signal of the record.
+        /// Index of the signal in the record.
         signal: usize,
-        /// Integration order, see [`grains`].
+        /// Order of integration η as an integer multiple of the order resolution ([`grains`]).
         order: i64,
     },
-    /// Initial term t^e, e as an integer multiple of the order resolution.
+    /// Initial term t^e.
     Initial {
-        /// Exponent, see [`grains`].
+        /// Exponent e as an integer multiple of the order resolution ([`grains`]).
         exponent: i64,
     },
 }
 
 impl Key {
-    /// Key under which the regressor I^eta of a signal is stored.
+    /// Return the key of the fractional integral I^eta of a signal.
     #[must_use]
     pub fn integral(signal: usize, eta: f64) -> Self {
         Self::Integral { signal, order: grains(eta) }
     }
 
-    /// Key of an initial term.
+    /// Return the key of the initial term t^exponent.
     #[must_use]
     pub fn initial(exponent: f64) -> Self {
         Self::Initial { exponent: grains(exponent) }
     }
 }
 
-/// Distinct regressors in order of first use, identical for all records of a search.
+/// Distinct regressors in the sequence of first use, identical for all records of a search. The position of a regressor
+/// is its column in a bank.
 #[derive(Debug, Default, Clone)]
 pub struct Index {
     keys: Vec<Key>,
@@ -418,7 +436,7 @@ pub struct Index {
 }
 
 impl Index {
-    /// Position of a key. A new key is appended.
+    /// Return the position of a key. A new key is appended.
     pub fn insert(&mut self, key: Key) -> usize {
         let keys = &mut self.keys;
         *self.positions.entry(key).or_insert_with(|| {
@@ -427,7 +445,7 @@ impl Index {
         })
     }
 
-    /// Position of a key; None if it is absent.
+    /// Return the position of a key, `None` if it is absent.
     #[must_use]
     pub fn get(&self, key: Key) -> Option<usize> {
         self.positions.get(&key).copied()
@@ -439,24 +457,26 @@ impl Index {
         self.positions = self.keys.iter().enumerate().map(|(i, &key)| (key, i)).collect();
     }
 
-    /// All keys in order.
+    /// Return all keys in the sequence of their positions.
     #[must_use]
     pub fn keys(&self) -> &[Key] {
         &self.keys
     }
 }
 
-/// Columns of an [`Index`] on one record.
+/// Values of all regressors of an [`Index`] on one record, one column per regressor.
 pub struct Bank {
     m: usize,
-    /// All columns, contiguous.
+    /// Values of all columns, one column after another.
     columns: Vec<f64>,
-    /// Kernels of the output columns, contiguous.
+    /// Kernels of the columns that are integrals of the output, one kernel after another.
     kernels: Vec<f64>,
+    /// Index of the kernel of each column, `None` if the column is not an integral of the output.
     own: Vec<Option<usize>>,
 }
 
-/// Columns of all signals at one integration order, and the kernel if the output is among them.
+/// Columns of all signals at one order of integration, to be computed. The kernel is included if the output is among
+/// the signals.
 struct OrderColumns<'a> {
     order: i64,
     columns: Vec<(usize, &'a mut [f64])>,
@@ -464,7 +484,7 @@ struct OrderColumns<'a> {
 }
 
 impl OrderColumns<'_> {
-    /// Compute one kernel and its spectrum for all signals.
+    /// Compute the columns of all signals, given by their spectra, from one kernel.
     #[allow(clippy::cast_precision_loss)]
     fn write(self, record: &Record, spectra: &BTreeMap<usize, Kernel>, buffers: &mut Buffers) {
         let kernel = kernel(tidy(self.order as f64 / 1e9), record.m(), record.step());
@@ -485,13 +505,15 @@ impl OrderColumns<'_> {
 }
 
 impl Bank {
-    /// Compute every column. `output` is the signal whose kernels a simulation needs.
+    /// Compute the columns of all regressors in `index`. For integrals of the signal `output`, the kernels are also
+    /// stored, because a simulation needs them.
     ///
-    /// O(columns · m log m) on the threads of the current pool: one transform per column, one more for each order and
-    /// signal. Memory is 8·m bytes per column, twice that for columns of the output.
+    /// O(columns · m log m) on the threads of the current pool, with one transform per column and one more for each
+    /// order and each signal. The memory is 8·m bytes per column, and twice that for integrals of the output.
     ///
     /// # Errors
-    /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record does not have.
+    /// [`Error::BankTooLarge`] for more memory than [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record
+    /// does not have.
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -514,15 +536,16 @@ impl Bank {
         Self::new_interruptible(index, record, output, &Stop::default())
     }
 
-    /// Number of regressors that are integrals of this signal.
+    /// Return the number of regressors that are integrals of the signal `output`.
     pub(crate) fn own(index: &Index, output: usize) -> usize {
         index.keys.iter().filter(|k| matches!(k, Key::Integral { signal, .. } if *signal == output)).count()
     }
 
-    /// As [`Bank::new`], interruptible and without the memory limit, which the caller checks.
+    /// Compute the columns as [`Bank::new`] does, but interruptible and without the memory limit, which the caller must
+    /// check.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a signal that the record does not have, [`Error::Interrupted`].
+    /// [`Error::Structure`] for a signal that the record does not have, [`Error::Interrupted`] after a stop request.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn new_interruptible(index: &Index, record: &Record, output: usize, stop: &Stop) -> Result<Self> {
         let m = record.m();
@@ -578,12 +601,12 @@ impl Bank {
         Ok(Self { m, columns, kernels, own })
     }
 
-    /// All columns, contiguous.
+    /// Return the values of all columns, one column after another.
     pub(crate) fn columns(&self) -> &[f64] {
         &self.columns
     }
 
-    /// Column at a position, one value per pulse.
+    /// Return the column at a position, one value per pulse.
     ///
     /// # Panics
     /// If the column does not exist.
@@ -592,7 +615,8 @@ impl Bank {
         &self.columns[position * self.m..(position + 1) * self.m]
     }
 
-    /// Kernel of an output column, one value per pulse. Empty for any other column.
+    /// Return the kernel of a column that is an integral of the output, one value per pulse. Empty for any other
+    /// column.
     ///
     /// # Panics
     /// If the column does not exist.
@@ -601,31 +625,33 @@ impl Bank {
         self.own[position].map_or(&[], |place| &self.kernels[place * self.m..(place + 1) * self.m])
     }
 
-    /// Number of columns.
+    /// Return the number of columns.
     #[must_use]
     pub fn len(&self) -> usize {
         self.own.len()
     }
 
-    /// Whether there are no columns.
+    /// Return true if there are no columns.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.own.is_empty()
     }
 }
 
-/// Whether an exponent stands for an impulse or a derivative of one.
+/// Return true if an exponent stands for an impulse or its derivative: −1, −2, ….
 pub(crate) fn is_impulse(exponent: f64) -> bool {
     exponent <= -1.0 && exponent.fract() == 0.0
 }
 
-/// Split initial terms into terms of the equations and impulses of the sensors, each by equation.
+/// Split initial terms, given as (exponent, coefficient) pairs by equation, into terms of the equations and impulses of
+/// the sensors.
 #[allow(clippy::type_complexity)]
 pub(crate) fn split_impulses(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
     powers.iter().map(|own| own.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
 }
 
-/// Add impulses and their derivatives to the pulse means of outputs.
+/// Add impulses and their derivatives, given as (exponent, coefficient) pairs by output, to the pulse means of the
+/// outputs. `step` is the pulse length \[s\].
 pub(crate) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
     for (output, own) in outputs.iter_mut().zip(impulses) {
         for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {

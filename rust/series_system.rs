@@ -1,4 +1,4 @@
-//! Equations on a record as a series system A y = b: forced response, inverse and stabilized copies.
+//! Equations on a record as a system of series A y = b: forced response, inverse, and copies with exponential damping.
 
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
@@ -6,22 +6,26 @@ use crate::fractional::kernels::kernel;
 use crate::regressors::{is_impulse, Record};
 use crate::series::{self, Buffers, Kernel, SumOfProducts};
 
-/// Series system A y = b of equations. Their outputs are unknown, all other signals come from the record.
+/// System of series A y = b for equations on one record. The outputs y of the equations are unknown, and all other
+/// signals are taken from the record. A is a matrix of series, b contains the terms on known signals.
 ///
-/// Coefficients are not checked here, because iterates of an estimator may have any size.
+/// The size of coefficients is not checked, because iterates of an estimator may have any size.
 pub(crate) struct System<'a> {
     record: &'a Record,
-    /// Whether the sensor filter of each output may have an initial transient.
+    /// True for each output whose sensor filter may have an initial transient.
     filter_transients: Vec<bool>,
+    /// Matrix A of series, by equation, then by output.
     pub(crate) matrix: Vec<Vec<Vec<f64>>>,
+    /// Right-hand side b for zero initial conditions, by equation.
     pub(crate) rhs: Vec<Vec<f64>>,
 }
 
 impl<'a> System<'a> {
-    /// System of equations with distinct outputs.
+    /// Build the system of equations with distinct outputs.
     ///
     /// # Errors
-    /// Invalid orders or signals, a wrong number of coefficients, two equations with one output.
+    /// [`Error::OutOfRange`] for invalid orders, [`Error::Structure`] for invalid signals or two equations with the
+    /// same output. [`Error::Length`] for a wrong number of coefficients.
     pub(crate) fn new(equations: &[Equation], record: &'a Record) -> Result<Self> {
         let m = record.m();
         let n = equations.len();
@@ -67,7 +71,7 @@ impl<'a> System<'a> {
                 match unknown {
                     Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
-                        // Of a single nonzero sample only that one is used, which needs no transform.
+                        // Zeros at the end of a signal are omitted. An impulse, for example, then needs no transform.
                         let signal = record.term_signal(term.signal, eta);
                         let last = signal.iter().rposition(|v| *v != 0.0).map_or(0, |k| k + 1);
                         let integral = series::multiply(
@@ -84,7 +88,8 @@ impl<'a> System<'a> {
         Ok(Self { record, filter_transients: held, matrix, rhs })
     }
 
-    /// Matrix at ρz with ρ = e^{−decay}. A large enough decay [1/pulse] makes every model stable.
+    /// Return the system with its matrix at ρz instead of the one-step delay z, with ρ = e^{−decay}. A large enough
+    /// decay \[1/sampling interval\] makes every model stable.
     pub(crate) fn with_damping(mut self, decay: f64) -> Self {
         if decay > 0.0 {
             self.matrix.iter_mut().flatten().for_each(|series| *series = damp_series(decay, series));
@@ -92,8 +97,8 @@ impl<'a> System<'a> {
         self
     }
 
-    /// Response to inputs and initial terms: (exponent, coefficient) pairs per equation, empty for zero initial
-    /// conditions.
+    /// Return the outputs, by equation, for the inputs of the record and these initial terms. `initial` lists the
+    /// (exponent, coefficient) pairs of each equation, empty for zero initial conditions.
     pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
         let (rhs, beside) = self.forced_right_side(initial);
         let mut outputs = self.solve(&rhs)?;
@@ -101,7 +106,9 @@ impl<'a> System<'a> {
         Ok(outputs)
     }
 
-    /// Right-hand side with these initial terms, and the impulses that are added to the outputs instead.
+    /// Return the right-hand side with these initial terms, as one series per equation. Also return those initial terms
+    /// that are impulses and are added to the outputs instead. Initial terms are (exponent, coefficient) pairs by
+    /// equation.
     #[allow(clippy::type_complexity)]
     fn forced_right_side(&self, initial: &[Vec<(f64, f64)>]) -> (Vec<Vec<f64>>, Vec<Vec<(f64, f64)>>) {
         let (beside, driving): (Vec<_>, Vec<_>) = (initial.iter().enumerate())
@@ -116,10 +123,12 @@ impl<'a> System<'a> {
         (rhs, beside)
     }
 
-    /// Outputs if `bounded` accepts them, else outputs of the first damped copy that it accepts.
+    /// Return the outputs if `bounded` accepts them. Otherwise return the outputs of the first damped copy of the
+    /// system that it accepts, and the flag true.
     ///
-    /// The flag is true for a damped copy ([`crate::simulate::respond_damped`] with decays of 4, 8, 16, … a record). As
-    /// long as the inverse is finite, the damped inverse is its series at ρz, so a copy costs only products.
+    /// The damped copies have decays of 4, 8, 16, … per record ([`crate::simulate::respond_damped`]). The last copy is
+    /// returned if `bounded` accepts none. A decay replaces the one-step delay z by ρz with ρ = e^{−decay}. While the
+    /// inverse of the matrix is finite, the damped inverse is the same series at ρz. A copy then takes only products.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn respond_stabilized(
         &self,
@@ -166,14 +175,14 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Whether an initial term is an impulse that acts on the sensor of the output only.
+    /// Return true if an initial term is an impulse that acts on the sensor of the output only.
     ///
-    /// If the output and its inputs pass the record's filter together, the impulse acts on the equation instead.
+    /// If the output and its inputs all pass the record's filter, the impulse acts on the equation instead.
     fn is_output_impulse(&self, equation: usize, exponent: f64) -> bool {
         is_impulse(exponent) && (!self.record.is_filtered() || self.filter_transients[equation])
     }
 
-    /// Add the impulses of the sensors to the outputs.
+    /// Add impulses, given as (exponent, coefficient) pairs by equation, to the outputs.
     fn add_output_impulses(&self, outputs: &mut [Vec<f64>], beside: &[Vec<(f64, f64)>]) {
         for (output, own) in outputs.iter_mut().zip(beside) {
             for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
@@ -182,12 +191,13 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Series of the inverse of the matrix, see [`crate::series::Solver::inverse`].
+    /// Return the series of the inverse of the matrix ([`crate::series::Solver::inverse`]).
     pub(crate) fn inverse(&self) -> Result<Vec<Vec<Vec<f64>>>> {
         series::Solver::new(&self.matrix)?.inverse()
     }
 
-    /// Response of every output to a unit of each initial term (equation, exponent), all other inputs zero.
+    /// Return the responses of all outputs to each initial term (equation, exponent) with coefficient 1. All other
+    /// inputs are zero. Indexed by initial term, then by output.
     pub(crate) fn unit_responses(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         let mut solver = series::Solver::new(&self.matrix)?;
         match self.invert_for_units(&mut solver, units)? {
@@ -196,7 +206,7 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Response with zero initial conditions, and [`System::unit_responses`].
+    /// Return the outputs with zero initial conditions, and [`System::unit_responses`].
     #[allow(clippy::type_complexity)]
     pub(crate) fn rest_and_unit_responses(
         &self,
@@ -209,9 +219,11 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Inverse of the matrix, from which unit responses follow by products.
+    /// Return the spectra of the inverse of the matrix. Responses to the initial terms `units` follow from them by
+    /// products.
     ///
-    /// None without units, or if the inverse grows so much that products would lose digits of its first terms.
+    /// `None` if `units` is empty. Also `None` if the inverse grows so much over the record that products would lose
+    /// digits of its first terms.
     fn invert_for_units(
         &self,
         solver: &mut series::Solver<'_>,
@@ -231,6 +243,7 @@ impl<'a> System<'a> {
         Ok(Some(InverseKernels { system: self, inverse, kernels, behind, buffers: Buffers::default() }))
     }
 
+    /// Return the responses of all outputs to each initial term (equation, exponent) by one solution per term.
     fn one_by_one(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         units
             .iter()
@@ -245,31 +258,35 @@ impl<'a> System<'a> {
             .collect()
     }
 
-    /// Right-hand side of one initial term.
+    /// Return the right-hand side for one initial term with coefficient 1 in equation `i`.
     fn initial_term_right_side(&self, i: usize, exponent: f64) -> Vec<Vec<f64>> {
         let mut rows = vec![vec![0.0; self.record.m()]; self.matrix.len()];
         rows[i] = self.record.forcing_term(exponent);
         rows
     }
 
-    /// Outputs for these right-hand sides.
+    /// Return the outputs for these right-hand sides, by equation.
     pub(crate) fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         series::solve(&self.matrix, &borrowed)
     }
 }
 
-/// Inverse of a system's matrix, with and without the filter of the record. Each right-hand side costs one product.
+/// Inverse of the matrix of a series system, with and without the sensor filter of the record. The outputs for one
+/// right-hand side take one product per output.
 struct InverseKernels<'s, 'a> {
     system: &'s System<'a>,
+    /// Series of the inverse matrix, by output, then by equation. Empty if the record has no filter.
     inverse: Vec<Vec<Vec<f64>>>,
+    /// Spectra of the inverse matrix, by output, then by equation.
     kernels: Vec<Vec<Kernel>>,
-    /// Response of every output to the error of each equation, filtered, by equation; computed when first needed.
+    /// Spectra of the filtered inverse matrix, by equation, then by output. Computed when first needed.
     behind: Vec<Option<Vec<Kernel>>>,
     buffers: Buffers,
 }
 
 impl InverseKernels<'_, '_> {
+    /// Return the outputs with zero initial conditions.
     fn rest(&mut self) -> Vec<Vec<f64>> {
         let (rhs, m) = (&self.system.rhs, self.system.record.m());
         let mut outputs = vec![vec![0.0; m]; self.kernels.len()];
@@ -283,6 +300,7 @@ impl InverseKernels<'_, '_> {
         outputs
     }
 
+    /// Return the responses of all outputs to an initial term with coefficient 1 in equation `i`.
     fn unit(&mut self, (i, exponent): (usize, f64)) -> Vec<Vec<f64>> {
         let (system, m) = (self.system, self.system.record.m());
         if system.is_output_impulse(i, exponent) {
@@ -306,16 +324,17 @@ impl InverseKernels<'_, '_> {
     }
 }
 
-/// Series at ρz, ρ = e^{−decay}.
+/// Return a power series at ρz instead of z with ρ = e^{−decay}. Its terms are multiplied by ρ^k, k = 0, 1, ….
 #[allow(clippy::cast_precision_loss)]
 fn damp_series(decay: f64, series: &[f64]) -> Vec<f64> {
     series.iter().enumerate().map(|(k, a)| a * libm::exp(-decay * k as f64)).collect()
 }
 
-/// Maximum number of pulses of a signal that a product sums directly. Longer signals are transformed.
+/// Maximum number of samples of a signal up to its last nonzero one for which a product is summed directly. Longer
+/// signals are transformed.
 const MAX_DIRECT_PULSES: usize = 64;
 
-/// True if the second half of a series is so large that a transform loses the digits of the first half.
+/// Return true if the second half of a series is so large that a transform loses digits of the first half.
 fn exceeds_growth_limit(series: &[f64]) -> bool {
     let largest = |part: &[f64]| part.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     let (first, second) = series.split_at(series.len() / 2);
@@ -323,6 +342,6 @@ fn exceeds_growth_limit(series: &[f64]) -> bool {
     !(second <= MAX_SERIES_GROWTH * first && first.is_finite())
 }
 
-/// Maximum ratio of the peaks in the second and the first half of a series. At this ratio the rounding error of a
-/// transform, 1e−12 of the largest value, affects half of the digits.
+/// Maximum ratio of the largest moduli in the second and the first half of a series. The rounding error of a transform
+/// is 1e−12 of the largest value. At this ratio it affects half of the digits.
 const MAX_SERIES_GROWTH: f64 = 1e3;

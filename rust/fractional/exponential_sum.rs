@@ -1,34 +1,38 @@
-//! Approximation of the kernel of I^q by a sum of decaying exponentials, with which the history of a signal needs
-//! bounded memory.
+//! Approximation of the kernel of the fractional integral I^q by a sum of decaying exponentials. The history of a
+//! signal then needs bounded memory.
 //!
-//! t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. For such integrands the trapezoidal rule in x
-//! converges like e^{−π²/Δx}. A few dozen rates e^x therefore represent the whole history at any requested accuracy,
-//! and each rate needs one state per signal. Nodes below the lowest rate form a geometric series. Four rates near zero
-//! replace these nodes and match the first four moments of the series. Rates do not depend on q, so all orders of one
-//! signal share its states.
+//! The kernel is t^{q−1}/Γ(q) = sin(πq)/π ∫ e^{x(1−q)} e^{−t e^x} dx over all real x. For such integrands the
+//! trapezoidal rule in x with spacing Δx has an error of about e^{−π²/Δx}. A few dozen decay rates e^x therefore
+//! represent the whole history at any requested accuracy, and each rate needs one state per signal. Nodes below the
+//! lowest rate form a geometric series. Four rates near zero replace these nodes and match the first four moments of
+//! the series. The rates do not depend on q, so the integrals of all orders of one signal use the same states.
 
 use crate::error::{check_finite, check_overflow, Error, Result};
 
-/// Lowest decay rate of the quadrature rule times the longest lag. Slower exponentials are replaced by four moments of
-/// the signal (1e−3⁴/4! < 1e−13).
+/// Product of the lowest decay rate of the quadrature rule and the longest lag. Slower exponentials are replaced by
+/// four moments of the signal, with an error of (1e−3)⁴/4! < 1e−13.
 const LOWEST_RATE_TIMES_LAG: f64 = 1e-3;
-/// Rates that replace the nodes below the lowest rate of the rule, relative to it.
+/// Decay rates that replace the quadrature nodes below the lowest rate of the quadrature rule, relative to this rate.
 const TAIL_RATE_RATIOS: [f64; 4] = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
 
-/// Decay rates of exponential sums that approximate t^{q−1}/Γ(q) for all 0 < q ≤ 1, at lags between two limits.
+/// Decay rates of exponential sums that approximate t^{q−1}/Γ(q) for all 0 < q ≤ 1, at time lags t between two limits.
 #[derive(Debug, Clone)]
 pub struct Rates {
+    /// Decay rates \[1/s\], ascending.
     rates: Vec<f64>,
+    /// Spacing of the logarithms of the rates of the quadrature rule.
     spacing: f64,
+    /// Lowest rate of the quadrature rule \[1/s\].
     lowest: f64,
 }
 
 impl Rates {
-    /// Rates for lags in `[shortest, longest]` s at a relative accuracy of about `tolerance`, 1e−14 at best.
+    /// Return the rates for time lags in `[shortest, longest]` \[s\] at a relative accuracy of about `tolerance`, which
+    /// is 1e−14 at best.
     ///
-    /// Their number grows with ln(longest/shortest)·ln(1/tolerance): 70 for 10⁶ at 1e−9.
+    /// The number of rates grows with ln(longest/shortest)·ln(1/tolerance). It is 70 for a ratio of 10⁶ at 1e−9.
     /// # Errors
-    /// [`Error::OutOfRange`] where the lags do not increase or the tolerance is outside (1e−15, 0.1).
+    /// [`Error::OutOfRange`] if the lags do not increase or the tolerance is outside (1e−15, 0.1).
     pub fn new(shortest: f64, longest: f64, tolerance: f64) -> Result<Self> {
         let bad = |name: &str, value: f64, range: &str| Error::OutOfRange {
             name: name.into(),
@@ -62,14 +66,14 @@ impl Rates {
         Ok(Self { rates, spacing, lowest })
     }
 
-    /// The decay rates \[1/s\], ascending; the first is zero.
+    /// Return the decay rates \[1/s\] in ascending order. The first is zero.
     #[must_use]
     pub fn rates(&self) -> &[f64] {
         &self.rates
     }
 
-    /// Weights w with t^{q−1}/Γ(q) ≈ Σ w_j e^{−rate_j t} for 0 < q ≤ 1; for q = 1 only the zero rate has a weight, and
-    /// the sum is exact.
+    /// Return the weights w of t^{q−1}/Γ(q) ≈ Σ w_j e^{−rate_j t} for 0 < q ≤ 1, one per rate. For q = 1 only the zero
+    /// rate has a nonzero weight, and the sum is exact.
     #[must_use]
     pub fn weights(&self, q: f64) -> Vec<f64> {
         let mut weights = vec![0.0; self.rates.len()];
@@ -81,7 +85,7 @@ impl Rates {
         for (w, rate) in weights.iter_mut().zip(&self.rates).skip(TAIL_RATE_RATIOS.len()) {
             *w = scale * libm::pow(*rate, 1.0 - q);
         }
-        // Moments Σ_{j≥0} w_j (rate_j/lowest)^k of the rule's nodes at and below the lowest rate.
+        // Moments Σ_{j≥0} w_j (rate_j/lowest)^k of the nodes of the rule at and below the lowest rate.
         let at = scale * libm::pow(self.lowest, 1.0 - q);
         let mut moments = [0.0; 4];
         let mut power = 1.0 - q;
@@ -90,7 +94,7 @@ impl Rates {
             power += 1.0;
         }
         for (i, weight) in weights.iter_mut().take(TAIL_RATE_RATIOS.len()).enumerate() {
-            // Lagrange's polynomial of this node, by its coefficients.
+            // Coefficients of the Lagrange polynomial of this node.
             let mut polynomial = [1.0, 0.0, 0.0, 0.0];
             let mut degree = 0;
             for (k, node) in TAIL_RATE_RATIOS.iter().enumerate() {
@@ -109,13 +113,14 @@ impl Rates {
     }
 }
 
-/// Weights of a decay over a step, x = rate·step: e^{−x}, and the weights of the first and last value of the step in
-/// ∫₀¹ e^{−x(1−u)} (first·(1−u) + last·u) du.
+/// Return three weights for an exponential decay over one sampling interval, with x = rate·step. The first is e^{−x}.
+/// The others are the weights of the first and the last value of the interval in ∫₀¹ e^{−x(1−u)} (first·(1−u) + last·u)
+/// du.
 #[must_use]
 pub fn decay(x: f64) -> (f64, f64, f64) {
     let keep = libm::exp(-x);
     if x < 0.1 {
-        // Series of the divided differences: the closed forms cancel to x².
+        // Series of the divided differences. The closed forms would cancel to x².
         let (mut first, mut last, mut term) = (0.0, 0.0, 1.0);
         for k in 0..12 {
             let n = f64::from(k);
@@ -130,13 +135,15 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
     (keep, (1.0 - keep * (1.0 + x)) / square, (x - 1.0 + keep) / square)
 }
 
-/// Fractional integral I^q of a signal that is linear between samples, computed online by the sum of exponentials.
-/// Return it and the number of states.
+/// Return the fractional integral I^q of a signal that is linear between samples, computed recursively with a sum of
+/// exponentials. The arguments are the samples `x`, the order q, the sampling interval `step` \[s\] and the relative
+/// accuracy `tolerance`. The result is one value per sample, and the number of states.
 ///
 /// O(samples · rates).
 ///
 /// # Errors
-/// An order outside (0, 1], [`Error::NotFinite`], and as [`Rates::new`] for a step or a tolerance.
+/// [`Error::OutOfRange`] for an order outside (0, 1], and for a step or a tolerance out of range ([`Rates::new`]).
+/// [`Error::NotFinite`] for a sample that is not finite. Also an error for an integral that overflows.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {

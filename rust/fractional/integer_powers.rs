@@ -1,4 +1,4 @@
-//! Powers and logarithms of the integers up to m, computed for primes and combined for other integers.
+//! Powers and logarithms of the integers below m. They are computed for primes and combined for other integers.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -6,8 +6,8 @@ use std::thread::LocalKey;
 
 use crate::parallel::ForkSafeLock;
 
-/// `n^exponent` for n = 0 … m−1. Powers are multiplicative: a prime needs one power, any other integer one product. The
-/// relative error grows by ε/2 per prime factor; n < 2^20 has at most 19 factors.
+/// Return `n^exponent` for n = 0 … m−1, with 0 for n = 0. Only a prime needs a power function, any other integer one
+/// product. The relative error grows by ε/2 per prime factor. Integers below 2^20 have at most 19 factors.
 pub(crate) fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
     let (divisors, power) = (least_divisors(m), powers_of_primes(exponent, m));
     let mut powers = vec![0.0; m];
@@ -24,7 +24,7 @@ pub(crate) fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
     powers
 }
 
-/// `(2k+1)^exponent` for k = 0 … m−1, as [`whole_powers`].
+/// Return `(2k+1)^exponent` for k = 0 … m−1, computed as in [`whole_powers`].
 pub(crate) fn odd_powers(exponent: f64, m: usize) -> Vec<f64> {
     let (divisors, power) = (least_divisors(2 * m), powers_of_primes(exponent, 2 * m));
     let mut powers = vec![1.0; m];
@@ -39,9 +39,10 @@ pub(crate) fn odd_powers(exponent: f64, m: usize) -> Vec<f64> {
 /// Logarithm in double-double precision: the rounded value and its error.
 type Logarithm = (f64, f64);
 
-/// p^e of primes p < m from ln p, to about 1.5 ε. An exponential takes a third of the time of `pow`.
+/// Return a function for p^e of primes p < m, with e = `exponent`. It uses ln p and is accurate to about 1.5 ε. An
+/// exponential takes a third of the time of `pow`.
 ///
-/// For an integer e `pow` is used, which is exact if the power is representable.
+/// For an integer e it uses `pow`, which is exact if the power is representable.
 #[allow(clippy::cast_precision_loss)]
 fn powers_of_primes(exponent: f64, m: usize) -> impl Fn(usize) -> f64 {
     let logarithms = if exponent.fract() == 0.0 { None } else { Some(prime_logarithms(m)) };
@@ -56,7 +57,8 @@ fn powers_of_primes(exponent: f64, m: usize) -> impl Fn(usize) -> f64 {
     }
 }
 
-/// Product a·b, rounded, and its rounding error (Dekker, doi:10.1007/BF01397083). No overflow or underflow.
+/// Return the rounded product a·b and its rounding error (Dekker, doi:10.1007/BF01397083). There must be no overflow or
+/// underflow.
 fn exact_product(a: f64, b: f64) -> (f64, f64) {
     const HALVES: f64 = 134_217_729.0;
     let halves = |x: f64| {
@@ -68,24 +70,27 @@ fn exact_product(a: f64, b: f64) -> (f64, f64) {
     (product, ((a * b - product) + a * d + c * b) + c * d)
 }
 
-/// Sum a + b, rounded, and its rounding error.
+/// Return the rounded sum a + b and its rounding error.
 fn exact_sum(a: f64, b: f64) -> (f64, f64) {
     let sum = a + b;
     let part = sum - a;
     (sum, (a - (sum - part)) + (b - part))
 }
 
-/// Growing table shared by all threads; a thread uses its own table if the lock is unavailable.
+/// Growing table that all threads share. A thread uses a separate table if the lock is not available.
 struct Table<T: 'static> {
+    /// Table that all threads share.
     shared: &'static ForkSafeLock<Values<T>>,
+    /// Table of this thread.
     own: &'static LocalKey<RefCell<Values<T>>>,
+    /// Function that computes a table with a given number of values.
     make: fn(usize) -> Vec<T>,
 }
 
 type Values<T> = Option<Arc<Vec<T>>>;
 
 impl<T> Table<T> {
-    /// Table with at least m values.
+    /// Return a table with at least m values.
     fn of(&self, m: usize) -> Arc<Vec<T>> {
         let enough = |values: &Values<T>| values.as_ref().filter(|values| values.len() >= m).map(Arc::clone);
         let own = || self.own.with_borrow(enough);
@@ -105,7 +110,7 @@ impl<T> Table<T> {
     }
 }
 
-/// Least prime divisor of each n < m; the table may be longer.
+/// Return the least prime divisor of each n < m. The table may be longer.
 #[allow(clippy::cast_possible_truncation)]
 fn least_divisors(m: usize) -> Arc<Vec<u32>> {
     static SHARED: ForkSafeLock<Values<u32>> = ForkSafeLock::new(None);
@@ -128,9 +133,9 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
     Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
-/// Logarithms ln n in double-double precision for n < m, and 0 for n = 0; the table may be longer.
+/// Return the logarithms ln n in double-double precision for n < m, with 0 for n = 0. The table may be longer.
 ///
-/// The logarithm of a prime p is ln(p − 1) + 2 artanh(1/(2p − 1)), that of another integer the sum over its prime
+/// The logarithm of a prime p is ln(p − 1) + 2 artanh(1/(2p − 1)). For another integer it is the sum over the prime
 /// factors.
 #[allow(clippy::cast_precision_loss)]
 fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
@@ -165,7 +170,7 @@ fn prime_logarithms(m: usize) -> Arc<Vec<Logarithm>> {
     Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
-/// Logarithms ln n for n < m, and 0 for n = 0. The table may be longer.
+/// Return the logarithms ln n for n < m, with 0 for n = 0. The table may be longer.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
     static SHARED: ForkSafeLock<Values<f64>> = ForkSafeLock::new(None);

@@ -4,38 +4,41 @@ use crate::error::{check_finite, check_length, check_overflow, check_step, Error
 use crate::fractional::kernels::{block_pulse_kernel, check_order, grunwald_letnikov_weights, SecondDifferences};
 use crate::series;
 
-/// Rule of a fractional integral of samples.
+/// Discretization rule of a fractional integral of order η. h is the sampling interval.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IntegralRule {
-    /// Block-pulse matrix F^η (paper (31), (32)): samples and result are means over pulses; second order in h.
+    /// Block-pulse operational matrix F^η, eqs. (31) and (32) of the paper. Input and result are means over sampling
+    /// intervals. The error is of second order in h.
     BlockPulse,
-    /// Product trapezoidal rule for point samples, exact for the linear interpolant; second order in h.
+    /// Product trapezoidal rule for point samples, exact for the linear interpolant. The error is of second order in h.
     Trapezoidal,
-    /// Grünwald–Letnikov sum of order −η (paper (2)) for point samples; first order in h.
+    /// Grünwald–Letnikov sum of order −η for point samples, eq. (2) of the paper. The error is of first order in h.
     GrunwaldLetnikov,
 }
 
-/// Maximum order of a derivative of samples. Each order multiplies the noise of the samples by 1/h, where h is the
-/// sampling interval.
+/// Maximum order of a derivative of samples. Each integer order multiplies the noise of the samples by 1/h, where h is
+/// the sampling interval.
 pub const MAX_DERIVATIVE: f64 = 3.0;
 
-/// Definition of a fractional derivative.
+/// Definition of a fractional derivative of order α, and its discretization with the sampling interval h.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Derivative {
-    /// Grünwald–Letnikov sum (paper (2)); first order in h for signals that start at zero.
+    /// Grünwald–Letnikov sum, eq. (2) of the paper. The error is of first order in h for signals that start at zero.
     GrunwaldLetnikov,
-    /// Riemann–Liouville (paper (3)): Caputo derivative plus power functions of the initial values. It is infinite at t
-    /// = 0 if an initial value is not zero.
+    /// Riemann–Liouville derivative, eq. (3) of the paper: Caputo derivative plus power functions of the initial
+    /// values. It is infinite at t = 0 if an initial value is not zero.
     RiemannLiouville,
-    /// Caputo (paper (5)): L1 formula applied to the highest integer derivative; its error is of order min(2, 2 − frac
-    /// α) in h.
+    /// Caputo derivative, eq. (5) of the paper, by the L1 formula applied to the highest integer derivative below α.
+    /// The error is of order min(2, 2 − frac α) in h.
     Caputo,
 }
 
-/// Fractional integral I^η of uniformly sampled `x` from its first sample.
+/// Return the fractional integral I^η of uniformly sampled `x` from its first sample, one value per sample. `step` is
+/// the sampling interval \[s\].
 ///
 /// # Errors
-/// An order outside [0, 10], a step that is not positive, a value that is not finite, or an integral that overflows.
+/// [`Error::OutOfRange`] for an order outside [0, 10] or a step that is not positive. [`Error::NotFinite`] for a value
+/// that is not finite. Also an error for an integral that overflows.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -52,11 +55,11 @@ pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -
     Ok(out)
 }
 
-/// Integrate several signals of m samples by I^η in place. `signals` contains one signal after another. The kernel is
-/// computed once.
+/// Replace several signals of m samples by their fractional integrals I^η. `signals` contains one signal after another.
+/// The kernel is computed once.
 ///
 /// # Errors
-/// As [`fractional_integral`]; a length that is not a multiple of m.
+/// The errors of [`fractional_integral`], and [`Error::Length`] for a length that is not a multiple of m.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -101,7 +104,8 @@ pub fn integrate_signals(signals: &mut [f64], m: usize, eta: f64, step: f64, rul
     check_overflow(signals, step)
 }
 
-/// Trapezoidal weight of the first sample at point n: `(n−1)^{η+1} − (n−1−η) n^η`.
+/// Return the weight of the first sample in the product trapezoidal rule at sample n, without the factor h^η/Γ(η+2):
+/// `(n−1)^{η+1} − (n−1−η) n^η`.
 #[allow(clippy::cast_precision_loss)]
 fn first_sample_weight(eta: f64, n: usize) -> f64 {
     if n == 0 {
@@ -115,14 +119,16 @@ fn first_sample_weight(eta: f64, n: usize) -> f64 {
     libm::pow(n, eta) * ((n - 1.0) * libm::expm1(eta * libm::log1p(-1.0 / n)) + eta)
 }
 
-/// Fractional derivative D^α of uniformly sampled `x` from its first sample.
+/// Return the fractional derivative D^α of uniformly sampled `x` from its first sample, one value per sample. `step` is
+/// the sampling interval \[s\].
 ///
-/// `initial` holds the known x(0), x′(0), …. Missing values follow from second-order one-sided differences of the
-/// samples.
+/// `initial` contains the known initial values x(0), x′(0), …. Missing values follow from second-order one-sided
+/// differences of the samples.
 ///
 /// # Errors
-/// An order outside [0, 3], a step that is not positive, a value that is not finite, a derivative that overflows, or
-/// fewer samples than the differences need (⌈α⌉ + 2).
+/// [`Error::OutOfRange`] for an order outside [0, 3] or a step that is not positive. [`Error::NotFinite`] for a value
+/// that is not finite. [`Error::Length`] for fewer than ⌈α⌉ + 2 samples, which the differences need. Also an error for
+/// a Grünwald–Letnikov sum that overflows.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -167,7 +173,7 @@ pub fn fractional_derivative(
     if m < whole + 2 {
         return Err(Error::Length { name: "x".into(), expected: whole + 2, found: m });
     }
-    // Initial values and the highest whole derivative that the L1 formula still integrates.
+    // Initial values, and the highest integer derivative, to which the L1 formula is applied.
     let mut x = x.to_vec();
     x[0] = initial.first().copied().unwrap_or(x[0]);
     let mut starts = Vec::with_capacity(whole);
@@ -196,7 +202,7 @@ pub fn fractional_derivative(
     Ok(out)
 }
 
-/// Caputo derivative of an order in (0, 1) by the L1 formula, which is exact for the linear interpolant.
+/// Return the Caputo derivative of an order in (0, 1) by the L1 formula, which is exact for the linear interpolant.
 #[allow(clippy::cast_precision_loss)]
 fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
     let (m, a) = (x.len(), 1.0 - order);
@@ -216,14 +222,14 @@ fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
     series::multiply(&weights, &rises, m)
 }
 
-/// Derivative of integer order k ≤ 3 by central differences, one-sided towards the ends; second order in h at every
-/// sample. Needs k + 2 samples.
+/// Return the derivative of integer order k ≤ 3 by central differences, which are one-sided at the ends. The error is
+/// of second order in the step at every sample. Needs at least k + 2 samples.
 ///
-/// Each k has its own formula, because repeated first differences would lose an order of accuracy at the ends each
-/// time.
+/// Each k has a separate formula, because every repetition of first differences would lose an order of accuracy at the
+/// ends.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
 fn difference(x: &[f64], k: usize, step: f64) -> Vec<f64> {
-    // Weights at the first samples, counted from the first, and those around every sample further in.
+    // Weights for the first samples, and central weights for every interior sample.
     let (ends, centre): (&[&[f64]], &[f64]) = match k {
         0 => return x.to_vec(),
         1 => (&[&[-1.5, 2.0, -0.5]], &[-0.5, 0.0, 0.5]),
@@ -232,7 +238,7 @@ fn difference(x: &[f64], k: usize, step: f64) -> Vec<f64> {
     };
     let (m, reach) = (x.len(), ends.len());
     let scale = step.powi(-(k as i32));
-    // Read backwards, a derivative of odd order changes its sign.
+    // In reversed time, a derivative of odd order changes its sign.
     let mirrored = if k % 2 == 1 { -scale } else { scale };
     let mut out: Vec<f64> = Vec::with_capacity(m);
     let weighted = |weights: &[f64], values: &mut dyn Iterator<Item = &f64>| -> f64 {

@@ -1,10 +1,10 @@
-//! Kernels of the fractional integral I^η: block-pulse kernel, derivative in η, Grünwald–Letnikov weights,
-//! improper terms.
+//! Kernels of the fractional integral I^η: block-pulse kernel, derivative by η, Grünwald–Letnikov weights and improper
+//! terms.
 //!
-//! An improper term has a higher order than its equation. The equation D^α y = c D^ν s + … with ν > α is integrated by
-//! its highest order ν: I^{ν−α} y = c s + …. Division by the kernel of I^{ν−α} gives y = c D^{ν−α} s + …, where the
-//! kernel of D^{ν−α} is the reciprocal of that kernel. All terms then have the same form, of second order in the step,
-//! and D^q I^q is the identity up to rounding.
+//! A term is improper if its order exceeds the order of its equation. The equation D^α y = c D^ν s + … with ν > α is
+//! integrated by its highest order ν: I^{ν−α} y = c s + …. Division by the kernel of I^{ν−α} gives y = c D^{ν−α} s + …,
+//! where the kernel of D^{ν−α} is the reciprocal of the kernel of I^{ν−α}. All terms then have the same form, with an
+//! error of second order in the step. D^q I^q is the identity up to rounding.
 
 use crate::error::{Error, Result};
 use crate::fractional::integer_powers::{odd_powers, whole_logarithms, whole_powers};
@@ -12,26 +12,29 @@ use crate::series::{multiply, reciprocal};
 
 /// Maximum order of an integral and of an equation. It suffices for five oscillatory modes.
 ///
-/// Kernels are exact to a few ε up to this order. Rounding errors of a division grow like (ωT)^α/Γ(α+1), so long
-/// records of many modes need lower orders.
+/// Kernels are exact to a few ε up to this order. Rounding errors of a division grow like (ωT)^α/Γ(α+1) with the
+/// frequency ω of a mode, the record length T and the order α. Long records of many modes therefore need lower orders.
 pub const MAX_ORDER: f64 = 10.0;
 
-/// Minimum order of an input in an equation: a threefold integration.
+/// Minimum order of an input in an equation. A negative order −3 is a threefold integration.
 pub const MIN_INPUT_ORDER: f64 = -3.0;
 
-/// Distance in pulses below which the even binomial sum converges slowly and needs [`TERMS_NEAR`] terms.
+/// Distance \[pulses\] below which the even binomial sum of the kernel converges slowly and needs [`TERMS_NEAR`] terms.
 const FAR_DISTANCE_PULSES: usize = 8;
-/// Number of terms for distances 2 … 7. At distance 2, 4^−25 is below the rounding error.
+/// Number of terms of the binomial sum of the kernel for distances of 2 to 7 pulses. At distance 2, the omitted terms,
+/// 4^−25, are below the rounding error.
 const TERMS_NEAR: usize = 25;
-/// Number of terms from distance 8 on: 64^−8 is below the rounding error.
+/// Number of terms of the binomial sum of the kernel from a distance of 8 pulses on. The omitted terms, 64^−8, are
+/// below the rounding error.
 const TERMS_FAR: usize = 8;
 
-/// Block-pulse kernel of I^η: first row of F^η, `h^η/Γ(η+2)·v_n`, n = 1 … m (paper (32)).
+/// Return the block-pulse kernel of I^η, which is the first row of the matrix F^η: `h^η/Γ(η+2)·v_n`, n = 1 … m, eq.
+/// (32) of the paper. `step` is the pulse length h \[s\].
 ///
-/// The printed `v_n` is a second difference of n^{η+1} and suffers from cancellation (relative error 2e−3 at n = 2^20
-/// for η = 0.15). Here it is an even binomial sum, exact to a few ε for every n. η = 0 gives the identity.
+/// In the paper, `v_n` is a second difference of n^{η+1}. It suffers from cancellation, with a relative error of 2e−3
+/// at n = 2^20 for η = 0.15. Here it is an even binomial sum, exact to a few ε for every n. η = 0 gives the identity.
 ///
-/// Cost O(m).
+/// O(m).
 ///
 /// ```
 /// // I^1 of a pulse: half of it within itself, all of it in every later one.
@@ -51,15 +54,16 @@ pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     head.chain(tail).map(|v| scale * v).collect()
 }
 
-/// Derivative of [`block_pulse_kernel`] with respect to η.
+/// Return the derivative of [`block_pulse_kernel`] with respect to η.
 ///
-/// Uses d/dη of `h^η/Γ(η+2)`, that is ln h − ψ(η+2), and the term-by-term derivative of the binomial sum.
+/// It follows from the logarithmic derivative of `h^η/Γ(η+2)`, which is ln h − ψ(η+2), and from the term-by-term
+/// derivative of the binomial sum.
 #[must_use]
 pub fn block_pulse_kernel_derivative(eta: f64, m: usize, step: f64) -> Vec<f64> {
     kernel_with_derivative(eta, m, step).1
 }
 
-/// [`block_pulse_kernel`] and its derivative with respect to η, at little more than the cost of one.
+/// Return [`block_pulse_kernel`] and its derivative with respect to η, at little more than the cost of one.
 #[must_use]
 pub fn kernel_with_derivative(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
@@ -88,28 +92,33 @@ pub fn kernel_with_derivative(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f
         .unzip()
 }
 
-/// `v_n = n^{η+1} − 2(n−1)^{η+1} + (n−2)^{η+1}` (v₁ = 1) and its derivative with respect to η, both to a few ε.
+/// Return `v_n = n^{η+1} − 2(n−1)^{η+1} + (n−2)^{η+1}` (v₁ = 1) and its derivative with respect to η, both exact to a
+/// few ε.
 #[must_use]
 pub fn second_difference(eta: f64, n: usize) -> (f64, f64) {
     SecondDifferences::new(eta).value_and_slope(n)
 }
 
 /// Even binomial coefficients C(η+1, 2k), k = 1 … K, and their derivatives with respect to η. They give the second
-/// differences `v_n` for all n.
+/// differences `v_n` of n^{η+1} for all n ([`second_difference`]).
 pub(crate) struct SecondDifferences {
     eta: f64,
+    /// Binomial coefficients C(η+1, 2k), k = 1 … K, for the order of integration η.
     coefficients: [f64; TERMS_NEAR],
+    /// Derivatives of the binomial coefficients with respect to the order of integration.
     slopes: [f64; TERMS_NEAR],
 }
 
 impl SecondDifferences {
+    /// Compute the coefficients for the order of integration `eta`.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn new(eta: f64) -> Self {
         let (mut coefficients, mut slopes) = ([0.0; TERMS_NEAR], [0.0; TERMS_NEAR]);
         let (mut c, mut dc) = (1.0, 0.0);
         for (k, (coefficient, slope)) in coefficients.iter_mut().zip(&mut slopes).enumerate() {
             for j in [2 * k, 2 * k + 1] {
-                // η + 1 − j, but exactly η at j = 1: for small η the rounding of η + 1 would be the whole error.
+                // The factor is η + 1 − j, but exactly η at j = 1. For small η, the rounding error of η + 1 would
+                // dominate the error of the factor.
                 let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
                 let divisor = (j + 1) as f64;
                 dc = (dc * factor + c) / divisor;
@@ -120,18 +129,20 @@ impl SecondDifferences {
         Self { eta, coefficients, slopes }
     }
 
-    /// Sum Σ_k a_k x^k with a = `coefficients` and x = `shrink` = centre^{−2}. Only terms above the rounding error are
-    /// added, smallest first.
+    /// Return the sum Σ_k a_k x^k, k ≥ 1, with a = `coefficients` and x = `shrink` = centre^{−2}. Only terms above the
+    /// rounding error are added, the smallest first.
     fn sum(coefficients: &[f64; TERMS_NEAR], centre: usize, shrink: f64) -> f64 {
         let terms = if centre < FAR_DISTANCE_PULSES { TERMS_NEAR } else { TERMS_FAR };
         coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink)
     }
 
+    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]).
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn value(&self, n: usize) -> f64 {
         self.near_value(n, if n > 2 { libm::pow((n - 1) as f64, self.eta + 1.0) } else { 1.0 })
     }
 
+    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) and its derivative with respect to η.
     #[allow(clippy::cast_precision_loss)]
     fn value_and_slope(&self, n: usize) -> (f64, f64) {
         let centre = n.saturating_sub(1) as f64;
@@ -140,7 +151,7 @@ impl SecondDifferences {
         self.near_value_and_slope(n, power, logarithm)
     }
 
-    /// Second difference `v_n` of [`second_difference`]. `power` is (n−1)^{η+1}.
+    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]). `power` is (n−1)^{η+1}.
     #[allow(clippy::cast_precision_loss)]
     fn near_value(&self, n: usize, power: f64) -> f64 {
         match n {
@@ -154,8 +165,8 @@ impl SecondDifferences {
         }
     }
 
-    /// Second difference `v_n` and its derivative with respect to η. `power` is (n−1)^{η+1}, and `logarithm` is
-    /// ln(n−1).
+    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) and its derivative with respect to η.
+    /// `power` is (n−1)^{η+1}, and `logarithm` is ln(n−1).
     #[allow(clippy::cast_precision_loss)]
     fn near_value_and_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let value = self.near_value(n, power);
@@ -171,13 +182,14 @@ impl SecondDifferences {
     }
 }
 
-/// Length of the shortest kernel whose powers are computed by a sieve over primes instead of one by one.
+/// Minimum length of a kernel whose powers are computed by a sieve over primes instead of one by one.
 const MIN_SIEVE_TERMS: usize = 256;
-/// Number of kernel values computed by the long binomial sum. Later values use the formula for large distances.
+/// Number of values at the start of a kernel that are computed with many terms of the binomial sum. Later values need
+/// at most five terms.
 const LONG_SUM_TERMS: usize = 64;
 
-/// Number of terms K of the even binomial sum that exceed the rounding error for c = `centre` ≥ [`LONG_SUM_TERMS`]. The
-/// omitted terms are below c^{−2K}.
+/// Return the number K of terms of the even binomial sum that exceed the rounding error for c = `centre` ≥
+/// [`LONG_SUM_TERMS`]. The omitted terms are below c^{−2K}.
 const fn terms_at(centre: usize) -> usize {
     match centre {
         0..1024 => 5,
@@ -187,8 +199,8 @@ const fn terms_at(centre: usize) -> usize {
 }
 
 impl SecondDifferences {
-    /// Second difference `v_n` of [`second_difference`] for n = `centre` + 1 > [`LONG_SUM_TERMS`]. `power` is
-    /// centre^{η+1}.
+    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) for n = `centre` + 1 > [`LONG_SUM_TERMS`].
+    /// `power` is centre^{η+1}.
     #[allow(clippy::cast_precision_loss)]
     fn far_value(&self, centre: usize, power: f64) -> f64 {
         let shrink = 1.0 / (centre as f64 * centre as f64);
@@ -196,8 +208,8 @@ impl SecondDifferences {
         2.0 * power * sum
     }
 
-    /// Second difference `v_n` and its derivative with respect to η for n = `centre` + 1 > [`LONG_SUM_TERMS`]. `power`
-    /// is centre^{η+1}, and `logarithm` is ln centre.
+    /// Return the second difference `v_n` of n^{η+1} ([`second_difference`]) and its derivative with respect to η, for
+    /// n = `centre` + 1 > [`LONG_SUM_TERMS`]. `power` is centre^{η+1}, and `logarithm` is ln centre.
     #[allow(clippy::cast_precision_loss)]
     fn far_value_and_slope(&self, centre: usize, power: f64, logarithm: f64) -> (f64, f64) {
         let shrink = 1.0 / (centre as f64 * centre as f64);
@@ -212,10 +224,11 @@ impl SecondDifferences {
     }
 }
 
-/// ψ(x) for x > 0, NaN elsewhere: recurrence up to x ≥ 10, then the asymptotic series (DLMF 5.11.2).
+/// Return the digamma function ψ(x) for x > 0, NaN elsewhere, by recurrence up to x ≥ 10 and the asymptotic series
+/// (DLMF 5.11.2).
 #[must_use]
 pub fn digamma(x: f64) -> f64 {
-    // B_{2k}/(2k) for k = 1 … 7; the eighth term is below 1e−17 at x = 10.
+    // B_{2k}/(2k) for k = 1 … 7 with Bernoulli numbers B. The eighth term is below 1e−17 at x = 10.
     const SERIES: [f64; 7] =
         [1.0 / 12.0, -1.0 / 120.0, 1.0 / 252.0, -1.0 / 240.0, 1.0 / 132.0, -691.0 / 32760.0, 1.0 / 12.0];
     if x.is_nan() || x <= 0.0 {
@@ -231,7 +244,7 @@ pub fn digamma(x: f64) -> f64 {
     libm::log(x) - 0.5 / x - tail - shift
 }
 
-/// Grünwald–Letnikov weights `(−1)^j C(α, j)`, j = 0 … m−1 (paper (2)); a negative α integrates.
+/// Return the Grünwald–Letnikov weights `(−1)^j C(α, j)`, j = 0 … m−1, eq. (2) of the paper. A negative α integrates.
 ///
 /// ```
 /// assert_eq!(ftlm::fractional::kernels::grunwald_letnikov_weights(1.0, 4), [1.0, -1.0, 0.0, 0.0]);
@@ -250,9 +263,11 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
     weights
 }
 
-/// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε for exponents above −1.
+/// Return the means of `t^exponent` over the pulses k = 1 … m of length `step` from t = 0 on. They are exact to a few ε
+/// for exponents above −1.
 ///
-/// For −1, −2, … these are differences over the first pulses, for δ and its derivatives.
+/// For the exponents −1, −2, … the result is differences over the first pulses, which represent an impulse and its
+/// derivatives.
 ///
 /// ```
 /// let means = ftlm::fractional::kernels::power_means(1.0, 3, 2.0);
@@ -262,8 +277,8 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
 #[allow(clippy::cast_precision_loss)]
 pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent <= -1.0 && exponent.fract() == 0.0 {
-        // Differences of the first pulses are centered between them. One more difference shifts them back by half their
-        // length.
+        // A difference of the first pulses is centered between them. One more difference shifts its center back to t =
+        // 0.
         let order = -exponent - 1.0;
         let (first, next) = (grunwald_letnikov_weights(order, m), grunwald_letnikov_weights(order + 1.0, m));
         let scale = libm::pow(step, exponent);
@@ -278,7 +293,7 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     out
 }
 
-/// Derivative of [`power_means`] with respect to an exponent above −1.
+/// Return the derivative of [`power_means`] with respect to an exponent above −1.
 ///
 /// ```
 /// // Means of t^0 are always 1. Those of t^e change with e like ln t: ∫ ln t over [0, 1] is −1.
@@ -298,28 +313,33 @@ pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     out
 }
 
-/// Number of first pulses of a long record whose means are computed as differences of powers of the pulse ends. Later
-/// pulses before [`LONG_SUM_TERMS`] use a series about the pulse midpoint. It has [`MIDPOINT_SERIES_TERMS`] terms,
-/// because 33^−16 is below the rounding error.
+/// Number of pulses at the start of a long record whose means of t^e are computed as differences of powers at the pulse
+/// ends. The means over later pulses are computed by a series about the pulse midpoint.
 const ENDPOINT_PULSES: usize = 16;
+/// Number of terms of the series about the midpoint of a pulse, for pulses before number [`LONG_SUM_TERMS`]. The
+/// omitted terms, 33^−16, are below the rounding error.
 const MIDPOINT_SERIES_TERMS: usize = 8;
 
-/// Number of pulses whose means are computed from powers of their ends. Other means are computed from powers of their
-/// midpoints.
+/// Return the number of pulses at the start of a record of m pulses whose means of t^e are computed from powers at the
+/// pulse ends. The means over other pulses are computed from powers at their midpoints.
 fn near_pulses(m: usize) -> usize {
     m.min(if m < MIN_SIEVE_TERMS { m } else { ENDPOINT_PULSES })
 }
 
-/// Means of t^e over pulses of length h.
+/// Means of t^e over pulses of length h from t = 0 on, with the exponent e.
 #[derive(Debug, Clone)]
 pub(crate) struct PowerMeans {
-    /// Exponent plus one, a = e + 1.
+    /// Exponent plus one.
     a: f64,
+    /// Factor h^e with the pulse length h and the exponent e.
     scale: f64,
+    /// Factor (h/2)^e with the pulse length h and the exponent e.
     half: f64,
+    /// Logarithm of the pulse length.
     ln_step: f64,
-    /// Coefficients C(a, 2j+1)/a of the midpoint series.
+    /// Coefficients C(a, 2j+1)/a, j = 0, 1, …, of the series about the pulse midpoint, with the exponent a − 1.
     sums: [f64; MIDPOINT_SERIES_TERMS],
+    /// Derivatives of the coefficients `sums` with respect to the exponent.
     slopes: [f64; MIDPOINT_SERIES_TERMS],
 }
 
@@ -339,7 +359,7 @@ impl PowerMeans {
         Self { a, scale, half: scale * libm::exp2(-exponent), ln_step: libm::log(step), sums, slopes }
     }
 
-    /// Mean over pulse k + 1, as one of [`power_means`].
+    /// Return the mean of the power over pulse k + 1, which is element k of [`power_means`].
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn mean(&self, k: usize) -> f64 {
         if k < ENDPOINT_PULSES {
@@ -348,20 +368,22 @@ impl PowerMeans {
         self.midpoint_mean(k, libm::pow((2 * k + 1) as f64, self.a - 1.0))
     }
 
-    /// Mean over pulse k, k^a − (k−1)^a, without cancellation.
+    /// Return the mean of t^e over pulse k, which is h^e/a·(k^a − (k−1)^a), without cancellation. Here h is the pulse
+    /// length, e the exponent and a = e + 1.
     fn endpoint_mean(&self, k: f64) -> f64 {
         let a = self.a;
         self.scale / a * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
     }
 
-    /// Derivative of the mean over pulse k with respect to e.
+    /// Return the derivative of the mean of t^e over pulse k with respect to the exponent e.
     fn endpoint_slope(&self, k: f64) -> f64 {
         let a = self.a;
         let turned = |k: f64| if k > 1.0 { libm::pow(k, a) * libm::log(k) } else { 0.0 };
         self.endpoint_mean(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
     }
 
-    /// Sum of the terms above rounding error at the midpoint d/2 of pulse k + 1, with d = 2k + 1.
+    /// Return the sum Σ_j `sums[j]`·d^{−2j} with d = 2k + 1, where d/2 is the midpoint of pulse k + 1 in pulse lengths.
+    /// Only terms above the rounding error are added.
     #[allow(clippy::cast_precision_loss)]
     fn sum(sums: &[f64; MIDPOINT_SERIES_TERMS], k: usize) -> f64 {
         let d = (2 * k + 1) as f64;
@@ -370,23 +392,27 @@ impl PowerMeans {
         sums[..terms].iter().rev().fold(0.0, |sum, &c| sum * shrink + c)
     }
 
-    /// Mean over pulse k + 1 from d^e: (d/2)^e·Σ C(a, 2j+1)/a·d^−2j, a series about the midpoint.
+    /// Return the mean of t^e over pulse k + 1, which is (h d/2)^e·Σ_j C(a, 2j+1)/a·d^{−2j}. Here h is the pulse
+    /// length, d = 2k + 1 and a = e + 1. `power` is d^e.
     fn midpoint_mean(&self, k: usize, power: f64) -> f64 {
         self.half * power * Self::sum(&self.sums, k)
     }
 
-    /// Derivative of the mean over pulse k + 1 with respect to e.
+    /// Return the derivative of the mean of t^e over pulse k + 1 with respect to the exponent e. `power` is d^e and
+    /// `logarithm` is ln d with d = 2k + 1.
     fn midpoint_slope(&self, k: usize, power: f64, logarithm: f64) -> f64 {
         let turned = self.ln_step - std::f64::consts::LN_2 + logarithm;
         self.half * power * (Self::sum(&self.sums, k) * turned + Self::sum(&self.slopes, k))
     }
 }
 
-/// Pulse means of t^e as an input, corrected in the first two pulses for −1 < e < 0.
+/// Return the pulse means of t^`exponent` as an input of a simulation, corrected in the first two pulses for exponents
+/// between −1 and 0. `step` is the pulse length \[s\].
 ///
-/// Without the correction a smooth response has an error of order e + 2 in the step, because of the moments of t^e
-/// about the pulse midpoints. The sum of the moments Σ_j ∫_j (t − t_j) t^e dt is h^{e+2} ζ(−1−e)/(1+e). This amount is
-/// moved from the first pulse to the second (correction as in doi:10.1137/0517050).
+/// Without the correction, a smooth response has an error of order e + 2 in the pulse length h, with the exponent e.
+/// Its cause is the first moments of t^e about the pulse midpoints t_j. Their sum Σ_j ∫_j (t − t_j) t^e dt over the
+/// pulses is h^{e+2} ζ(−1−e)/(1+e). The correction moves this amount from the first pulse to the second (as in
+/// doi:10.1137/0517050).
 #[must_use]
 pub fn power_pulses(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let mut pulses = power_means(exponent, m, step);
@@ -396,7 +422,7 @@ pub fn power_pulses(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     pulses
 }
 
-/// Derivative of [`power_pulses`] with respect to an exponent above −1.
+/// Return the derivative of [`power_pulses`] with respect to an exponent above −1.
 #[must_use]
 pub fn power_pulses_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     let mut slopes = power_means_slope(exponent, m, step);
@@ -408,12 +434,12 @@ pub fn power_pulses_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     slopes
 }
 
-/// Whether a power of t is infinite at t = 0 and not an impulse.
+/// Return true if the power t^exponent is infinite at t = 0 and not an impulse.
 fn is_singular(exponent: f64) -> bool {
     exponent > -1.0 && exponent < 0.0
 }
 
-/// Move this value from the first pulse to the second.
+/// Subtract `value` from the first pulse and add it to the second.
 fn shift(pulses: &mut [f64], value: f64) {
     if let [first, second, ..] = pulses {
         *first -= value;
@@ -421,16 +447,17 @@ fn shift(pulses: &mut [f64], value: f64) {
     }
 }
 
-/// Sum of the first moments of t^e about the midpoints of unit pulses: ζ(−1−e)/(1+e), −1 < e < 0.
+/// Return the sum of the first moments of t^e about the midpoints of pulses of unit length. It is ζ(−1−e)/(1+e) for −1
+/// < e < 0.
 fn moment(exponent: f64) -> f64 {
-    // Euler–Maclaurin summation from ten on.
+    // Euler–Maclaurin summation from n = 10 on.
     const FROM: f64 = 10.0;
     const BERNOULLI: [f64; 4] = [1.0 / 12.0, -1.0 / 720.0, 1.0 / 30240.0, -1.0 / 1_209_600.0];
     let a = exponent + 1.0;
     let first: f64 = (1..10).map(|n| libm::pow(f64::from(n), a)).sum();
     let power = libm::pow(FROM, a);
     let mut zeta = first - power * FROM / (a + 1.0) + 0.5 * power;
-    // s (s+1) (s+2) … N^{−s−2j+1} for s = −a.
+    // Terms s (s+1) (s+2) … N^{−s−2j+1} for s = −a and N = 10.
     let mut term = -a * power / FROM;
     for (j, b) in (1..).zip(BERNOULLI) {
         zeta += b * term;
@@ -457,12 +484,12 @@ pub fn check_order(name: &str, order: f64) -> Result<()> {
     }
 }
 
-/// Excess of the order of a term over α must be below this value. The reciprocal kernel of D^1 is Tustin's rule, which
-/// oscillates from pulse to pulse without decay.
+/// The difference between the order of a term and the order α of its equation must be below this value. At difference 1
+/// the reciprocal kernel is that of Tustin's rule for a derivative, which oscillates from pulse to pulse without decay.
 pub const MAX_EXCESS: f64 = 1.0;
 
-/// Kernel of I^η in pulse means for η > −[`MAX_EXCESS`]. For η < 0 it is the reciprocal of [`block_pulse_kernel`] at
-/// −η.
+/// Return the kernel of I^η in pulse means for η > −[`MAX_EXCESS`], m values for the pulse length `step` \[s\]. For η <
+/// 0 it is the reciprocal of [`block_pulse_kernel`] at −η.
 ///
 /// ```
 /// use ftlm::fractional::kernels::kernel;
@@ -478,7 +505,7 @@ pub fn kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     }
 }
 
-/// [`kernel`] and its derivative with respect to η.
+/// Return [`kernel`] and its derivative with respect to η.
 #[must_use]
 pub fn kernel_and_slope(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     if eta >= 0.0 {
@@ -486,12 +513,12 @@ pub fn kernel_and_slope(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     }
     let (integral, slope) = kernel_with_derivative(-eta, m, step);
     let kernel = reciprocal(&integral);
-    // d/dη of 1/F(−η) is F′(−η)/F(−η)².
+    // d/dη of 1/F(−η) is F′(−η)/F(−η)², with the kernel F as a series.
     let square = multiply(&kernel, &kernel, m);
     (kernel, multiply(&square, &slope, m))
 }
 
-/// First coefficient of [`kernel`], by which a pulse contributes to the integral over that pulse.
+/// Return the first value of [`kernel`], which gives the contribution of a pulse to the integral over the same pulse.
 #[must_use]
 pub fn first_coefficient(eta: f64, step: f64) -> f64 {
     let size = eta.abs();

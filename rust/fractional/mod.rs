@@ -1,4 +1,5 @@
-//! Fractional integrals and derivatives: kernels, operational matrices, and memory in bounded space.
+//! Fractional integrals and derivatives: kernels, operational matrices, and an approximation whose memory does not grow
+//! with the record.
 
 pub mod exponential_sum;
 mod integer_powers;

@@ -1,16 +1,18 @@
-//! Operational matrices of integration for block pulses and Haar wavelets, and the fast Haar transform.
+//! Operational matrices of fractional integration for block pulses and Haar wavelets, and the fast Haar transform.
 //!
-//! Identification and simulation apply F^η as a series instead ([`crate::series`]).
+//! Identification and simulation apply the block-pulse matrix F^η as a power series instead ([`crate::series`]).
 
 use crate::error::{check_dense, check_step, Error, Result};
 use crate::fractional::kernels::{block_pulse_kernel, check_order};
 #[cfg(feature = "oracles")]
 use crate::linalg::dense;
 
-/// Block-pulse operational matrix F^η (paper (32)): upper-triangular Toeplitz, row-major m × m; `step` = duration / m.
+/// Return the block-pulse operational matrix F^η, eq. (32) of the paper: upper-triangular Toeplitz, row-major m × m.
+/// `step` is the pulse length \[s\], the duration divided by m.
 ///
 /// # Errors
-/// An order outside [0, 10], a step that is not positive, m = 0, or an m that needs too much memory.
+/// [`Error::OutOfRange`] for an order outside [0, 10] or a step that is not positive. Also an error for m = 0, or an m
+/// that needs too much memory.
 pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     check_order("order", eta)?;
     check_step(step)?;
@@ -23,13 +25,14 @@ pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     Ok(f)
 }
 
-/// Haar operational matrix P^η = Φ F^η Φᵀ (paper (37)), row-major m × m. O(m²).
+/// Return the Haar operational matrix P^η = Φ F^η Φᵀ, eq. (37) of the paper, row-major m × m. Φ is the Haar matrix and
+/// F^η the block-pulse matrix. `step` is the pulse length \[s\]. O(m²).
 ///
-/// F is Toeplitz, so an entry depends only on the widths of two wavelets and their distance. Each row is a contiguous
-/// part of a table of two levels. All tables together have O(m log m) entries.
+/// F^η is Toeplitz, so an element depends only on the widths of two wavelets and their distance. Each row is composed
+/// of contiguous ranges of tables, one for each pair of levels (widths). All tables together have O(m log m) values.
 ///
 /// # Errors
-/// As [`block_pulse_matrix`], and m must be a power of two.
+/// The errors of [`block_pulse_matrix`], and [`Error::NotPowerOfTwo`] for an m that is not a power of two.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -44,7 +47,7 @@ pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     check_order("order", eta)?;
     check_step(step)?;
     check_dense(m)?;
-    // sums[k] are the sums of 2^k successive kernel values, the last of them at n.
+    // sums[k] are the sums of 2^k successive kernel values, the last of which is at n.
     let mut sums = vec![block_pulse_kernel(eta, m, step)];
     let mut width = 1;
     while width < m {
@@ -55,7 +58,7 @@ pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     }
     let mut out = Vec::with_capacity(m * m);
     let mut response = vec![0.0; m];
-    // Constant first, then wavelets from the widest to the narrowest.
+    // The constant comes first, then the wavelets from the widest to the narrowest.
     for level in 0..sums.len() {
         let rows = Wavelet::of(level, m);
         rows.respond(&sums, &mut response);
@@ -69,21 +72,26 @@ pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     Ok(out)
 }
 
-/// One level of the Haar basis.
+/// One level of the Haar basis: the constant, or all wavelets of one width.
 struct Wavelet {
+    /// Width of a wavelet in pulses.
     width: usize,
+    /// True for the constant basis function, false for a level of wavelets.
     constant: bool,
+    /// Absolute value of a basis function of this level where it is not 0.
     scale: f64,
 }
 
 impl Wavelet {
+    /// Return level 0 (the constant), 1 (the widest wavelet), 2, … of the basis for m pulses.
     #[allow(clippy::cast_precision_loss)]
     fn of(level: usize, m: usize) -> Self {
         let width = m >> level.saturating_sub(1);
         Self { width, constant: level == 0, scale: 1.0 / (width as f64).sqrt() }
     }
 
-    /// Convolution Σ_s φ(s) f(n − s) with a wavelet φ, from the running sums of f.
+    /// Write the convolution Σ_s φ(s) f(n − s) of a kernel f with a wavelet φ of this level to `out`. `sums[k]`
+    /// contains the sums of 2^k successive values of f.
     fn respond(&self, sums: &[Vec<f64>], out: &mut [f64]) {
         let half = self.width / 2;
         if self.constant {
@@ -98,22 +106,23 @@ impl Wavelet {
     }
 }
 
-/// Table of the matrix entries in which rows of one wavelet level meet columns of one level. An entry depends only on
-/// the distance of the two wavelets in time. Every row is a contiguous range of `values`.
+/// Table of the matrix elements whose row belongs to one wavelet level and whose column belongs to another. An element
+/// depends only on the time distance of the two wavelets. Each row is a contiguous range of `values`.
 struct Table {
     values: Vec<f64>,
-    /// Number of columns of the level.
+    /// Number of columns, which all belong to one wavelet level.
     count: usize,
-    /// Number of rows within the width of one column, if columns are wider than rows. Each of these rows has its own
-    /// range of `values`.
+    /// Number of rows within the width of one column, 1 if columns are not wider than rows. Each of these rows has a
+    /// separate range of `values`.
     phases: usize,
-    /// Number of columns per row otherwise.
+    /// Number of columns within the width of one row, 1 if rows are not wider than columns.
     stride: usize,
-    /// Number of rows of the level.
+    /// Number of rows, which all belong to one wavelet level.
     rows: usize,
 }
 
 impl Table {
+    /// Return the elements of this table in row `i` of the wavelet level of the rows.
     fn window(&self, i: usize) -> &[f64] {
         let start = if self.phases > 1 {
             (i % self.phases) * (2 * self.count - 1) + self.count - 1 - i / self.phases
@@ -125,8 +134,9 @@ impl Table {
 }
 
 /// Return the tables of one wavelet level of rows with every level of columns, in the sequence of the columns.
+/// `response` is the convolution of the kernel with a wavelet of the rows.
 fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
-    // ahead[m + d] is the sum of the responses from d on over half a width.
+    // padded[m + d] is the sum of the responses from d on, over half the width of a column.
     let mut padded = vec![0.0; 2 * m];
     padded[m..].copy_from_slice(response);
     let levels = m.trailing_zeros() as usize;
@@ -145,7 +155,7 @@ fn tables(rows: &Wavelet, response: &[f64], m: usize) -> Vec<Table> {
     tables
 }
 
-/// Table with `entry(m + d)` for a column that starts d pulses after its row.
+/// Build a table. `entry(m + d)` is the element for a column that starts d pulses after its row.
 fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f64) -> Table {
     let count = m / columns.width;
     let (phases, stride) = ((columns.width / rows.width).max(1), (rows.width / columns.width).max(1));
@@ -158,7 +168,8 @@ fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f
     Table { values, count, phases, stride, rows: m / rows.width }
 }
 
-/// Haar operational matrix P^η by two dense matrix products, a reference for tests of [`operational_matrix`]. O(m³).
+/// Return the Haar operational matrix P^η by two dense matrix products, a reference for tests of
+/// [`operational_matrix`]. O(m³).
 ///
 /// # Errors
 /// An order out of range, or a size that is too large or not a power of two ([`operational_matrix`]).
@@ -172,7 +183,7 @@ pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64
     Ok(dense::multiply(&phi_f, &phi_transposed, m, m, m))
 }
 
-/// In-place transpose in tiles that fit the first-level cache.
+/// Transpose a row-major m × m matrix in place, in tiles that fit the first-level cache.
 #[cfg(feature = "oracles")]
 fn transpose(a: &mut [f64], m: usize) {
     const TILE: usize = 32;
@@ -203,7 +214,7 @@ pub fn check_power_of_two(m: usize) -> Result<()> {
     }
 }
 
-/// Haar transform Φ f in place: coefficients from coarse to fine, from pulse means. O(m).
+/// Replace the pulse means f by their Haar coefficients Φ f, in the sequence from coarse to fine. O(m) for m pulses.
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`] if the number of pulses is not a power of two.
@@ -223,7 +234,7 @@ pub fn haar_transform(f: &mut [f64]) -> Result<()> {
     Ok(())
 }
 
-/// Inverse Haar transform Φᵀ c in place: pulse means from coefficients. O(m).
+/// Replace Haar coefficients c by the pulse means Φᵀ c. O(m) for m pulses.
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`] if the number of pulses is not a power of two.
@@ -243,7 +254,8 @@ pub fn haar_inverse(c: &mut [f64]) -> Result<()> {
     Ok(())
 }
 
-/// Haar transform as [`haar_transform`], with scratch memory of the caller. The length of `f` is a power of two.
+/// Transform as [`haar_transform`] does, with scratch memory of the caller of at least the length of `f`. This length
+/// must be a power of two.
 pub(crate) fn haar_transform_with_scratch(f: &mut [f64], scratch: &mut [f64]) {
     let mut len = f.len();
     while len > 1 {
@@ -258,7 +270,7 @@ pub(crate) fn haar_transform_with_scratch(f: &mut [f64], scratch: &mut [f64]) {
     }
 }
 
-/// Orthogonal Haar matrix Φ by definition, row-major m × m (paper (27), (29)).
+/// Return the orthogonal Haar matrix Φ by definition, eqs. (27) and (29) of the paper, row-major m × m.
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`] if the number of pulses is not a power of two.

@@ -1,29 +1,33 @@
-//! Transforms of samples from Laplace transforms, by Poisson's summation formula.
+//! Starred transforms of samples, computed from Laplace transforms by Poisson's summation formula.
 //!
-//! Samples f(kh) have the starred transform F*(s) = Σ f(kh) e^{−skh} = 1/h Σ_n F(s + 2πi n/h), in which the sample at a
-//! jump is the mean of both sides. For Re s = σ > 0, F* is the discrete Fourier transform of the samples times
-//! e^{−σkh}, which are periodic up to e^{−σLh} over L samples. A function of s of any orders thus has samples with an
-//! error of about 1e−10, without a grid of pulses. A convolution with zero-order-hold inputs is a product of two
-//! transforms.
+//! Samples f(kh) of a signal f with Laplace transform F have the starred transform F*(s) = Σ f(kh) e^{−skh} = 1/h Σ_n
+//! F(s + 2πi n/h). The sample at a jump is the mean of both sides. For Re s = σ > 0, F* is the discrete Fourier
+//! transform of the samples times e^{−σkh}, which are periodic up to e^{−σLh} over L samples. The samples of a function
+//! with any powers of s thus have an error of only about 1e−10, without a grid of pulses. A convolution with
+//! zero-order-hold inputs is a product of two transforms.
 //!
-//! The alias terms n ≠ 0 are smooth in the base band |Im s| ≤ π/h: they are evaluated at Chebyshev nodes and
+//! The alias terms n ≠ 0 are smooth in the base band |Im s| ≤ π/h. They are therefore evaluated at Chebyshev nodes and
 //! interpolated. The terms of large |n| are summed by an Euler–Maclaurin integral, whose constant follows from f(0).
 
 use std::f64::consts::PI;
 
 use crate::fft::{self, Bin, Plan, Workspace};
 
-/// Damping σ times the duration T. It balances the wrap-around e^{−2σT} and the rounding error e^{σT} ε, both 4e−11.
+/// Product of the damping σ and the duration T. It balances the wrap-around error e^{−2σT} and the rounding error
+/// e^{σT} ε, both of which are 4e−11.
 const DAMPING_DURATIONS: f64 = 12.0;
-/// Number of panels of the base band, each with [`PANEL_NODES`] Chebyshev nodes. The error is about 34^−8 = 6e−13 if no
-/// pole is near the Nyquist frequency (Bernstein ellipse of radius 34 of the outermost panel).
+/// Number of panels of the base band (frequencies up to the Nyquist frequency), each with [`PANEL_NODES`] Chebyshev
+/// nodes. The error is about 34^−8 = 6e−13 if no pole is near the Nyquist frequency (Bernstein ellipse of radius 34 of
+/// the outermost panel).
 const BAND_PANEL_COUNT: usize = 8;
+/// Number of Chebyshev nodes in each panel of the base band (frequencies up to the Nyquist frequency).
 const PANEL_NODES: usize = 8;
-/// Index n of the first alias term that is summed by the integral.
+/// Index n of the first alias term F(s + 2πi n/h) that an integral replaces. F is a Laplace transform, and h the
+/// sampling interval.
 const DIRECT_ALIAS_COUNT: usize = 32;
-/// Coefficient of the third difference in the midpoint Euler–Maclaurin sum.
+/// Coefficient of the third difference in the midpoint Euler–Maclaurin formula.
 const THIRD_DIFFERENCE: f64 = 17.0 / 5760.0;
-/// Gauss–Legendre rule on [0, 1] as (point, weight).
+/// Gauss–Legendre quadrature rule on [0, 1] as pairs (point, weight).
 const LEGENDRE_RULE: [(f64, f64); 4] = [
     (0.069_431_844_202_973_71, 0.173_927_422_568_726_93),
     (0.330_009_478_207_571_87, 0.326_072_577_431_273_07),
@@ -31,22 +35,23 @@ const LEGENDRE_RULE: [(f64, f64); 4] = [
     (0.930_568_155_797_026_3, 0.173_927_422_568_726_93),
 ];
 
-/// The starred transform on the line Re s = σ for a number of uniform samples.
+/// Starred transform Σ f(kh) e^{−skh} of uniform samples f(kh), on the line Re s = σ.
 pub(crate) struct StarredTransform {
+    /// Sampling interval h \[s\].
     step: f64,
     plan: Plan,
-    /// Damping factor e^{−σkh} of each sample.
+    /// Damping factor e^{−σkh} of sample k, with the damping σ and the sampling interval h.
     damping: Vec<f64>,
-    /// Logarithm ln s of each frequency bin.
+    /// Logarithm ln s of the Laplace variable at each frequency bin.
     logarithms: Vec<Bin>,
-    /// First bin of each panel, then the number of bins.
+    /// Number of the first bin of each panel of the base band, then the number of bins.
     panels: Vec<usize>,
-    /// Weight and ln s of the alias terms of each node.
+    /// Weight and ln s of each alias term at the frequency s, by interpolation node.
     aliases: Vec<Vec<(f64, Bin)>>,
 }
 
 impl StarredTransform {
-    /// Transforms of `rows` samples with this step.
+    /// Prepare starred transforms Σ f(kh) e^{−skh} of `rows` samples f(kh) with the sampling interval h = `step` \[s\].
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(crate) fn new(rows: usize, step: f64) -> Self {
         let plan = fft::plan(fft::fast_length(2 * rows));
@@ -91,7 +96,8 @@ impl StarredTransform {
         }
     }
 
-    /// Transform of samples.
+    /// Return the starred transform Σ f(kh) e^{−skh} of samples f(kh), one value per frequency bin. h is the sampling
+    /// interval.
     pub(crate) fn transform(&self, samples: impl Iterator<Item = f64>) -> Vec<Bin> {
         let mut time: Vec<f64> = samples.zip(&self.damping).map(|(v, damping)| v * damping).collect();
         time.resize(self.plan.len(), 0.0);
@@ -100,7 +106,7 @@ impl StarredTransform {
         spectrum
     }
 
-    /// Samples of a transform, the inverse of [`Self::transform`].
+    /// Return the samples with the given starred transform, the inverse of [`Self::transform`].
     pub(crate) fn samples(&self, mut spectrum: Vec<Bin>) -> Vec<f64> {
         let mut time = vec![0.0; self.plan.len()];
         self.plan.inverse(&mut spectrum, &mut time, &mut Workspace::new());
@@ -109,8 +115,9 @@ impl StarredTransform {
         time
     }
 
-    /// Compute the starred transforms of functions: `functions(ln s, out)` writes their Laplace transforms, and
-    /// `starts` are their samples at t = 0.
+    /// Return the starred transforms Σ f(kh) e^{−skh} of functions f, one value per frequency bin. `functions(ln s,
+    /// out)` writes their Laplace transforms at s to `out`, and `starts` contains their values at t = 0. h is the
+    /// sampling interval.
     pub(crate) fn spectra(&self, starts: &[f64], mut functions: impl FnMut(Bin, &mut [Bin])) -> Vec<Vec<Bin>> {
         let count = starts.len();
         let mut values = vec![Bin::default(); count];
@@ -138,7 +145,7 @@ impl StarredTransform {
         spectra
     }
 
-    /// Add the interpolated terms n ≠ 0 to the term n = 0 of a function.
+    /// Add the alias terms n ≠ 0, interpolated from their `sums` at the nodes, to the term n = 0 of a function.
     #[allow(clippy::cast_precision_loss)]
     fn add_aliases(&self, spectrum: &mut [Bin], sums: &[Bin]) {
         let share = 2.0 * BAND_PANEL_COUNT as f64 / (self.plan.len() / 2) as f64;
@@ -164,18 +171,18 @@ impl StarredTransform {
     }
 }
 
-/// Angle of a Chebyshev node.
+/// Return the angle of Chebyshev node k.
 #[allow(clippy::cast_precision_loss)]
 fn node_angle(k: usize) -> f64 {
     (2 * k + 1) as f64 * PI / (2 * PANEL_NODES) as f64
 }
 
-/// Chebyshev node on [−1, 1].
+/// Return Chebyshev node k on [−1, 1].
 fn chebyshev_node(k: usize) -> f64 {
     libm::cos(node_angle(k))
 }
 
-/// Power s^−η from ln s.
+/// Return the Laplace transform s^−η of η-fold integration, given ln s.
 pub(crate) fn integration(logarithm: Bin, eta: f64) -> Bin {
     let size = libm::exp(-eta * logarithm.re);
     let (sine, cosine) = libm::sincos(-eta * logarithm.im);
@@ -186,7 +193,7 @@ pub(crate) fn integration(logarithm: Bin, eta: f64) -> Bin {
 mod tests {
     use super::*;
 
-    /// Samples of the step response of a transfer function without direct feedthrough.
+    /// Return samples of the step response of a transfer function without direct feedthrough.
     fn step_response(rows: usize, step: f64, function: impl Fn(Bin) -> Bin) -> Vec<f64> {
         let transform = StarredTransform::new(rows, step);
         let spectra = transform.spectra(&[0.0], |logarithm, values| {

@@ -1,4 +1,4 @@
-//! Dense matrices: products, Gram matrices, QR factors and singular values. The only user of `faer`.
+//! Dense matrices: products, Gram matrices, QR factors and singular values. This is the only module that uses `faer`.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
@@ -6,19 +6,20 @@ use faer::{Accum, Mat, MatRef, Par};
 use crate::linalg::orthogonal;
 use crate::parallel::{self, Stop};
 
-/// Minimum number of rows in one block of a product of long columns. There are at most [`MAX_ROW_PARTS`] blocks. They
-/// do not depend on the number of threads, so neither do the sums.
+/// Minimum number of rows in one block of a product of long columns. The blocks do not depend on the number of threads,
+/// so neither do the rounding errors of the sums.
 const MIN_PART_ROWS: usize = 1 << 14;
+/// Maximum number of row blocks of a product of long columns.
 const MAX_ROW_PARTS: usize = 16;
-/// Number of columns in a tile of a Gram matrix product.
+/// Number of columns that are multiplied at a time in a Gram matrix product.
 const GRAM_TILE_COLUMNS: usize = 64;
-/// Number of rows of scattered columns that are copied for one product. They fit in the cache.
+/// Number of rows of separately stored columns that are copied for one product. They fit in the cache.
 const LAID_OUT: usize = 1 << 10;
 
-/// Row-major product of an a×b and a b×c matrix, one thread. O(abc).
+/// Return the row-major product of an a×b and a b×c matrix, computed on one thread. O(abc).
 #[must_use]
 pub fn multiply(left: &[f64], right: &[f64], a: usize, b: usize, c: usize) -> Vec<f64> {
-    // Column-major reading of row-major storage is the transpose, so (AB)ᵀ = BᵀAᵀ needs no copy.
+    // Row-major storage read as column-major is the transpose, so (AB)ᵀ = BᵀAᵀ needs no copy.
     let left_t = MatRef::from_column_major_slice(left, b, a);
     let right_t = MatRef::from_column_major_slice(right, c, b);
     let mut product = Mat::<f64>::zeros(c, a);
@@ -30,9 +31,11 @@ pub fn multiply(left: &[f64], right: &[f64], a: usize, b: usize, c: usize) -> Ve
     out
 }
 
-/// Gram matrix of contiguous columns and, as last column, a target. It is row-major and exactly symmetric.
+/// Return the Gram matrix of contiguous columns and, as the last column, a target. For k columns it has shape (k + 1) ×
+/// (k + 1), row-major, and is exactly symmetric.
 ///
-/// O(k²m) on the threads of the current pool. The columns are not copied. The result is invalid after `stop` was set.
+/// O(k²m) for m rows on the threads of the current pool. The columns are not copied. The result is invalid after a stop
+/// request.
 ///
 /// # Panics
 /// If the columns are not as long as the target.
@@ -78,21 +81,21 @@ pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     out
 }
 
-/// Return (first row, number of rows) of each row block of a product.
+/// Return (first row, number of rows) of each row block of a product of columns with `m` rows.
 fn pieces(m: usize) -> Vec<(usize, usize)> {
     let len = m.div_ceil(MAX_ROW_PARTS).max(MIN_PART_ROWS);
     (0..m).step_by(len).map(|from| (from, len.min(m - from))).collect()
 }
 
-/// Upper-triangular factor R of the QR factorisation of the given columns, row-major k × k. O(k²m).
+/// Return the upper-triangular factor R of the QR factorization of k columns, row-major k × k. O(k²m) for m rows.
 ///
-/// Needs at least as many rows as columns; shorter columns are padded with zero rows, which leaves R unchanged.
+/// Columns with fewer than k rows are padded with zero rows, which leaves R unchanged.
 #[must_use]
 pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     if let Some(factor) = orthogonal::triangular_factor(columns) {
         return factor;
     }
-    // Squares overflow: norms must be scaled.
+    // The squares are out of range, so norms must be scaled.
     let k = columns.len();
     let m = columns.iter().map(Vec::len).max().unwrap_or(0);
     let x = Mat::from_fn(m.max(k), k, |i, j| columns[j].get(i).copied().unwrap_or(0.0));
@@ -107,20 +110,20 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     out
 }
 
-/// Singular value decomposition of columns. Values are in descending order.
+/// Singular value decomposition of a matrix, given by its columns.
 #[non_exhaustive]
 pub struct SingularValues {
-    /// Singular vectors on the left, each as long as the columns.
+    /// Left singular vectors, each as long as the columns.
     pub left: Vec<Vec<f64>>,
-    /// Singular values. Their count is the smaller of the number and the length of the columns.
+    /// Singular values in descending order. Their count is the smaller of the number and the length of the columns.
     pub values: Vec<f64>,
-    /// Singular vectors on the right, with one element a column.
+    /// Right singular vectors, with one element per column.
     pub right: Vec<Vec<f64>>,
 }
 
-/// Singular values and vectors of columns of equal length. O(k²m), one thread.
+/// Return the singular values and vectors of k columns with m rows, computed on one thread. O(k²m).
 ///
-/// None if the iteration does not converge, which does not occur for finite values.
+/// `None` if the iteration does not converge, which does not occur for finite values.
 ///
 /// ```
 /// # fn run() -> Option<()> {
@@ -141,9 +144,10 @@ pub fn singular_values(columns: &[Vec<f64>]) -> Option<SingularValues> {
     Some(SingularValues { left: vectors(decomposition.U()), values: sizes, right: vectors(decomposition.V()) })
 }
 
-/// Least-squares solution of smallest norm. O(k²m). Singular values below a fraction `share` of the largest count as 0.
+/// Return the least-squares solution of smallest norm for k columns with m rows. Singular values of at most `share`
+/// times the largest count as 0. O(k²m).
 ///
-/// None if the singular values cannot be computed, which does not occur for finite values.
+/// `None` if the singular values cannot be computed, which does not occur for finite values.
 ///
 /// ```
 /// // The two columns are equal: each gets half of what one would get.
@@ -171,9 +175,10 @@ pub fn minimum_norm_solution(columns: &[Vec<f64>], target: &[f64], share: f64) -
     Some(solution)
 }
 
-/// Inner products of every left with every right column of equal length, row-major left × right.
+/// Return the inner products of every left with every right column, row-major with one row per left column. All columns
+/// have equal length m.
 ///
-/// O(left·right·m) on the threads of the current pool. The result is invalid after `stop` was set.
+/// O(left·right·m) on the threads of the current pool. The result is invalid after a stop request.
 #[must_use]
 pub fn inner_products(left: &[&[f64]], right: &[&[f64]], stop: &Stop) -> Vec<f64> {
     let m = left.first().map_or(0, |c| c.len());

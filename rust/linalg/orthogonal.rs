@@ -1,22 +1,22 @@
-//! Orthonormal bases, projections and triangular factors of long columns, vectorized.
+//! Orthonormal bases, projections and triangular factors of matrices with long columns, by vector instructions.
 
 use crate::error::Result;
 use crate::parallel::{self, Stop};
 use crate::simd::{dispatch_simd, dot, SimdKernel};
 
-/// Number of rows of one block of a triangular factorization. They fit in the cache.
+/// Number of rows of one block of a triangular factorization. Such a block fits in the cache.
 const QR_BLOCK_ROWS: usize = 1 << 10;
 
-/// Number of directions that are projected out between two checks for cancellation.
+/// Number of basis vectors that are projected out between two checks for a stop request.
 const AT_ONCE: usize = 16;
 
-/// Minimum squared norm in factorizations. Below it, or above [`MAX_SQUARED_NORM`], sums of squares lose accuracy or
-/// overflow.
+/// Minimum squared norm of a column in a factorization. Smaller sums of squares lose accuracy.
 const MIN_SQUARED_NORM: f64 = 1e-280;
+/// Maximum squared norm of a column in a factorization. Larger sums of squares may overflow.
 const MAX_SQUARED_NORM: f64 = 1e280;
 
-/// SIMD task that reduces [R; rows] to an upper triangle R by Householder reflections. It returns false if a square is
-/// out of range.
+/// Reduction of a triangle R with rows below it to an upper triangle, by Householder reflections. The result is false
+/// if a squared norm is out of range. It is compiled for the widest vector instructions available.
 struct Reflections<'a> {
     columns: &'a mut [Vec<f64>],
 }
@@ -54,18 +54,18 @@ impl SimdKernel for Reflections<'_> {
     }
 }
 
-/// Upper-triangular QR factor of columns, row-major k × k, by blocks of rows. O(k²m).
+/// Return the upper-triangular QR factor of k columns, row-major k × k, computed by blocks of rows. O(k²m) for m rows.
 ///
-/// None if a squared norm is out of range.
+/// `None` if a squared norm is outside [`MIN_SQUARED_NORM`] to [`MAX_SQUARED_NORM`].
 pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     let k = columns.len();
     let m = columns.iter().map(Vec::len).max().unwrap_or(0);
-    // R of the processed rows on top, the next rows below.
+    // The triangle R of the processed rows is on top, and the next rows follow below.
     let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + QR_BLOCK_ROWS.min(m)); k];
     stacked.iter_mut().for_each(|column| column.resize(k, 0.0));
     for from in (0..m).step_by(QR_BLOCK_ROWS) {
         for (j, (column, source)) in stacked.iter_mut().zip(columns).enumerate() {
-            // A reflection leaves its own vector below the triangle.
+            // A reflection leaves its vector below the triangle.
             column.truncate(k);
             column.iter_mut().skip(j + 1).for_each(|v| *v = 0.0);
             let rows = source.get(from..source.len().min(from + QR_BLOCK_ROWS)).unwrap_or_default();
@@ -85,7 +85,8 @@ pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
     out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
-/// SIMD task that removes the components along an orthonormal basis from a column, repeated `times` times.
+/// Removal of the components along an orthonormal basis from a column, repeated `times` times. It is compiled for the
+/// widest vector instructions available.
 struct Projection<'a> {
     basis: &'a [Vec<f64>],
     column: &'a mut [f64],
@@ -108,12 +109,14 @@ impl SimdKernel for Projection<'_> {
     }
 }
 
-/// Remove the components along an orthonormal basis from a column of equal length. O(k m).
+/// Remove the components along an orthonormal basis from a column of equal length. O(k m) for k basis vectors of m
+/// values.
 pub fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
     dispatch_simd(Projection { basis, column, times: 1 });
 }
 
-/// Add a column to an orthonormal basis unless its relative distance from the span is below `share`. O(k m).
+/// Extend an orthonormal basis by a column, unless its distance from the span relative to its norm is at most `share`.
+/// O(k m) for k basis vectors of m values.
 pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
     let whole = norm(&column);
     // Two passes are enough (Kahan, Parlett).
@@ -125,10 +128,11 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
     }
 }
 
-/// Orthonormal basis of the span of columns, up to a relative distance `share` of every column from the span.
+/// Return an orthonormal basis of the span of k columns of m values. Every column has a distance of at most `share`
+/// from the span, relative to its norm.
 ///
-/// O(k² m) on the threads of the current pool. Pivoting: the column farthest from the basis comes next, so that
-/// rounding errors are amplified once by 1/`share`, not once a column. Zero columns and columns whose squared norm
+/// O(k² m) on the threads of the current pool. The column farthest from the basis is added next (pivoting). Rounding
+/// errors are therefore amplified once by 1/`share`, not once per column. Zero columns and columns whose squared norm
 /// overflows are skipped.
 ///
 /// # Errors
@@ -159,7 +163,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
         basis.push(direction);
         let last = &basis[basis.len() - 1..];
         let without = |(): &mut (), (remainder, mut column): (f64, Vec<f64>)| {
-            // A column that is half processed after cancellation is discarded.
+            // After a stop request, columns are left unprocessed, and the result is discarded.
             if stop.is_set() {
                 return (remainder, column);
             }
@@ -170,7 +174,7 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
     }
 }
 
-/// SIMD task that computes the norm √Σ v².
+/// Euclidean norm √Σ v² of a column. It is compiled for the widest vector instructions available.
 struct Norm<'a>(&'a [f64]);
 
 impl SimdKernel for Norm<'_> {
@@ -182,7 +186,7 @@ impl SimdKernel for Norm<'_> {
     }
 }
 
-/// Euclidean norm of a column whose squares do not overflow.
+/// Return the Euclidean norm of a column whose squares do not overflow.
 #[must_use]
 pub fn norm(column: &[f64]) -> f64 {
     dispatch_simd(Norm(column))

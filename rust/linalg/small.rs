@@ -1,18 +1,19 @@
-//! Small dense systems: inverses, LU, batched LDLᵀ solves, recursive least squares. The only user of `nalgebra`.
+//! Small dense systems: inverses, LU, batched LDLᵀ solutions, recursive least squares. This is the only module that
+//! uses `nalgebra`.
 
 use nalgebra::{DMatrix, DVector, Dyn, FullPivLU, Schur};
 
 use crate::error::{check_length, Error, Result};
 use crate::simd::Lanes;
 
-/// Pivot of a correlation matrix below which a regressor is linearly dependent within rounding. The Gram matrix of m =
-/// 2048 products has errors of about 1e−13.
+/// Pivot of a correlation matrix at or below which a regressor is linearly dependent within rounding. The elements of a
+/// Gram matrix of columns with m = 2048 rows have errors of about 1e−13.
 pub const PIVOT_FLOOR: f64 = 1e-13;
 
-/// Inverse of a row-major n × n matrix, row-major.
+/// Return the inverse of a row-major n × n matrix, row-major.
 ///
 /// # Errors
-/// [`Error::LeadingZero`] with the determinant of a singular matrix, [`Error::Length`].
+/// [`Error::LeadingZero`] with the determinant of a singular matrix. [`Error::Length`] for a wrong number of elements.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -38,7 +39,8 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
     }
 }
 
-/// Inverse and determinant of a row-major n × n matrix; None for a singular matrix, or one that is not finite.
+/// Return the inverse (row-major) and the determinant of a row-major n × n matrix. `None` for a singular matrix, or one
+/// that is not finite.
 ///
 /// ```
 /// use ftlm::linalg::small::inverse_with_determinant;
@@ -64,9 +66,9 @@ pub fn inverse_with_determinant(matrix: &[f64], n: usize) -> Option<(Vec<f64>, f
 /// Maximum number of steps of an eigenvalue iteration. A polynomial of degree ten needs about thirty.
 const MAX_EIGENVALUE_STEPS: usize = 1000;
 
-/// Largest magnitude of the zeros of a polynomial, whose coefficients start with the constant.
+/// Return the largest magnitude of the zeros of a polynomial. Its coefficients start with the constant.
 ///
-/// None without a zero, or if the leading coefficient is 0 or too small relative to the others.
+/// `None` for a polynomial without zeros, or if the leading coefficient is 0 or too small relative to the others.
 ///
 /// ```
 /// // (z + 3)(z − 2)
@@ -78,9 +80,9 @@ pub fn spectral_radius(coefficients: &[f64]) -> Option<f64> {
     Some(roots.iter().map(|(re, im)| re.hypot(*im)).fold(0.0, f64::max)).filter(|_| !roots.is_empty())
 }
 
-/// Real and imaginary parts of the zeros of a polynomial, whose coefficients start with the constant.
+/// Return the zeros of a polynomial as pairs (real part, imaginary part). Its coefficients start with the constant.
 ///
-/// None if the leading coefficient is 0 or too small relative to the others.
+/// `None` if there are no coefficients, or if the leading coefficient is 0 or too small relative to the others.
 ///
 /// ```
 /// // (s + 1)² + 4
@@ -95,7 +97,7 @@ pub fn polynomial_roots(coefficients: &[f64]) -> Option<Vec<(f64, f64)>> {
     if ratios.iter().any(|v| !v.is_finite()) {
         return None;
     }
-    // In this unit no coefficient is above 1.
+    // With zeros in this unit, no coefficient is above 1 in modulus.
     let unit = ratios.iter().zip(1..).map(|(v, k)| v.abs().powf(1.0 / k as f64)).fold(0.0, f64::max);
     if unit == 0.0 {
         return Some(vec![(0.0, 0.0); ratios.len()]);
@@ -108,21 +110,23 @@ pub fn polynomial_roots(coefficients: &[f64]) -> Option<Vec<(f64, f64)>> {
     Some(eigenvalues.iter().map(|z| (unit * z.re, unit * z.im)).collect())
 }
 
-/// LU factorization of an equilibrated square matrix, whose rows and columns may differ in scale by any factor.
+/// LU factorization of a square matrix after equilibration. The scales of its rows and columns may differ by any
+/// factor.
 pub struct EquilibratedLu {
-    /// Largest magnitude in each row.
+    /// Scale of each row: its largest modulus.
     rows: Vec<f64>,
-    /// Largest magnitude in each column.
+    /// Scale of each column: its largest modulus after scaling the rows.
     columns: Vec<f64>,
-    /// LU factorization; None for a matrix without rows.
+    /// LU factorization with full pivoting, `None` for an empty matrix.
     factor: Option<FullPivLU<f64, Dyn, Dyn>>,
 }
 
 impl EquilibratedLu {
-    /// Factorization of a row-major k × k matrix.
+    /// Factor a row-major k × k matrix.
     ///
     /// # Errors
-    /// [`Error::Singular`] for a matrix that is singular within rounding, [`Error::Length`].
+    /// [`Error::Singular`] for a matrix that is singular within rounding. [`Error::Length`] for a wrong number of
+    /// elements.
     ///
     /// ```
     /// let solved = ftlm::linalg::small::EquilibratedLu::new(&[2.0, 0.0, 0.0, 0.25], 2)?.solve(&[1.0, 1.0]);
@@ -131,7 +135,7 @@ impl EquilibratedLu {
     /// ```
     pub fn new(matrix: &[f64], k: usize) -> Result<Self> {
         check_length("matrix", k * k, matrix.len())?;
-        // Scale rows, then columns, to unit largest element. Near singularity then does not depend on units.
+        // Scale rows, then columns, to a largest modulus of 1. The test for singularity then does not depend on units.
         let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
         let mut a = DMatrix::from_row_slice(k, k, matrix);
         let rows: Vec<f64> = (0..k).map(|i| largest(&mut a.row(i).iter().copied())).collect();
@@ -154,7 +158,7 @@ impl EquilibratedLu {
         Ok(Self { rows, columns, factor })
     }
 
-    /// Solution for this right-hand side, one value per row.
+    /// Return the solution for a right-hand side with one value per row.
     #[must_use]
     pub fn solve(&self, rhs: &[f64]) -> Vec<f64> {
         let mut x = DVector::from_iterator(rhs.len(), rhs.iter().zip(&self.rows).map(|(v, scale)| v / scale));
@@ -164,7 +168,7 @@ impl EquilibratedLu {
         x.iter().zip(&self.columns).map(|(v, scale)| v / scale).collect()
     }
 
-    /// Inverse, row-major.
+    /// Return the inverse, row-major.
     #[must_use]
     pub fn inverse(&self) -> Vec<f64> {
         let k = self.rows.len();
@@ -178,10 +182,11 @@ impl EquilibratedLu {
     }
 }
 
-/// Inverse of a row-major k × k matrix whose rows and columns may differ in scale by any factor.
+/// Return the inverse (row-major) of a row-major k × k matrix. The scales of its rows and columns may differ by any
+/// factor.
 ///
 /// # Errors
-/// [`Error::Singular`] for a matrix that is singular within rounding, [`Error::Length`].
+/// [`Error::Singular`] for a matrix that is singular within rounding. [`Error::Length`] for a wrong number of elements.
 ///
 /// ```
 /// assert_eq!(ftlm::linalg::small::scaled_inverse(&[2.0, 0.0, 0.0, 0.25], 2), Ok(vec![0.5, 0.0, 0.0, 4.0]));
@@ -192,22 +197,23 @@ pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
     Ok(EquilibratedLu::new(matrix, k)?.inverse())
 }
 
-/// Index of element (i, j), j ≤ i, of a symmetric matrix stored by its lower rows.
+/// Return the index of element (i, j), j ≤ i, of a symmetric matrix stored as the rows of its lower triangle.
 #[inline(always)]
 #[must_use]
 pub const fn packed_index(i: usize, j: usize) -> usize {
     i * (i + 1) / 2 + j
 }
 
-/// Solve L symmetric positive definite systems of k unknowns side by side, in place, by L D Lᵀ.
+/// Solve L symmetric positive definite systems of k unknowns in parallel SIMD lanes, in place, by L D Lᵀ factorization.
+/// O(k³).
 ///
-/// `gram` has the lower rows ([`packed_index`]) of correlation matrices. Their diagonals are 1, or 0 for a zero column.
-/// `rhs` is overwritten with the solutions. The first `needed` unknowns must be independent; the returned flags mark
-/// the lanes in which they are not. Later dependent unknowns are set to 0. O(k³). The operations of a lane depend
-/// neither on other lanes nor on L.
+/// `gram` contains the lower triangles ([`packed_index`]) of correlation matrices. Their diagonal elements are 1, or 0
+/// for a zero column. `rhs` is overwritten with the solutions. The first `needed` unknowns must be linearly
+/// independent. The returned flags are true for lanes in which they are not. Later dependent unknowns are set to 0. The
+/// operations of a lane depend neither on other lanes nor on L.
 #[inline(always)]
 pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
-    // Common sizes get loops of constant length.
+    // For frequent numbers of unknowns, the compiler generates loops of constant length.
     match rhs.len() {
         1 => solve_sized(1, gram, rhs, needed),
         2 => solve_sized(2, gram, rhs, needed),
@@ -218,6 +224,7 @@ pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], 
     }
 }
 
+/// Do the work of [`solve_lanes`] for k unknowns.
 #[inline(always)]
 fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
     let (gram, rhs) = (&mut gram[..packed_index(k, 0)], &mut rhs[..k]);
@@ -283,7 +290,8 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
     singular
 }
 
-/// Solution of a small symmetric row-major system. None if it is not positive definite. O(k³).
+/// Return the solution of a small symmetric system with a row-major matrix. `None` if it is not positive definite.
+/// O(k³) for k unknowns.
 #[must_use]
 pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     let k = rhs.len();
@@ -291,9 +299,10 @@ pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     Some(solved.iter().copied().collect())
 }
 
-/// Nonnegative least squares: minimize ‖Σ xⱼ columnⱼ − target‖ for x ≥ 0, by active sets.
+/// Return the x ≥ 0 that minimizes ‖Σ x_j column_j − target‖, by the active-set method.
 ///
-/// Lawson & Hanson, doi:10.1137/1.9781611971217, §23.3. A dependent column gets 0.
+/// The algorithm is that of Lawson & Hanson, doi:10.1137/1.9781611971217, §23.3. The coefficient of a linearly
+/// dependent column is 0.
 ///
 /// ```
 /// let found = ftlm::linalg::small::nonnegative_solution(&[vec![1.0, 0.0], vec![0.0, 1.0]], &[2.0, -1.0]);
@@ -312,7 +321,7 @@ pub fn nonnegative_solution(columns: &[Vec<f64>], target: &[f64]) -> Vec<f64> {
         let Some(next) = rises.max_by(|&i, &j| gradient[i].total_cmp(&gradient[j])) else { break };
         positive.push(next);
         while let Ok(solved) = matrix.select_columns(&positive).svd(true, true).solve(&target, PIVOT_FLOOR) {
-            // The last share of the way on which no value becomes negative.
+            // Largest fraction of the step at which no value becomes negative.
             let ends = positive.iter().zip(&solved).filter(|(_, to)| **to <= 0.0).map(|(&j, to)| x[j] / (x[j] - to));
             let share = ends.fold(1.0, f64::min);
             positive.iter().zip(&solved).for_each(|(&j, to)| x[j] += share * (to - x[j]));
@@ -329,7 +338,7 @@ pub fn nonnegative_solution(columns: &[Vec<f64>], target: &[f64]) -> Vec<f64> {
     x.iter().copied().collect()
 }
 
-/// Solve `R x = c` for upper-triangular row-major R, k × k with row stride `stride`.
+/// Return the solution x of R x = `rhs` for an upper-triangular row-major matrix R with row stride `stride`.
 #[must_use]
 pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
     let k = rhs.len();
@@ -343,7 +352,8 @@ pub fn back_substitute(r: &[f64], stride: usize, rhs: &[f64]) -> Vec<f64> {
     x
 }
 
-/// Replace a packed lower triangle by its Cholesky factor. The pivot of a zero row is set to 1.
+/// Replace a packed lower triangle of a k × k matrix by its Cholesky factor. The pivot of a row with diagonal element 0
+/// is set to 1. `None` if the matrix is not positive definite.
 fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
     for i in 0..k {
         for j in 0..=i {
@@ -363,34 +373,37 @@ fn cholesky(packed: &mut [f64], k: usize) -> Option<()> {
     Some(())
 }
 
-/// Σ q qᵀ and Σ q m over the newest rows, in amortized O(k²) per row for any length of the window.
+/// Sums Σ q qᵀ and Σ q m over a sliding window of the newest rows, with regressor values q and output m of a row. They
+/// take amortized O(k²) operations per row of k values, for any length of the window.
 ///
-/// Rows form blocks of the length of the window. A window consists of the end of one block and the beginning of the
-/// next, so its sum is a suffix sum plus a prefix sum (van Herk, doi:10.1016/0167-8655(92)90069-C). No sums are
+/// The rows form blocks of the length of the window. A window consists of the end of one block and the beginning of the
+/// next. Its sum is therefore a suffix sum plus a prefix sum (van Herk, doi:10.1016/0167-8655(92)90069-C). No sums are
 /// subtracted, so there is no cancellation.
 #[derive(Debug, Clone)]
 pub struct SlidingGram {
+    /// Number of values in a row.
     width: usize,
+    /// Number of rows of the window.
     length: usize,
-    /// Products of the rows of the current block: packed rows of q qᵀ, then q m.
+    /// Products of each row of the current block: packed lower triangle of q qᵀ, then q m.
     block: Vec<f64>,
-    /// Suffix sums of the previous block: from each of its rows to its end.
+    /// Suffix sums of the products over the previous block: from each of its rows to its end.
     suffixes: Vec<f64>,
-    /// Sum of the rows of the current block.
+    /// Sum of the products over the current block.
     prefix: Vec<f64>,
-    /// Sum of the rows of the previous block that are still in the window.
+    /// Sum of the products over the rows of the previous block that are still in the window.
     suffix: Vec<f64>,
 }
 
 impl SlidingGram {
-    /// Empty window of this many rows, each of `width` values.
+    /// Return an empty window of at most `length` rows with `width` values each.
     #[must_use]
     pub fn new(width: usize, length: usize) -> Self {
         let zeros = vec![0.0; packed_index(width, 0) + width];
         Self { width, length, block: Vec::new(), suffixes: Vec::new(), prefix: zeros.clone(), suffix: zeros }
     }
 
-    /// Remove all rows.
+    /// Remove all rows from the window.
     pub fn clear(&mut self) {
         self.block.clear();
         self.suffixes.clear();
@@ -401,7 +414,7 @@ impl SlidingGram {
     /// Add a row and its output. If the window is full, the oldest row is removed.
     ///
     /// # Errors
-    /// [`Error::Length`] for a row of another length.
+    /// [`Error::Length`] for a row of wrong length.
     pub fn push(&mut self, row: &[f64], output: f64) -> Result<()> {
         check_length("row", self.width, row.len())?;
         let all = self.prefix.len();
@@ -427,28 +440,28 @@ impl SlidingGram {
         Ok(())
     }
 
-    /// Return one element of Σ q qᵀ (packed upper rows) or, after these, of Σ q m over the rows of the window. `at` is
-    /// the index of the element.
+    /// Return element `at` of the sums over the window: packed lower triangle of Σ q qᵀ, then Σ q m.
     #[inline]
     fn sum(&self, at: usize) -> f64 {
         self.suffix[at] + self.prefix[at]
     }
 }
 
-/// State of the paper's recursion (44): coefficients and inverse covariance.
+/// State of the recursion of eq. (44) of the paper: coefficients and inverse covariance (information matrix).
 #[derive(Debug, Clone)]
 pub struct Recursion {
     coefficients: Vec<f64>,
-    /// Inverse covariance, packed rows of the lower triangle.
+    /// Inverse covariance, packed as the rows of its lower triangle.
     information: Vec<f64>,
-    /// Right-hand side that new prior precisions add to the next step.
+    /// Contribution of new prior precisions to the right-hand side of the next step.
     gain: Vec<f64>,
-    /// Cholesky factor of the information, packed.
+    /// Cholesky factor of the inverse covariance, packed in the same way.
     factor: Vec<f64>,
 }
 
 impl Recursion {
-    /// Recursion that starts at coefficients 0 with the inverse prior covariance of each; 0 without a prior.
+    /// Return the state with coefficients 0. `precision` contains the inverse prior covariance of each coefficient, 0
+    /// without a prior.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a precision that is negative or not finite.
@@ -467,12 +480,12 @@ impl Recursion {
         Ok(Self { coefficients: vec![0.0; k], factor: information.clone(), information, gain: vec![0.0; k] })
     }
 
-    /// Multiply the information of all earlier rows by a factor in (0, 1].
+    /// Multiply the inverse covariance from all earlier rows by a forgetting factor in (0, 1].
     pub fn forget(&mut self, factor: f64) {
         self.information.iter_mut().for_each(|v| *v *= factor);
     }
 
-    /// Add inverse prior covariances of coefficients with prior mean 0. The next step uses them.
+    /// Add an inverse prior covariance for each coefficient, with prior mean 0. The next step uses them.
     pub fn add_prior(&mut self, precision: impl Iterator<Item = f64>) {
         for (j, more) in precision.take(self.coefficients.len()).enumerate() {
             self.information[packed_index(j, j)] += more;
@@ -480,12 +493,13 @@ impl Recursion {
         }
     }
 
-    /// Update the state by one step of the paper's (44) with the rows of a window.
+    /// Update the state by one step of eq. (44) of the paper with the rows of a window.
     ///
-    /// A coefficient without information is unchanged.
+    /// A coefficient with zero information is unchanged.
     ///
     /// # Errors
-    /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for rows of another length.
+    /// [`Error::Diverged`] if the inverse covariance is not positive definite. [`Error::Length`] for rows of wrong
+    /// length.
     pub fn step(&mut self, window: &SlidingGram) -> Result<()> {
         let k = self.coefficients.len();
         check_length("row", k, window.width)?;
@@ -508,7 +522,7 @@ impl Recursion {
         self.factor.copy_from_slice(&self.information);
         cholesky(&mut self.factor, k)
             .ok_or_else(|| Error::Diverged { what: "covariance of the recursion".into(), index: 0 })?;
-        // L Lᵀ x = gain, and the solution replaces the gain.
+        // Solve L Lᵀ x = gain with the Cholesky factor L. The solution replaces the gain.
         let (factor, x) = (&self.factor, &mut self.gain);
         for i in 0..k {
             let partial_sum: f64 = (0..i).map(|j| factor[packed_index(i, j)] * x[j]).sum();
@@ -522,7 +536,7 @@ impl Recursion {
         Ok(())
     }
 
-    /// Coefficients after the last step.
+    /// Return the coefficient estimates after the most recent step.
     #[must_use]
     pub fn coefficients(&self) -> &[f64] {
         &self.coefficients
@@ -533,7 +547,8 @@ impl Recursion {
 mod tests {
     use super::*;
 
-    /// Update by one step of the paper's (44) with a dense solve. Rows of the window are added one after another.
+    /// Update by one step of eq. (44) of the paper with a dense solution. Rows of the window are added one after
+    /// another.
     fn naive_step(information: &mut DMatrix<f64>, x: &mut DVector<f64>, rows: &[(Vec<f64>, f64)]) {
         let mut gain = DVector::zeros(x.len());
         for (row, output) in rows {

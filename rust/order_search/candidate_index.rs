@@ -13,19 +13,20 @@ use crate::order_search::options::{Budget, Options};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
-/// All candidates of an order grid for one equation, with the data they share.
+/// All candidates of an order grid for one equation, with the regressors and bounds that they share.
 pub(crate) struct CandidateIndex<'a> {
     pub(crate) problem: Problem,
     pub(crate) lattice: Cow<'a, OrderGrid>,
     pub(crate) options: Options,
-    /// Part of the memory limit that is not used \[bytes\].
+    /// Unused part of the memory limit \[bytes\].
     pub(crate) spare_bytes: u64,
-    /// Column index by block of the order grid, then by term, then by grid value of the term's order.
+    /// Column of the regressor, by block of the order grid, then by term, then by grid value of the order of the term.
+    /// A block has one order α of the equation.
     tables: Vec<Vec<Vec<usize>>>,
 }
 
 impl<'a> CandidateIndex<'a> {
-    /// Build regressors, their products and test vectors for all candidates.
+    /// Build the regressors, their inner products and the fixed test vectors for all candidates.
     pub(crate) fn new(
         records: &[Record],
         lattice: Cow<'a, OrderGrid>,
@@ -59,31 +60,32 @@ impl<'a> CandidateIndex<'a> {
         Ok(Self { problem, lattice, options: options.clone(), spare_bytes: spare, tables })
     }
 
-    /// Columns of the terms at a cursor.
+    /// Write the column of each term of the candidate at the cursor to `positions`.
     pub(crate) fn positions(&self, cursor: &Cursor<'_>, positions: &mut [usize]) {
         let table = &self.tables[cursor.block()];
         cursor.each(0, |term, digit| positions[term] = table[term][digit]);
     }
 
-    /// Columns of the initial terms at a cursor.
+    /// Write the columns of the initial terms of the candidate at a cursor to `initial`. Unchanged for zero initial
+    /// conditions.
     pub(crate) fn initial(&self, cursor: &Cursor<'_>, initial: &mut Vec<usize>) {
         if self.options.initial != Initial::Rest {
             self.problem.initial_positions(&cursor.structure(), initial);
         }
     }
 
-    /// Columns of the values of one term in the cursor's block.
+    /// Return the columns of all grid values of the order of one term, for the order α at the cursor.
     #[inline(always)]
     pub(crate) fn term_columns(&self, cursor: &Cursor<'_>, term: usize) -> &[usize] {
         &self.tables[cursor.block()][term]
     }
 
-    /// Columns of the values of one term in a block.
+    /// Return the columns of all grid values of the order of one term, for the order α of a block.
     pub(crate) fn columns(&self, block: usize, term: usize) -> &[usize] {
         &self.tables[block][term]
     }
 
-    /// Advance to the next candidate and update its columns.
+    /// Advance the cursor to the next candidate, and update the columns `terms`.
     #[inline(always)]
     pub(crate) fn next(&self, cursor: &mut Cursor<'_>, terms: &mut [usize]) {
         let changed = cursor.advance();
@@ -92,7 +94,8 @@ impl<'a> CandidateIndex<'a> {
     }
 }
 
-/// Column of every value of every term, per block. The tables replace a search per candidate.
+/// Return the column of every grid value of every term, by block. A table avoids a lookup of each regressor per
+/// candidate.
 fn tables(lattice: &OrderGrid, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
     lattice
         .blocks()
@@ -105,7 +108,7 @@ fn tables(lattice: &OrderGrid, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>
                         .iter()
                         .enumerate()
                         .map(|(i, &order)| {
-                            // Values outside this α's range are never used.
+                            // Grid values outside the range of this α are never used.
                             if i < first {
                                 Ok(0)
                             } else {

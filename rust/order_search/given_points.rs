@@ -1,6 +1,6 @@
 //! Output errors of given candidates, each with its own orders and coefficients.
 //!
-//! The genetic algorithm uses it for its population.
+//! The genetic algorithm uses this module to score its population.
 
 use std::collections::HashMap;
 
@@ -16,15 +16,16 @@ use crate::order_search::result::Verdict;
 use crate::parallel::{pool, PerThread};
 use crate::regressors::{Key, Record};
 
-/// Maximum memory of regressors cached between calls \[bytes\]. A converged population reuses them.
+/// Maximum memory of the regressors cached between calls \[bytes\]. Successive populations of a converged genetic
+/// algorithm use the same regressors.
 const MAX_CACHE_BYTES: usize = 256 << 20;
 
-/// Candidate with an order and a coefficient for each term.
+/// Candidate of a search: order of the equation, and an order and a coefficient for each term.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Point {
-    /// Order of the equation.
+    /// Highest order α of the equation.
     pub order: f64,
-    /// Orders of the terms.
+    /// Orders ν of the terms.
     pub orders: Vec<f64>,
     /// Coefficients of the terms.
     pub coefficients: Vec<f64>,
@@ -38,15 +39,18 @@ pub struct Points {
     inputs: Vec<bool>,
     norm: Norm,
     samples: usize,
-    /// Cache by record: the kernel of a term of the output, the integral of any other signal.
+    /// Cached columns, one per record: the kernel for a term of the output, the fractional integral of any other
+    /// signal.
     cache: HashMap<Key, Vec<Vec<f64>>>,
 }
 
 impl Points {
-    /// Build the equation of `output` with a term on each of `signals`. `inputs` marks the signals that are inputs.
+    /// Build the evaluator of the equation of `output` with one term on each of `signals`. `inputs\[s\]` is true if
+    /// signal s is an input.
     ///
     /// # Errors
-    /// No record, or a signal that the records lack.
+    /// [`Error::Structure`] without a record or for a signal that the records lack. [`Error::Length`] for records with
+    /// different numbers of signals.
     pub fn new(
         records: Vec<Record>,
         output: usize,
@@ -75,15 +79,17 @@ impl Points {
         Ok(Self { records, output, signals, inputs, norm, samples, cache: HashMap::new() })
     }
 
-    /// Output error of every candidate, summed over the records: Σ|e|, or RMSE.
+    /// Return the output error of every candidate over all records: Σ|e| for [`Norm::L1`], the root mean square error
+    /// for [`Norm::L2`].
     ///
-    /// The error is infinite for invalid orders, for an order above that of the equation, for a simulation that
-    /// diverges, and for an error above `limit`, whose evaluation stops early. The result is bitwise identical for any
-    /// number of threads.
+    /// The error is infinite for invalid orders, for a term order above the order of the equation, and for a simulation
+    /// that diverges. It is also infinite if it exceeds `limit`, because the evaluation then stops early. The result is
+    /// bitwise identical for any number of threads.
     ///
     /// # Errors
-    /// A candidate of another length, coefficients that are not finite, threads that do not start,
-    /// [`Error::Interrupted`].
+    /// [`Error::Length`] for a number of orders or coefficients that differs from the number of terms.
+    /// [`Error::NotFinite`] for coefficients that are not finite. [`Error::Interrupted`] after a stop request. Also an
+    /// error if the threads cannot be started.
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -112,13 +118,14 @@ impl Points {
             let structure = Structure { output: self.output, order: point.order, terms };
             let is_input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
             let fits = structure.check(self.records[0].len(), is_input).is_ok();
-            // The kink correction has no derivative at jumps, and a candidate must be ranked as it will be simulated.
+            // The correction of slope discontinuities has no derivative at jumps. A candidate must be ranked by the
+            // response with which it will be simulated.
             let smooth = structure.terms.iter().all(|term| term.order <= structure.order);
             structures.push((fits && smooth).then_some(structure));
         }
         let pool = pool(threads)?;
         self.fill_cache(&structures, &pool);
-        // Raw sums: Σ|e|, or Σe².
+        // Raw scores are sums: Σ|e| or Σe².
         #[allow(clippy::cast_precision_loss)]
         let samples = self.samples as f64;
         let raw_limit = if self.norm == Norm::L1 { limit } else { limit * limit * samples };
@@ -142,7 +149,7 @@ impl Points {
         Ok(raw.into_iter().map(|raw| self.norm.score(raw, self.samples)).collect())
     }
 
-    /// Compute the regressors that are not in the cache.
+    /// Compute the regressors of these structures that are not in the cache.
     fn fill_cache(&mut self, structures: &[Option<Structure>], pool: &rayon::ThreadPool) {
         let each = self.samples * std::mem::size_of::<f64>();
         let mut requests: Vec<(Key, usize, f64)> = Vec::new();
@@ -179,7 +186,8 @@ impl Points {
         self.cache.extend(requests.into_iter().map(|(key, _, _)| key).zip(columns));
     }
 
-    /// Raw error of a candidate on all records. `None` above the limit, or if the simulation diverges.
+    /// Return the raw score (Σ|e| or Σe²) of a candidate over all records. `None` if it exceeds the limit or the
+    /// simulation diverges.
     fn error(
         &self,
         structure: &Structure,
@@ -200,7 +208,7 @@ impl Points {
             let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));
             let target = record.signal(self.output);
             match march.accumulate_error(target, side(true), side(false), self.norm, sum, limit, control) {
-                // A NaN limit excludes all.
+                // A NaN limit excludes all candidates.
                 Verdict::Score(raw) if raw <= limit => sum = raw,
                 _ => return None,
             }
@@ -209,8 +217,8 @@ impl Points {
     }
 }
 
-/// L1 output error of one candidate on one record by naive division, a reference for tests of [`Points::scores`].
-/// O(m²).
+/// Return the L1 output error Σ|e| of one candidate on one record by naive division. It is a reference for tests of
+/// [`Points::scores`] and takes O(m²) operations for m samples. Infinite if the division fails.
 ///
 /// # Panics
 /// If the record lacks a signal.

@@ -1,9 +1,9 @@
 //! Options of an order search: criterion, norm, estimator, pruning and memory budget.
 //!
-//! The budget counts memory that grows with records and order grid: columns, kernels, their products, spectra and test
-//! vectors of every equation and record, and the rows of the join of coupled equations. Tables of boxes and tailored
-//! test vectors use the remaining memory, or are not built. The records themselves and the workspace of each thread,
-//! some vectors of the record's length, are not counted.
+//! The memory budget counts all memory that grows with records and order grid. It includes columns, kernels, their
+//! inner products, spectra and test vectors of every equation and record. It also includes the rows of the join of
+//! coupled equations. Tables of boxes and tailored test vectors use the remaining memory, or are not built. The budget
+//! excludes the records and the workspace of each thread, which is a few vectors of the record's length.
 
 use crate::equation::Initial;
 use crate::error::{check_finite, Error, Result};
@@ -13,26 +13,27 @@ use crate::fft::{fast_length, Bin};
 use crate::regressors::{Bank, Index, Record, BANK_LIMIT};
 use crate::simd::LANE_COUNT;
 
-/// Error that ranks the candidates.
+/// Kind of error by which the candidates are ranked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Criterion {
-    /// Output error e = y − ŷ, ŷ the simulated output.
+    /// Output error e = y − ŷ with measured output y and simulated output ŷ.
     OutputError,
-    /// Equation error ε = y − Σ c I^{α−ν} s with measured signals s.
+    /// Equation error ε = y − Σ c I^{α−ν} s over the terms with coefficient c, order ν and measured signal s. I^{α−ν}
+    /// is the fractional integral for an equation of order α.
     EquationError,
 }
 
 /// Norm of an error over all samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Norm {
-    /// Sum of absolute errors Σ|e| (equation (45) of the paper).
+    /// Sum of absolute errors Σ|e|, eq. (45) of the paper.
     L1,
-    /// Root mean square √(Σe²/M) (equation (46) of the paper).
+    /// Root mean square √(Σe²/M) over M samples, eq. (46) of the paper.
     L2,
 }
 
 impl Norm {
-    /// Add |e| or e² of a block to a raw sum.
+    /// Return the sum `raw` plus Σ|e| or Σe² over a block, with the error e = measured − response.
     #[inline]
     pub(crate) fn add(self, raw: f64, measured: &[f64], response: &[f64]) -> f64 {
         raw + match self {
@@ -41,7 +42,7 @@ impl Norm {
         }
     }
 
-    /// Score of a raw sum (Σ|e| or Σe²) over this many samples.
+    /// Return the score of a raw sum (Σ|e| or Σe²) over this many samples.
     ///
     /// ```
     /// # use ftlm::order_search::options::Norm;
@@ -57,7 +58,7 @@ impl Norm {
     }
 }
 
-/// Sum over pairs of values in [`LANE_COUNT`] independent partial sums.
+/// Return the sum of `term(a, b)` over pairs of values, computed in [`LANE_COUNT`] independent partial sums.
 #[inline(always)]
 fn sum_side_by_side(a: &[f64], b: &[f64], term: impl Fn(f64, f64) -> f64) -> f64 {
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANE_COUNT>(), b.as_chunks::<LANE_COUNT>());
@@ -78,31 +79,33 @@ pub enum Estimator {
     LeastSquares,
     /// Multi-innovation least squares in closed form.
     MultiInnovation(Innovation),
-    /// Instrumental variables, refined from the records' noise-free signals.
+    /// Refined instrumental variables with instruments from the noise-free signals of the records.
     InstrumentalVariables(InstrumentalSettings),
 }
 
 /// Options of an order search.
 ///
-/// Defaults: output error in the L1 norm, least-squares coefficients, zero initial conditions, 20 rows, one thread.
+/// The defaults are the output error in the L1 norm, least-squares coefficients, zero initial conditions, 20 rows and
+/// one thread.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Error that ranks the candidates.
+    /// Kind of error by which the candidates are ranked.
     pub criterion: Criterion,
     /// Norm of the error.
     pub norm: Norm,
     /// Estimator of the coefficients.
     pub estimator: Estimator,
-    /// Initial terms of each record.
+    /// Initial terms that are estimated for each record.
     pub initial: Initial,
-    /// Number of rows in the table, at least one.
+    /// Number of rows in the result table, at least one.
     pub top: usize,
-    /// Number of threads, 1 to `MAX_THREADS`. The result is bitwise identical for any number.
+    /// Number of threads, 1 to `MAX_THREADS`. The result is bitwise identical for any number of threads.
     pub threads: usize,
-    /// True to stop the evaluation of a candidate once its bound or partial sum excludes it. `false` evaluates all
-    /// candidates completely, as a reference for tests.
+    /// True to exclude candidates by lower bounds and to stop an evaluation once its partial sum exceeds the limit.
+    /// `false` evaluates all candidates completely, as a reference for tests.
     pub pruning: bool,
-    /// Limit \[bytes\] of the memory for regressors, their products, test vectors and the join of coupled equations.
+    /// Limit of the memory for regressors, their inner products, test vectors and the join of coupled equations
+    /// \[bytes\].
     pub memory: u64,
 }
 
@@ -122,11 +125,11 @@ impl Default for Options {
 }
 
 impl Options {
-    /// Raise an error if no search is possible with these options.
+    /// Return an error if no search is possible with these options.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for an empty table, an estimator's settings or the exponent of an initial term.
-    /// [`Error::NotFinite`] for exponents that are not finite.
+    /// [`Error::OutOfRange`] for a table without rows, invalid settings of the estimator, or an exponent of an initial
+    /// term that is not above −1. [`Error::NotFinite`] for exponents that are not finite.
     ///
     /// ```
     /// # use ftlm::order_search::options::Options;
@@ -158,12 +161,13 @@ impl Options {
         Ok(())
     }
 
-    /// True if the coefficients of each candidate are refined after an initial estimate.
+    /// Return true if the coefficients of each candidate are refined after an initial estimate.
     pub(crate) fn refines(&self) -> bool {
         matches!(self.estimator, Estimator::InstrumentalVariables(_))
     }
 
-    /// Return the maximum weight of a row in the normal equations: the innovation length, or 1 without multi-innovation.
+    /// Return the largest weight of a row (sample) in the normal equations. It is the innovation length, or 1 for other
+    /// estimators.
     pub(crate) fn weights(&self) -> usize {
         match self.estimator {
             Estimator::MultiInnovation(innovation) => innovation.length,
@@ -171,14 +175,14 @@ impl Options {
         }
     }
 
-    /// Whether candidates are ranked by simulation with zero initial conditions and coefficients from the normal
-    /// equations.
+    /// Return true if candidates are ranked by simulation with pruning, zero initial conditions and coefficients from
+    /// the normal equations.
     pub(crate) fn ranks_by_simulation(&self) -> bool {
         self.pruning && !self.refines() && self.criterion == Criterion::OutputError && self.initial == Initial::Rest
     }
 
-    /// Whether a candidate's score follows from the Gram matrix alone. This is the squared equation error with zero
-    /// initial conditions.
+    /// Return true if the Gram matrix alone determines the score of a candidate. The score is then the squared equation
+    /// error with zero initial conditions.
     pub(crate) fn ranks_by_gram_matrix(&self) -> bool {
         self.pruning
             && !self.refines()
@@ -194,22 +198,25 @@ fn out_of_range(name: &str, value: f64, range: &str, remedy: &str) -> Error {
 
 const BYTES_PER_VALUE: u128 = size_of::<f64>() as u128;
 
-/// Total memory that a search needs.
+/// Memory that a search needs.
 #[derive(Debug, Default)]
 pub(crate) struct Budget {
+    /// Total memory \[bytes\].
     bytes: u128,
+    /// Total number of regressor columns of all equations.
     columns: usize,
+    /// Part of the memory for the join of coupled equations \[bytes\].
     layout: u128,
 }
 
 impl Budget {
-    /// Add the memory of the rows of a join \[bytes\].
+    /// Add the memory of the rows of the join of coupled equations \[bytes\].
     pub(crate) fn add_layout(&mut self, bytes: u128) {
         self.layout += bytes;
         self.bytes += bytes;
     }
 
-    /// Add the data shared by the candidates of one equation, with at most `vectors` test vectors.
+    /// Add the memory of the data that the candidates of one equation share, with at most `vectors` test vectors.
     pub(crate) fn add(&mut self, records: &[Record], output: usize, index: &Index, options: &Options, vectors: usize) {
         let width = index.keys().len() as u128;
         let own = Bank::own(index, output) as u128;
@@ -225,32 +232,33 @@ impl Budget {
             if refined {
                 let spectrum = (size_of::<Bin>() * (fast_length(2 * m) / 2 + 1)) as u128;
                 self.bytes += spectrum * (width + own + 1);
-                // D e = w holds for integrals of the measured output, which need another bank.
+                // The dual bound uses D e = w with denominator D, output error e and equation error w. It requires
+                // integrals of the measured output, which need another bank.
                 if bounded && options.criterion == Criterion::OutputError {
                     self.bytes += bank;
                 }
             }
             if bounded {
-                // Real and imaginary parts with every column and the target, before and after regrouping, four numbers
-                // per own column, and the vectors.
+                // Products of real and imaginary parts with every column and the target are stored twice while they are
+                // regrouped. Further memory is for four numbers per output column and for the vectors.
                 let vectors = vectors as u128;
                 self.bytes += BYTES_PER_VALUE * vectors * (4 * (width + 1) + 4 * own + 2 * m as u128);
             }
         }
-        // Products of all columns and the target: per record for the initial terms, summed over records, and
-        // temporaries.
+        // Inner products of all columns and the target: per record for the initial terms, summed over records, and
+        // temporary copies.
         let products = BYTES_PER_VALUE * (3 + records.len() as u128) * (width + 1).pow(2);
         // Only one bank for initial coefficients exists at a time.
         self.bytes += products + if refined { largest } else { 0 };
         self.columns += index.keys().len();
     }
 
-    /// Memory that remains of a limit \[bytes\].
+    /// Return the part of a memory limit that remains \[bytes\], 0 if the limit is exceeded.
     pub(crate) fn remaining_bytes(&self, limit: u64) -> u64 {
         u128::from(limit).saturating_sub(self.bytes).try_into().unwrap_or(u64::MAX)
     }
 
-    /// Raise an error if the memory exceeds the limit.
+    /// Return an error if the memory exceeds a limit \[bytes\].
     ///
     /// # Errors
     /// [`Error::Memory`] if the memory exceeds the limit.

@@ -2,91 +2,91 @@
 
 use crate::order_search::options::Norm;
 
-/// Maximum number of failures that are listed. Further failures are only counted.
+/// Maximum number of failed candidates that a result lists. Further failures are only counted.
 pub(crate) const MAX_LISTED_FAILURES: usize = 100;
 
 /// Reason why a candidate has no score.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Failure {
-    /// Regressors are linearly dependent to working precision.
+    /// The regressors are linearly dependent to working precision.
     Singular,
     /// The simulated output overflows.
     Diverged,
 }
 
-/// Outcome of one candidate, in raw sums (Σ|e| or Σe²).
+/// Outcome of one candidate. Values are raw scores (Σ|e| or Σe²).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Verdict {
-    /// Score of a complete evaluation.
+    /// Raw score (Σ|e| or Σe²) of a complete evaluation.
     Score(f64),
-    /// Lower bound above the limit, without simulation.
+    /// Lower bound of the raw score, above the limit. The candidate was not simulated.
     Bounded(f64),
-    /// Partial sum above the limit at which the evaluation was stopped.
+    /// Partial sum at which the evaluation was stopped, because it exceeded the limit or the caller requested a stop.
     Stopped(f64),
-    /// No score, for this reason.
+    /// The candidate has no score, for this reason.
     Failed(Failure),
 }
 
 /// Row of the result table.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Row {
-    /// Index in the order grid.
+    /// Index of the candidate in the order grid.
     pub index: u64,
-    /// Score in the selected norm, summed over records.
+    /// Score in the selected norm over all records. In a partial result it is the raw score (Σ|e| or Σe²).
     pub score: f64,
-    /// One coefficient per term.
+    /// Coefficients of the terms, one per term.
     pub coefficients: Vec<f64>,
-    /// Coefficients of the initial terms, per record, in the order of the structure's exponents.
+    /// Coefficients of the initial terms: one vector per record, in the order of the exponents of the structure.
     pub initial: Vec<Vec<f64>>,
 }
 
-/// Number of candidates by outcome. The outcomes add up to `candidates`; `excluded_by_box` is part of
-/// `excluded_by_bound`.
+/// Number of candidates by outcome. At the end of a search the outcomes add up to `candidates`. `excluded_by_box` is
+/// part of `excluded_by_bound`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counts {
     /// Total number of candidates.
     pub candidates: u64,
-    /// Number of candidates in the table.
+    /// Number of candidates in the result table.
     pub table_rows: u64,
-    /// Number of complete evaluations that did not enter the table.
+    /// Number of candidates that were evaluated completely but did not enter the table.
     pub beaten: u64,
     /// Number of candidates excluded by a lower bound, without simulation.
     pub excluded_by_bound: u64,
-    /// Number of candidates excluded together with their whole box, without a bound of their own.
+    /// Number of candidates that were excluded together with a whole box of orders.
     pub excluded_by_box: u64,
-    /// Number of evaluations stopped early because their partial sum exceeded the limit.
+    /// Number of candidates whose evaluation was stopped early because a partial sum exceeded the limit.
     pub stopped: u64,
     /// Number of candidates with linearly dependent regressors.
     pub singular: u64,
-    /// Number of candidates without a finite simulated output.
+    /// Number of candidates whose simulated output is not finite.
     pub diverged: u64,
 }
 
-/// The result of a search.
+/// Result of an order search over one equation.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Outcome {
-    /// Best rows in ascending order of the score, ties by index.
+    /// Best rows in ascending order of the score. Rows of equal score are ordered by index.
     pub rows: Vec<Row>,
     /// Number of candidates by outcome.
     pub counts: Counts,
-    /// First failures by index, at most 100.
+    /// Index and reason of failed candidates: the first ones by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
 }
 
-/// Partial result of some batches.
+/// Partial result of a search, from some of its batches.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Part {
-    /// Best rows of the batches, at most as many as the table holds. Scores are raw sums (Σ|e| or Σe²).
+    /// Best rows of the batches, at most as many as the table has. Scores are raw scores (Σ|e| or Σe²).
     pub rows: Vec<Row>,
-    /// Number of candidates by outcome. Rows count as `beaten` until the search is complete.
+    /// Number of candidates by outcome. Candidates in `rows` count as `beaten` until the search is complete.
     pub counts: Counts,
-    /// First failures by index, at most 100.
+    /// Index and reason of failed candidates: the first ones by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
 }
 
 impl Part {
-    /// Merge the result of other batches. The best `keep` rows of all remain.
+    /// Merge the result of other batches into this one. Only the best `keep` rows remain.
     ///
     /// ```
     /// # use ftlm::order_search::options::Norm;
@@ -109,13 +109,14 @@ impl Part {
         self.failures.truncate(MAX_LISTED_FAILURES);
     }
 
-    /// Index and raw score of each row, which later batches use as thresholds.
+    /// Return index and raw score (Σ|e| or Σe²) of each row. Later batches use the scores as thresholds.
     #[must_use]
     pub fn seed(&self) -> Vec<(u64, f64)> {
         self.rows.iter().map(|row| (row.index, row.score)).collect()
     }
 
-    /// Result of a search from all of its batches over records with this many samples. Raw sums become scores.
+    /// Return the result of a search from the merged result of all its batches. Raw scores become scores in `norm` over
+    /// `samples` samples.
     #[must_use]
     pub fn outcome(mut self, norm: Norm, samples: usize) -> Outcome {
         self.counts.table_rows = self.rows.len() as u64;
@@ -128,6 +129,7 @@ impl Part {
 }
 
 impl Counts {
+    /// Add the counts of another result.
     fn add(&mut self, other: &Self) {
         for (sum, n) in [
             (&mut self.candidates, other.candidates),
@@ -143,7 +145,8 @@ impl Counts {
         }
     }
 
-    /// Number of candidates with an outcome. At the end of a search it is the total number.
+    /// Return the number of candidates that have an outcome. At the end of a search it is the total number of
+    /// candidates.
     #[must_use]
     pub fn processed_count(&self) -> u64 {
         [self.table_rows, self.beaten, self.excluded_by_bound, self.stopped, self.singular, self.diverged]
@@ -152,17 +155,17 @@ impl Counts {
     }
 }
 
-/// Keep the best `keep` rows, ties by index.
+/// Sort the rows by score, then by index, and keep the first `keep` rows.
 fn trim(rows: &mut Vec<Row>, keep: usize) {
     rows.sort_by(|a, b| a.score.total_cmp(&b.score).then(a.index.cmp(&b.index)));
     rows.truncate(keep);
 }
 
-/// Best rows so far, and the limit they imply.
+/// Best rows found by a search, and the limit that they imply.
 pub(crate) struct TopRows {
     pub(crate) rows: Vec<Row>,
     keep: usize,
-    /// Raw score above which no candidate can enter the table.
+    /// Raw score (Σ|e| or Σe²) above which no candidate can enter the table.
     pub(crate) limit: f64,
 }
 
@@ -171,19 +174,19 @@ impl TopRows {
         Self { rows: Vec::new(), keep, limit }
     }
 
-    /// Insert rows, and drop rows that are not among the best.
+    /// Insert rows, and remove rows that are not among the best `keep`.
     pub(crate) fn insert_rows(&mut self, rows: impl Iterator<Item = Row>) {
         self.rows.extend(rows);
         trim(&mut self.rows, self.keep);
     }
 
-    /// Whether this row is in the table.
+    /// Return true if this row is in the table.
     pub(crate) fn contains(&self, row: &Row) -> bool {
         let place = self.rows.partition_point(|r| r.score.total_cmp(&row.score).then(r.index.cmp(&row.index)).is_lt());
         self.rows.get(place).is_some_and(|r| r.index == row.index)
     }
 
-    /// Lower the limit to the score of the worst row if `stopping` is set and the table is full.
+    /// Lower the limit to the score of the worst row if pruning is enabled (`stopping`) and the table is full.
     pub(crate) fn lower_limit(&mut self, stopping: bool) {
         if stopping && self.rows.len() == self.keep {
             self.limit = self.limit.min(self.rows[self.keep - 1].score);

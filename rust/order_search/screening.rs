@@ -1,4 +1,4 @@
-//! Screening of candidates in batches: coefficients in parallel lanes, then exclusion by lower bounds.
+//! Screening of candidates: coefficients in parallel SIMD lanes, then exclusion by lower bounds.
 
 use crate::order_search::candidate::columns::{part_of, Columns};
 use crate::order_search::candidate::normal_equations::{ResidualSumOfSquares, Solve};
@@ -13,24 +13,26 @@ use crate::simd::{self, LANE_COUNT};
 /// Candidate that no bound has excluded.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct OpenCandidate {
+    /// Index of the candidate in the order grid.
     pub(crate) index: u64,
+    /// Lower bound of the raw score (Σ|e| or Σe²).
     pub(crate) bound: f64,
-    /// Score estimate that orders the evaluation.
+    /// Estimate of the raw score. Candidates are evaluated in ascending order of it.
     pub(crate) guess: f64,
 }
 
-/// Sort by estimate, ties by index, NaN last.
+/// Sort candidates by the estimate of their score, then by index, with NaN last.
 pub(crate) fn sort_by_guess(open: &mut [OpenCandidate]) {
     open.sort_unstable_by(|a, b| a.guess.total_cmp(&b.guess).then(a.index.cmp(&b.index)));
 }
 
-/// Screen candidates `lo … hi − 1` against a limit. Return the candidates that are not excluded, and the singular ones.
-/// It is compiled for the widest vector instructions available.
+/// Screen candidates `lo … hi − 1` against a limit of the raw score (Σ|e| or Σe²). Return the candidates that no bound
+/// excludes, and the indices of the singular ones. It is compiled for the widest vector instructions available.
 pub(crate) fn screen(catalogue: &CandidateIndex<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<OpenCandidate>, Vec<u64>) {
     simd::dispatch_simd(Screening { catalogue, lo, hi, limit })
 }
 
-/// Kernel form of [`screen`].
+/// Arguments of [`screen`] as a task that is compiled for the widest vector instructions available.
 struct Screening<'a> {
     catalogue: &'a CandidateIndex<'a>,
     lo: u64,
@@ -48,7 +50,8 @@ impl simd::SimdKernel for Screening<'_> {
         let mut cursor = Cursor::at(&catalogue.lattice, lo);
         let mut index = lo;
         let width = catalogue.lattice.width();
-        // Candidates differ in their Caputo terms and in the power of an offset, so they cannot share a layout.
+        // Candidates differ in their Caputo terms and in the exponent of an offset. They therefore cannot be solved in
+        // parallel lanes.
         if !catalogue.options.initial.follows_orders() {
             let mut screen = Screen::<LANE_COUNT>::new(width);
             catalogue.positions(&cursor, &mut screen.terms);
@@ -77,14 +80,16 @@ impl simd::SimdKernel for Screening<'_> {
     }
 }
 
-/// Context of the row bound, which precedes other bounds if candidates are ranked by squared equation error.
+/// Data for the common bound of candidates that differ in one term only. This bound precedes the others if candidates
+/// are ranked by squared equation error.
 struct RowBoundContext<'a> {
     squares: &'a ResidualSumOfSquares,
     limit: f64,
 }
 
 impl<'a> RowBoundContext<'a> {
-    /// Context of a search; `None` if the bound would exclude no candidate, or if coefficients are fixed.
+    /// Return the data of a search. `None` if the limit is infinite, a coefficient is fixed, or candidates are not
+    /// ranked by squared equation error.
     fn of(catalogue: &'a CandidateIndex<'_>, limit: f64) -> Option<Self> {
         let Problem { residual_sums: squares, equations, .. } = &catalogue.problem;
         let squares =
@@ -93,27 +98,31 @@ impl<'a> RowBoundContext<'a> {
     }
 }
 
-/// Workspace for screening L candidates in parallel lanes.
+/// Workspace for screening L candidates in parallel SIMD lanes.
 pub(crate) struct Screen<const L: usize> {
     solve: Solve<L>,
+    /// Regressor columns (indices in the banks) of each term for the L candidates.
     positions: Vec<Columns<L>>,
+    /// Regressor columns (indices in the banks) of the initial terms.
     initial: Vec<usize>,
-    /// Columns of the next candidate.
+    /// Regressor columns (indices in the banks) of the terms of the next candidate.
     terms: Vec<usize>,
-    /// Columns of the terms of one candidate.
+    /// Regressor columns (indices in the banks) of the terms of one candidate.
     columns: Vec<usize>,
     coefficients: Vec<f64>,
     weights: Vec<f64>,
-    /// Norm cache of the tailored test vectors.
+    /// Cache of norms for the tailored test vectors.
     norm_cache: NormCache,
-    /// Positions in a row that are not excluded.
+    /// Positions in a row of candidates that the row bound does not exclude.
     open_positions: Vec<usize>,
-    /// Lookup state of the linearized test vectors.
+    /// State of the lookup of linearized test vectors.
     lookup: VectorLookup,
+    /// Path of the unstable-zero test that excluded the most recent candidate.
     path: usize,
 }
 
 impl<const L: usize> Screen<L> {
+    /// Return a workspace for candidates with `width` terms.
     pub(crate) fn new(width: usize) -> Self {
         Self {
             solve: Solve::new(),
@@ -130,8 +139,8 @@ impl<const L: usize> Screen<L> {
         }
     }
 
-    /// Screen the next candidates that differ only in one term, by their common row bound. Return their number, or
-    /// `None` if they are too few or have no such bound.
+    /// Screen the next candidates, which differ only in one term, by their common lower bound. Return their number.
+    /// `None` if there are fewer than L such candidates or no common bound.
     #[inline(always)]
     fn screen_row(
         &mut self,
@@ -168,7 +177,7 @@ impl<const L: usize> Screen<L> {
         Some(len as u64)
     }
 
-    /// Screen the next L candidates.
+    /// Compute coefficients and lower bounds of the next L candidates, and advance the cursor.
     #[inline(always)]
     fn screen_next(
         &mut self,
@@ -200,7 +209,8 @@ impl<const L: usize> Screen<L> {
         self.screen_positions(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, screened);
     }
 
-    /// Screen the candidates whose columns have been set.
+    /// Screen the first `count` of the L candidates whose columns have been set. Append to the candidates that no bound
+    /// excludes, and to the indices of singular candidates.
     #[inline(always)]
     fn screen_positions(
         &mut self,
@@ -227,7 +237,7 @@ impl<const L: usize> Screen<L> {
             let (bound, guess) = match (&squares, &catalogue.problem.bound) {
                 (Some((least, guess)), _) => (least[n], guess[n]),
                 (None, Some(bound)) => {
-                    // Unrefined coefficients order the evaluation but prove nothing.
+                    // Unrefined coefficients give an estimate of the score but no valid bound.
                     let refined = catalogue.problem.refines();
                     let limit = if refined { f64::INFINITY } else { limit };
                     columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
@@ -265,8 +275,8 @@ impl<const L: usize> Screen<L> {
         }
     }
 
-    /// Screen at most L candidates of a slice, with zero initial conditions. `candidates` holds index and the columns
-    /// of the two varying terms. `columns` holds all others.
+    /// Screen at most L candidates of a slice, with zero initial conditions. `candidates` lists the index and the
+    /// columns of the two varying terms. `columns` gives the columns of all other terms.
     #[inline(always)]
     pub(crate) fn screen_slice_candidates(
         &mut self,

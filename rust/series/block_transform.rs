@@ -1,9 +1,10 @@
 //! Complex transforms of blocks of 64 real terms, for products of series block by block.
 //!
-//! Terms 64 to 127 of the product of a block of 64 terms and a piece of 128 terms are the middle product. It is the
-//! contribution of a block of a quotient to a later block. Modulo z⁶⁴ − i a real series a + z⁶⁴ b is the complex series
-//! a + i b, and the imaginary part of the product of the two is the middle product. Its 64 values at the roots of z⁶⁴ =
-//! i are a discrete Fourier transform in two passes of 8, each with [`LANE_COUNT`] columns side by side.
+//! Terms 64 to 127 of the product of a block of 64 terms and a segment of 128 terms are the middle product. It is the
+//! contribution of a block of a quotient to a later block. Modulo z⁶⁴ − i, a real series a + z⁶⁴ b is the complex
+//! series a + i b. The imaginary part of the product of the block and the segment is therefore the middle product. The
+//! 64 values of a series at the roots of z⁶⁴ = i are a discrete Fourier transform. It is computed in two passes of 8,
+//! each with [`LANE_COUNT`] columns in parallel.
 
 use std::array::from_fn;
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
@@ -13,13 +14,13 @@ use crate::simd::{self, LANE_COUNT};
 /// Number of terms in a block. Its transform has the same number of values.
 pub const BLOCK_TERMS: usize = LANE_COUNT * LANE_COUNT;
 
-/// Real parts, then imaginary parts, of [`LANE_COUNT`] values.
+/// Real parts, then imaginary parts, of [`LANE_COUNT`] complex values.
 pub(super) type Tile = [[f64; LANE_COUNT]; 2];
 
-/// Values at the roots of z⁶⁴ = i, or terms modulo z⁶⁴ − i, row by row.
+/// Values of a series at the roots of z⁶⁴ = i, or its terms modulo z⁶⁴ − i, row-major 8 × 8.
 type Square = [Tile; LANE_COUNT];
 
-/// Factors of the transform.
+/// Constant factors of the transform.
 struct Factors {
     /// Factor e^{iπ j/128} of term j. It maps the roots of z⁶⁴ = i to the roots of z⁶⁴ = 1.
     shift: Square,
@@ -48,10 +49,12 @@ impl Factors {
     }
 }
 
-// One a thread: a lock that another thread holds while the process forks would never be released.
+// Each thread has its own factors. If a process forks while another thread has locked shared ones, the lock would never
+// be released.
 thread_local!(static FACTORS: Factors = Factors::new());
 
-/// Sums Σ_j x_j e^{2πi jk/8} of the rows in each lane. With real and imaginary parts exchanged, e^{−2πi jk/8}.
+/// Replace the rows x_j in each lane by the sums Σ_j x_j e^{2πi jk/8}, k = 0 … 7. With real and imaginary parts
+/// exchanged (`RE` = 1, `IM` = 0), the factor is e^{−2πi jk/8}.
 #[allow(clippy::needless_range_loop)]
 #[inline(always)]
 fn sum_rows<const RE: usize, const IM: usize>(x: &mut Square) {
@@ -78,7 +81,8 @@ fn sum_rows<const RE: usize, const IM: usize>(x: &mut Square) {
     }
 }
 
-/// Multiply rows by factors, or by their conjugates if `sign` is −1, and transpose rows and lanes.
+/// Multiply the elements by factors, or by their conjugates if `sign` is −1. Return the result with rows and lanes
+/// transposed.
 #[inline(always)]
 fn turn_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
     for row in 0..LANE_COUNT {
@@ -91,7 +95,7 @@ fn turn_and_transpose(x: &mut Square, factors: &Square, sign: f64) -> Square {
     from_fn(|l| [from_fn(|row| x[row][0][l]), from_fn(|row| x[row][1][l])])
 }
 
-/// SIMD task: transform of a block, or of a block and the next one.
+/// Transform of a block, or of a block and the next one. It is compiled for the widest vector instructions available.
 struct ForwardTransform<'a> {
     factors: &'a Factors,
     low: &'a [f64; BLOCK_TERMS],
@@ -125,7 +129,7 @@ impl simd::SimdKernel for ForwardTransform<'_> {
     }
 }
 
-/// Write the transform of up to 128 terms to every `stride`-th tile (group of frequencies).
+/// Write the transform of up to 128 terms to every `stride`-th tile. A tile is a group of frequencies.
 pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
     let (blocks, rest) = terms.as_chunks();
     let mut padded = [0.0; BLOCK_TERMS];
@@ -138,7 +142,8 @@ pub(super) fn transform(terms: &[f64], tiles: &mut [Tile], stride: usize) {
     }
 }
 
-/// SIMD task: middle product from its transform.
+/// Inverse transform that gives the middle product (terms 64 to 127) of a block of 64 terms and a segment of 128 terms.
+/// It is compiled for the widest vector instructions available.
 struct InverseTransform<'a> {
     factors: &'a Factors,
     tiles: &'a [Tile],
@@ -162,7 +167,8 @@ impl simd::SimdKernel for InverseTransform<'_> {
     }
 }
 
-/// Middle product of a block and a piece from the product of their transforms.
+/// Return the middle product of a block and a segment: terms 64 to 127 of their product. `tiles` is the product of
+/// their transforms.
 pub(super) fn middle_product(tiles: &[Tile]) -> [f64; BLOCK_TERMS] {
     FACTORS.with(|factors| simd::dispatch_simd(InverseTransform { factors, tiles }))
 }

@@ -1,10 +1,11 @@
-//! Division of series by forward substitution in blocks that are joined by FFT products, O(m log² m).
+//! Division of truncated power series by forward substitution in blocks. The blocks are joined by FFT products. O(m
+//! log² m) for m terms.
 //!
 //! Blocks of 64 terms, of 2048 terms and so on each form a level. In each level the spectra of solved blocks and of the
-//! pieces of the divisor are computed once. Only their products are summed for each later block. The many short
-//! transforms have their own code. The division is exact for every divisor with a nonzero leading coefficient, also if
-//! the quotient is unstable. [`Division`] returns the quotient block by block, so that a search can drop a candidate
-//! early.
+//! segments of the divisor are computed once. For each later block, only products of these spectra are summed. The many
+//! short transforms have separate code. The division is exact for every divisor with a nonzero leading coefficient,
+//! also if the quotient is unstable. [`Division`] returns the quotient block by block, so that a search can stop the
+//! simulation of a candidate early.
 
 use std::borrow::Cow;
 
@@ -17,10 +18,10 @@ use crate::simd::{self, LANE_COUNT};
 
 pub use super::block_transform::BLOCK_TERMS;
 
-/// Number of terms whose sums stay in registers while products are subtracted.
+/// Number of terms whose sums stay in processor registers while products are subtracted.
 const TILE_TERMS: usize = 8;
 
-/// Subtract a product: `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved[s]`.
+/// Subtract a product from the remaining terms: `remainder[i] −= Σ_s series[TILE_TERMS − s + i]·solved\[s\]`.
 #[inline(always)]
 fn subtract_product(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     let mut at = TILE_TERMS;
@@ -42,7 +43,7 @@ fn subtract_product(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_T
     }
 }
 
-/// [`subtract_product`] of L terms, whose sums stay in registers.
+/// Do the work of [`subtract_product`] for L terms, whose sums stay in processor registers.
 #[inline(always)]
 fn subtract_tile_product<const L: usize>(remainder: &mut [f64], series: &[f64], solved: &[f64; TILE_TERMS]) {
     let mut sums = [0.0; L];
@@ -56,10 +57,14 @@ fn subtract_tile_product<const L: usize>(remainder: &mut [f64], series: &[f64], 
     remainder.copy_from_slice(&sums);
 }
 
-/// SIMD task: forward substitution within a block of one unknown, in place.
+/// Forward substitution within a block of one unknown, in place. It is compiled for the widest vector instructions
+/// available.
 struct Substitution<'a> {
+    /// Divisor, a power series of at least the length of the block.
     divisor: &'a [f64],
+    /// Reciprocal of the leading coefficient of the divisor.
     inverse: f64,
+    /// Right-hand side, replaced by the quotient.
     block: &'a mut [f64],
 }
 
@@ -99,39 +104,47 @@ impl simd::SimdKernel for Substitution<'_> {
     }
 }
 
-/// Maximum number of blocks of one level. A block of the next level is as long as all of them together. 32 was the
-/// fastest of 8, 16 and 32 at m = 2048.
+/// Maximum number of blocks of one level. A block of the next level is as long as all these blocks together. 32 was the
+/// fastest of 8, 16 and 32 at m = 2048 terms.
 const MAX_LEVEL_BLOCKS: usize = 32;
 
-/// Spectra of one block length: of the solved blocks, and of the pieces of the n² matrix series. Their products are the
-/// contributions of solved blocks to later blocks.
+/// Spectra for one block length of a division of n unknown series: of the solved blocks, and of segments of the n²
+/// series of the matrix. Their products are the contributions of solved blocks to later blocks.
 ///
-/// Piece d contains the terms d·len to (d + 2)·len of a series. The second half of its product with block k is the
-/// contribution to block k + d + 1. Contributions of several blocks are summed as spectra, tile by tile, so the spectra
-/// of one tile are stored side by side: blocks forwards, pieces backwards, per equation.
+/// Segment d contains the terms d·len to (d + 2)·len of a series. The second half of its product with block k is the
+/// contribution to block k + d + 1. Contributions of several blocks are summed as spectra. A tile is a group of
+/// adjacent frequency bins. The spectra of one tile are contiguous for each equation, with ascending blocks and
+/// descending segments.
 struct Level {
+    /// Transform for this block length.
     transform: Transform,
+    /// Block length in terms.
     len: usize,
-    /// Number of blocks for which memory is allocated.
+    /// Number of blocks of this length for which memory is allocated.
     capacity: usize,
+    /// Spectra of the solved blocks, ordered by tile (group of frequency bins), block and unknown.
     blocks: Vec<Tile>,
+    /// Spectra of segments of the matrix series, ordered by tile (group of frequency bins), equation, descending
+    /// segment and unknown.
     pieces: Vec<Tile>,
+    /// Number of segments of each matrix series whose spectra have been computed.
     known_pieces: usize,
-    /// Spectrum of a contribution.
+    /// Spectrum of the contribution of solved blocks to one later block.
     sum: Vec<Tile>,
 }
 
-/// Transform whose products give the contributions of a block.
+/// Transform for one block length. Products of spectra give the contribution of a block of the quotient to a later
+/// block.
 enum Transform {
-    /// Transform of the shortest blocks.
+    /// Transform of the shortest blocks, of [`BLOCK_TERMS`] terms.
     Block,
-    /// Cyclic transform of twice the length of a block. Terms that wrap around are added to the first half, which is
-    /// not used.
+    /// Cyclic transform of twice the length of a block. Terms that wrap around affect only the first half, which is not
+    /// used.
     Cyclic(Plan),
 }
 
 impl Transform {
-    /// Number of tiles of a spectrum.
+    /// Return the number of tiles of a spectrum. A tile is a group of [`LANE_COUNT`] frequency bins.
     fn tiles(&self) -> usize {
         match self {
             Self::Block => LANE_COUNT,
@@ -141,6 +154,7 @@ impl Transform {
 }
 
 impl Level {
+    /// Allocate a level of blocks of `len` terms for `n` unknown series of `m` terms.
     fn new(len: usize, n: usize, m: usize) -> Self {
         let transform = if len == BLOCK_TERMS { Transform::Block } else { Transform::Cyclic(fft::plan(2 * len)) };
         let capacity = m.div_ceil(len).min(MAX_LEVEL_BLOCKS);
@@ -159,7 +173,7 @@ impl Level {
     }
 }
 
-/// Buffers of the transforms of one level at a time.
+/// Buffers for the transforms of one level.
 #[derive(Default)]
 struct LevelBuffers {
     time: Vec<f64>,
@@ -168,7 +182,8 @@ struct LevelBuffers {
 }
 
 impl LevelBuffers {
-    /// Write the spectrum of the values, followed by zeros, to every `stride`-th tile.
+    /// Write the spectrum of the values, padded with zeros, to every `stride`-th tile. A tile is a group of frequency
+    /// bins.
     fn transform(&mut self, transform: &Transform, values: &[f64], tiles: &mut [Tile], stride: usize) {
         let plan = match transform {
             Transform::Block => return block_transform::transform(values, tiles, stride),
@@ -186,7 +201,7 @@ impl LevelBuffers {
         }
     }
 
-    /// Contribution to a block, from its spectrum `tiles`.
+    /// Return the contribution of solved blocks to a later block, from its spectrum `tiles`.
     fn invert(&mut self, transform: &Transform, tiles: &[Tile]) -> &[f64] {
         let plan = match transform {
             Transform::Block => {
@@ -208,8 +223,8 @@ impl LevelBuffers {
     }
 }
 
-/// SIMD task: compute the spectrum that the first `count` blocks of a level contribute to equation `i` in the next
-/// block.
+/// Computation of a spectrum: the contribution of the first `count` blocks of one block length to equation `i` of `n`
+/// in the next block. It is compiled for the widest vector instructions available.
 struct Contributions<'a> {
     n: usize,
     i: usize,
@@ -241,47 +256,50 @@ impl simd::SimdKernel for Contributions<'_> {
     }
 }
 
-/// State of an n × n division that computes the quotients block by block.
+/// State of the solution of an n × n system of series, which computes the quotients (unknown series) block by block.
 ///
-/// Right-hand sides are added block by block ([`Division::add`]). [`Division::advance`] then solves the next block and
-/// adds the contributions of solved blocks to one later block. That block belongs to the longest level whose blocks end
-/// there. Every block is transformed once.
+/// The caller adds right-hand sides block by block ([`Division::add`]). [`Division::advance`] then solves the next
+/// block and subtracts the contributions of solved blocks from one later block. Its length is that of the longest
+/// blocks that end at the solved terms. The spectrum of every block is computed once.
 pub struct Division {
     n: usize,
     m: usize,
     solved: usize,
-    /// Right-hand side minus the contributions of solved blocks, then the quotient, per unknown.
+    /// For each unknown: the quotient in the solved terms, then the right-hand side minus the contributions of solved
+    /// blocks.
     rest: Vec<Vec<f64>>,
-    /// Levels with their solved blocks, the shortest first.
+    /// Spectra by block length, the shortest first.
     levels: Vec<Level>,
     buffers: LevelBuffers,
 }
 
 impl Division {
-    /// Division of n unknown series of m terms.
+    /// Return the initial state of a division for n unknown series of m terms, with right-hand sides of 0.
     #[must_use]
     pub fn new(n: usize, m: usize) -> Self {
         Self { n, m, solved: 0, rest: vec![vec![0.0; m]; n], levels: Vec::new(), buffers: LevelBuffers::default() }
     }
 
-    /// Reset everything except allocated memory.
+    /// Reset the division for another divisor. Memory stays allocated.
     pub fn reset(&mut self) {
         self.levels.iter_mut().for_each(|level| level.known_pieces = 0);
         self.restart();
     }
 
-    /// Reset the right-hand side and keep the spectra, for the same divisor.
+    /// Reset the right-hand sides to 0. The spectra of the divisor are kept, so the divisor must not change.
     pub fn restart(&mut self) {
         self.solved = 0;
         self.rest.iter_mut().for_each(|r| r.fill(0.0));
     }
 
-    /// Solve for complete right-hand sides.
+    /// Solve all terms for complete right-hand sides. `inverse` is the row-major inverse of the matrix of leading
+    /// coefficients.
     pub(super) fn run<S: AsRef<[f64]>>(&mut self, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
         self.run_to(self.m, matrix, inverse, rhs);
     }
 
-    /// Solve for the first terms only, rounded up to blocks.
+    /// Solve at least the first `terms` terms, rounded up to whole blocks, for complete right-hand sides. `inverse` is
+    /// the row-major inverse of the matrix of leading coefficients.
     pub(super) fn run_to<S: AsRef<[f64]>>(&mut self, terms: usize, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
         for (i, b) in rhs.iter().enumerate() {
             self.add(i, 0, b);
@@ -291,37 +309,37 @@ impl Division {
         }
     }
 
-    /// Number of solved terms.
+    /// Return the number of terms that are solved in every unknown series.
     #[must_use]
     pub fn solved_terms(&self) -> usize {
         self.solved
     }
 
-    /// Add to the right-hand side of equation i from term `start` on, which must not be solved yet.
+    /// Add values to the right-hand side of equation i from term `start` on. These terms must not be solved yet.
     pub fn add(&mut self, i: usize, start: usize, values: &[f64]) {
         for (rest, &v) in self.rest[i][start..].iter_mut().zip(values) {
             *rest += v;
         }
     }
 
-    /// Quotient i as far as it is solved.
+    /// Return the solved terms of unknown series i.
     #[must_use]
     pub fn quotient(&self, i: usize) -> &[f64] {
         &self.rest[i][..self.solved]
     }
 
-    /// All quotients. Terms that are not solved yet are remainders.
+    /// Return all unknown series. Terms that are not solved yet are remainders.
     pub(super) fn quotients(&self) -> &[Vec<f64>] {
         &self.rest
     }
 
-    /// All quotients.
+    /// Return all unknown series, which must be solved completely.
     #[must_use]
     pub fn into_quotients(self) -> Vec<Vec<f64>> {
         self.rest
     }
 
-    /// Number of terms of each series that the next [`Division::advance`] reads.
+    /// Return the number of terms of each divisor series that the next [`Division::advance`] reads.
     #[must_use]
     pub fn required_terms(&self) -> usize {
         let hi = (self.solved + BLOCK_TERMS).min(self.m);
@@ -332,22 +350,22 @@ impl Division {
         ((place + 1) * len).min(self.m)
     }
 
-    /// Total number of terms.
+    /// Return the number of terms of an unknown series.
     #[must_use]
     pub fn terms(&self) -> usize {
         self.m
     }
 
-    /// Solve the next block and join it to the rest.
+    /// Solve the next block, and subtract the contributions of solved blocks from later terms.
     ///
-    /// `inverse` is the row-major inverse of the leading matrix. `series(i, j, len)` returns the first `len` terms of
-    /// A_ij (fewer if m is smaller), never more than [`Division::required_terms`].
+    /// `inverse` is the row-major inverse of the matrix of leading coefficients. `series(i, j, len)` returns the first
+    /// `len` terms of the matrix series A_ij. `len` never exceeds [`Division::required_terms`].
     pub fn advance<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         self.solve_block(inverse, &series);
         self.join(&series);
     }
 
-    /// First half of [`Division::advance`]: next block of the quotients, by forward substitution.
+    /// Do the first half of [`Division::advance`]: solve the next block of the quotients by forward substitution.
     pub fn solve_block<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         let lo = self.solved;
         let hi = (lo + BLOCK_TERMS).min(self.m);
@@ -355,7 +373,7 @@ impl Division {
         self.solved = hi;
     }
 
-    /// Second half of [`Division::advance`]: contributions of the solved blocks to later ones.
+    /// Do the second half of [`Division::advance`]: subtract the contributions of solved blocks from later terms.
     pub fn join<'a>(&mut self, series: impl Fn(usize, usize, usize) -> &'a [f64]) {
         let (n, hi) = (self.n, self.solved);
         if hi == self.m {
@@ -395,6 +413,8 @@ impl Division {
         level.sum = sum;
     }
 
+    /// Solve the terms `lo … hi − 1` of all quotients by forward substitution, with the row-major inverse of the matrix
+    /// of leading coefficients.
     fn substitute<'a>(
         &mut self,
         inverse: &[f64],
@@ -428,8 +448,8 @@ impl Division {
     }
 }
 
-/// Return (level, block length, block count). The level is the longest with a block that ends at term `solved`. The
-/// count is the number of its blocks that contribute to the next block.
+/// Return (level, block length, block count) for a number of solved terms. The level is the longest with a block that
+/// ends there. The count is the number of its blocks that contribute to the next block.
 fn level_at(solved: usize) -> (usize, usize, usize) {
     let (mut level, mut len, mut count) = (0, BLOCK_TERMS, solved / BLOCK_TERMS);
     while count != 0 && count.is_multiple_of(MAX_LEVEL_BLOCKS) {
@@ -438,16 +458,18 @@ fn level_at(solved: usize) -> (usize, usize, usize) {
     (level, len, count % MAX_LEVEL_BLOCKS)
 }
 
-/// Quotient mod z^m, where m is the length of the numerator; exact also if the quotient is unstable. O(m log² m).
+/// Return the first m terms of the quotient of two power series, where m is the length of the numerator. The quotient
+/// is exact also if it is unstable. O(m log² m).
 ///
 /// # Errors
-/// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than m.
+/// [`Error::LeadingZero`] if the divisor starts with zero, [`Error::Length`] if it is shorter than m.
 pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
     let quotient = solve(&[vec![divisor]], &[numerator])?;
     quotient.into_iter().next().ok_or_else(|| Error::Internal { what: "a division without a quotient".into() })
 }
 
-/// Reciprocal of a series mod z^m. Not finite if the series starts with zero. O(m log² m).
+/// Return the first m terms of the reciprocal of a power series of m terms. The result is not finite if the series
+/// starts with zero. O(m log² m).
 ///
 /// ```
 /// assert_eq!(ftlm::series::reciprocal(&[1.0, -1.0, 0.0]), [1.0, 1.0, 1.0]);
@@ -462,10 +484,12 @@ pub fn reciprocal(series: &[f64]) -> Vec<f64> {
     division.into_quotients().pop().unwrap_or_default()
 }
 
-/// Solve the n × n system Σ_j A_ij y_j = b_i of series mod z^m, A_ij of length m at least. O(n² m log² m).
+/// Solve the n × n system Σ_j A_ij y_j = b_i of power series, truncated to m terms. The series A_ij have at least m
+/// terms, the right-hand sides b_i exactly m. Return the n series y_j. O(n² m log² m).
 ///
 /// # Errors
-/// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
+/// [`Error::LeadingZero`] if the matrix of leading coefficients is singular. [`Error::Length`] for a matrix that is not
+/// square, or series of wrong length.
 pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<Vec<f64>>> {
     let n = rhs.len();
     let m = rhs.first().map_or(0, |b| b.len());
@@ -490,7 +514,7 @@ pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<V
     Ok(division.into_quotients())
 }
 
-/// Solver of a system of series for many right-hand sides. The spectra of its matrix are computed once.
+/// Solver of a system of series for many right-hand sides. The spectra of the matrix are computed once.
 pub struct Solver<'a> {
     matrix: Cow<'a, [Vec<Vec<f64>>]>,
     inverse: Vec<f64>,
@@ -498,18 +522,19 @@ pub struct Solver<'a> {
 }
 
 impl<'a> Solver<'a> {
-    /// Solver for an n × n matrix whose elements are series of m terms.
+    /// Return a solver for an n × n matrix whose elements are series of m terms.
     ///
     /// # Errors
-    /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
+    /// [`Error::LeadingZero`] if the matrix of leading coefficients is singular. [`Error::Length`] for a matrix that is
+    /// not square, or series of wrong length.
     pub fn new(matrix: &'a [Vec<Vec<f64>>]) -> Result<Self> {
         Self::of(Cow::Borrowed(matrix))
     }
 
-    /// Solver that owns its matrix.
+    /// Return a solver that owns its matrix.
     ///
     /// # Errors
-    /// [`Error::LeadingZero`] if the matrix of leading coefficients is singular; [`Error::Length`] if the matrix is not
+    /// [`Error::LeadingZero`] if the matrix of leading coefficients is singular. [`Error::Length`] if the matrix is not
     /// square or its series differ in length.
     pub fn from_matrix(matrix: Vec<Vec<Vec<f64>>>) -> Result<Solver<'static>> {
         Solver::of(Cow::Owned(matrix))
@@ -530,16 +555,17 @@ impl<'a> Solver<'a> {
         Ok(Self { matrix, inverse, division: Division::new(n, m) })
     }
 
-    /// Number of terms m.
+    /// Return the number of terms m.
     #[must_use]
     pub fn terms(&self) -> usize {
         self.division.terms()
     }
 
-    /// Solve for one right-hand side of n series of m terms. Shorter series are allowed if all have equal length.
+    /// Solve the system for one right-hand side, which is n series of m terms. Shorter series are allowed if all have
+    /// equal length. Return n series of this length.
     ///
     /// # Errors
-    /// [`Error::Length`] for a wrong number of series, or series of unequal or too large length.
+    /// [`Error::Length`] for a wrong number of series, or for series of unequal length or of more than m terms.
     pub fn solve(&mut self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         check_length("right-hand sides", self.matrix.len(), rhs.len())?;
         let asked = rhs.first().map_or(0, Vec::len).min(self.division.terms());
@@ -552,7 +578,8 @@ impl<'a> Solver<'a> {
         Ok(self.division.quotients().iter().map(|quotient| quotient[..asked].to_vec()).collect())
     }
 
-    /// Series of A⁻¹: `[j][i]` is the response of unknown j to a unit pulse in the error of equation i. n solutions.
+    /// Return the series of the inverse A⁻¹ of the matrix. Element `[j][i]` is the response of unknown j to a unit
+    /// pulse in the error of equation i. Takes n solutions.
     ///
     /// # Errors
     /// [`Error::Length`] for series that do not match the matrix ([`Solver::solve`]).
@@ -569,7 +596,8 @@ impl<'a> Solver<'a> {
         Ok(rows)
     }
 
-    /// Spectra of A⁻¹ for products of up to `total` terms in all factors together, see [`Solver::inverse`].
+    /// Return the spectra of the inverse A⁻¹ of the matrix ([`Solver::inverse`]). They serve for products whose factors
+    /// have up to `total` terms together.
     ///
     /// # Errors
     /// [`Error::Length`] for series that do not match the matrix ([`Solver::solve`]).

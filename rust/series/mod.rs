@@ -1,10 +1,11 @@
 //! Power series in the one-step delay, truncated: products, quotients, linear systems, and reference algorithms for
 //! tests.
 //!
-//! A causal operator on pulse means is a polynomial in the delay z truncated at z^m. The fractional integral F^η is one
-//! of them. All such operators commute. Products ([`product`]) are convolutions by FFT. Quotients ([`division`]) use
-//! forward substitution in blocks that are joined by FFT products. [`solve`] solves for several unknown series. If all
-//! orders are integers, [`mod@running_sums`] does the same by running sums.
+//! A causal operator on pulse means (means over sampling intervals) is a polynomial in the one-step delay z, truncated
+//! at z^m. The fractional integral F^η is one of them. All such operators commute. Products ([`product`]) are
+//! convolutions by FFT. Quotients ([`division`]) use forward substitution in blocks that are joined by FFT products.
+//! [`solve`] solves for several unknown series. If all orders are integers, [`mod@running_sums`] solves the same
+//! systems by running sums.
 //!
 //! ```
 //! # fn main() -> ftlm::error::Result<()> {

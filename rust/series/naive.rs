@@ -3,16 +3,18 @@
 use super::product::direct;
 use crate::error::{Error, Result};
 
-/// Product mod z^m by definition, the oracle of [`super::product::multiply`]. O(m²).
+/// Return the first m terms of the product of two power series by definition, a reference for tests of
+/// [`super::product::multiply`]. O(m²).
 #[must_use]
 pub fn multiply_naive(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     direct(a, b, m)
 }
 
-/// Quotient `numerator / divisor` mod z^m by forward substitution, the oracle of [`super::division::divide`]. O(m²).
+/// Return the first m terms of the quotient of two power series by forward substitution, where m is the length of the
+/// numerator. It is a reference for tests of [`super::division::divide`]. O(m²).
 ///
 /// # Errors
-/// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than the numerator.
+/// [`Error::LeadingZero`] if the divisor starts with zero, [`Error::Length`] if it is shorter than the numerator.
 pub fn divide_naive(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
     let leading = check_leading(divisor)?;
     if divisor.len() < numerator.len() {
@@ -29,6 +31,7 @@ pub fn divide_naive(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
     Ok(quotient)
 }
 
+/// Return the leading coefficient. [`Error::LeadingZero`] if it is zero, not finite or missing.
 fn check_leading(divisor: &[f64]) -> Result<f64> {
     match divisor.first() {
         Some(&d) if d != 0.0 && d.is_finite() => Ok(d),

@@ -1,14 +1,15 @@
-//! Products of series mod z^m by real FFTs, O(m log m), with cached spectra for repeated products.
+//! Products of truncated power series mod z^m by real FFTs, O(m log m). The spectra of factors of many products are
+//! computed once.
 
 use std::cell::RefCell;
 
 use crate::fft::{self, Bin, Plan, Workspace};
 
-/// Maximum length of the shorter factor of a direct product. Up to it, direct products are faster and have no rounding
-/// error of transforms.
+/// Maximum length of the shorter factor of a product that is computed directly. Up to this length, direct products are
+/// faster and have no rounding error of transforms.
 const MAX_DIRECT_TERMS: usize = 64;
 
-/// Product mod z^m by definition. O(m²).
+/// Return the first m terms of the product of two power series by definition. O(m²).
 pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     let mut out = vec![0.0; m];
     for (i, &x) in a.iter().enumerate().take(m) {
@@ -19,10 +20,11 @@ pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     out
 }
 
-/// Product mod z^m, that is the causal convolution of a kernel with a signal. O(m log m).
+/// Return the first m terms of the product of two power series, which is the causal convolution of a kernel with a
+/// signal. O(m log m).
 ///
 /// # Panics
-/// If m points exceed the memory.
+/// If there is not enough memory for m values.
 #[must_use]
 pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     let (a, b) = (&a[..a.len().min(m)], &b[..b.len().min(m)]);
@@ -35,10 +37,11 @@ pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     out
 }
 
-/// Multiply many signals by one series modulo z^m, in place. Signals and series have m terms. O(m log m) per signal.
+/// Multiply many signals of m samples by one power series of m terms, in place. Products are truncated to m terms. O(m
+/// log m) per signal.
 ///
-/// The spectrum of the series is computed once. `signals` holds them one after another; a remainder of fewer than m
-/// terms is unchanged. The product is exact for a series that is zero from its second term on.
+/// The spectrum of the series is computed once. `signals` contains one signal after another. A remainder of fewer than
+/// m terms is unchanged. The product is exact for a series that is zero from its second term on.
 ///
 /// ```
 /// let mut signals = [1.0, 2.0, 3.0, 0.0, 1.0, 0.0];
@@ -65,12 +68,13 @@ pub fn multiply_signals(series: &[f64], signals: &mut [f64]) {
     }
 }
 
-/// Maximum length of a transform whose buffers a thread reuses.
+/// Maximum length of a Fourier transform for which a thread reuses its buffers.
 const MAX_REUSED_BUFFER_POINTS: usize = 1 << 17;
 
 thread_local!(static BUFFERS: RefCell<Buffers> = RefCell::default());
 
-/// Run `work` on reused buffers of this thread, or on new ones for long transforms. `work` must not call this function.
+/// Call `work` with reused buffers of this thread, or with new ones for transforms of more than
+/// [`MAX_REUSED_BUFFER_POINTS`] points. `work` must not call this function.
 fn with_thread_buffers<R>(points: usize, work: impl FnOnce(&mut Buffers) -> R) -> R {
     if points <= MAX_REUSED_BUFFER_POINTS {
         BUFFERS.with_borrow_mut(work)
@@ -79,7 +83,7 @@ fn with_thread_buffers<R>(points: usize, work: impl FnOnce(&mut Buffers) -> R) -
     }
 }
 
-/// Reusable buffers of the transforms of one thread.
+/// Reusable buffers for the Fourier transforms of one thread.
 #[derive(Default)]
 pub struct Buffers {
     time: Vec<f64>,
@@ -87,32 +91,33 @@ pub struct Buffers {
     workspace: Workspace,
 }
 
-/// Series with cached spectrum, for products with many signals at two transforms each.
+/// Series with its spectrum, for products with many signals. Each product takes two transforms.
 pub struct Kernel {
     plan: Plan,
     spectrum: Vec<Bin>,
 }
 
 impl Kernel {
-    /// Kernel (cached spectrum) of a series of length m, for products with signals of up to m points.
+    /// Return the spectrum of a series of length m, for products with signals of up to m terms.
     #[must_use]
     pub fn new(series: &[f64]) -> Self {
         Self::with_length(series, 2 * series.len())
     }
 
-    /// Kernel of a series for products of up to `total` terms in all factors together.
+    /// Return the spectrum of a series, for products whose factors have up to `total` terms together.
     #[must_use]
     pub fn with_length(series: &[f64], total: usize) -> Self {
         let plan = fft::plan(fft::fast_length(total));
         with_thread_buffers(plan.len(), |buffers| Self::from_plan(plan.clone(), series, buffers))
     }
 
-    /// Kernel as by [`Kernel::new`], with buffers of the caller.
+    /// Return the spectrum as [`Kernel::new`] does, with buffers of the caller.
     #[must_use]
     pub(crate) fn made_with(series: &[f64], buffers: &mut Buffers) -> Self {
         Self::from_plan(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
     }
 
+    /// Return the spectrum of a series, computed by the transform `plan`.
     fn from_plan(plan: Plan, series: &[f64], buffers: &mut Buffers) -> Self {
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
         let mut made = Self { plan, spectrum };
@@ -120,7 +125,7 @@ impl Kernel {
         made
     }
 
-    /// Kernel of a zero series of `m` terms.
+    /// Return the spectrum of a zero series of `m` terms.
     pub(crate) fn noughts(m: usize) -> Self {
         let plan = fft::plan(fft::fast_length(2 * m));
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
@@ -135,7 +140,8 @@ impl Kernel {
         self.plan.transform(time, &mut self.spectrum, workspace);
     }
 
-    /// First `out.len()` terms of the product with `signal`. Neither may be longer than the cached length.
+    /// Write the first `out.len()` terms of the product with `signal` to `out`. The series and `signal` together must
+    /// have at most the number of terms for which the spectrum was computed ([`Kernel::with_length`]).
     pub fn apply(&self, signal: &[f64], out: &mut [f64], buffers: &mut Buffers) {
         buffers.time.clear();
         buffers.time.extend_from_slice(signal);
@@ -151,12 +157,14 @@ impl Kernel {
         out[..read].copy_from_slice(&buffers.time[..read]);
     }
 
-    /// Multiply by another cached series of the same number of terms in all factors together.
+    /// Multiply by another series in the frequency domain. Both spectra must be for the same total number of terms, and
+    /// the product must not exceed it.
     pub fn multiply(&mut self, other: &Self) {
         self.spectrum.iter_mut().zip(&other.spectrum).for_each(|(x, y)| *x *= y);
     }
 
-    /// First `out.len()` terms of the product with another cached series of the same length, by one transform.
+    /// Write the first `out.len()` terms of the product with another series of the same length to `out`. Takes one
+    /// transform.
     pub fn times(&self, other: &Self, out: &mut [f64], buffers: &mut Buffers) {
         buffers.spectrum.clear();
         buffers.spectrum.extend(self.spectrum.iter().zip(&other.spectrum).map(|(x, y)| x * y));
@@ -167,20 +175,21 @@ impl Kernel {
     }
 }
 
-/// Sum of products of series in the frequency domain, by one inverse transform for all products.
+/// Sum of products of series in the frequency domain. All products together need one inverse transform.
 pub struct SumOfProducts {
     plan: Plan,
     spectrum: Vec<Bin>,
 }
 
 impl SumOfProducts {
-    /// Empty sum, to which products of series with m terms can be added.
+    /// Return an empty sum, to which products of two series of m terms can be added.
     #[must_use]
     pub fn new(m: usize) -> Self {
         Self::with_length(2 * m)
     }
 
-    /// An empty sum of products of up to `total` terms in all factors together: three factors of m terms need 3m.
+    /// Return an empty sum of products whose factors have up to `total` terms together. Three factors of m terms need
+    /// 3m.
     #[must_use]
     pub fn with_length(total: usize) -> Self {
         let plan = fft::plan(fft::fast_length(total));
@@ -193,26 +202,26 @@ impl SumOfProducts {
         self.spectrum.fill(Bin::new(0.0, 0.0));
     }
 
-    /// Add a series.
+    /// Add a series. Its spectrum must be for the same total number of terms as the sum.
     pub fn add_series(&mut self, series: &Kernel) {
         self.spectrum.iter_mut().zip(&series.spectrum).for_each(|(sum, x)| *sum += x);
     }
 
-    /// Add the product of another sum with a series, all cached for the same number of terms.
+    /// Add the product of another sum and a series. All spectra must be for the same total number of terms.
     pub fn add_product(&mut self, other: &Self, series: &Kernel) {
         for ((sum, x), y) in self.spectrum.iter_mut().zip(&other.spectrum).zip(&series.spectrum) {
             *sum += x * y;
         }
     }
 
-    /// Add weight·a·b, both cached for the same m as the sum.
+    /// Add `weight`·a·b. All spectra must be for the same total number of terms.
     pub fn add(&mut self, weight: f64, a: &Kernel, b: &Kernel) {
         for ((sum, x), y) in self.spectrum.iter_mut().zip(&a.spectrum).zip(&b.spectrum) {
             *sum += x * y * weight;
         }
     }
 
-    /// First `out.len()` terms of the sum, which is reset to zero.
+    /// Write the first `out.len()` terms of the sum to `out`, and reset the sum to zero.
     pub fn take(&mut self, out: &mut [f64], buffers: &mut Buffers) {
         buffers.time.resize(self.plan.len(), 0.0);
         let time = &mut buffers.time[..self.plan.len()];

@@ -1,26 +1,30 @@
-//! Systems of integrals of integer order by running sums instead of transforms: O(n² K) a term.
+//! Systems of integrals of integer order by running sums instead of transforms. O(n² K) per term for n equations and K
+//! sums.
 //!
-//! In pulse means I^η of integer order is h^η/(η+1)!·A(z)/(1−z)^η with an Eulerian polynomial A of degree η. In powers
-//! of 1−z it is a combination of running sums Q^l, Q = 1/(1−z), l = 0 … η. A system of such integrals is thus y = G₀ +
-//! Q(G₁ + Q(G₂ + …)), each G_l linear in the unknowns and the inputs: one state for each sum. The sums have the
-//! magnitude of the outputs, unlike the terms of a difference equation in y.
+//! In pulse means with the sampling interval h, the integral I^η of integer order η is h^η/(η+1)!·A(z)/(1−z)^η. Here z
+//! is the one-step delay, and A is an Eulerian polynomial of degree η. In powers of 1−z it is a combination of running
+//! sums Q^l, Q = 1/(1−z), l = 0 … η. A system of such integrals is thus y = G₀ + Q(G₁ + Q(G₂ + …)), where each G_l is
+//! linear in the unknowns and the inputs. It needs one state per sum. The sums have the magnitude of the outputs,
+//! unlike the terms of a difference equation in y.
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::small;
 use crate::simd::{dispatch_simd, SimdKernel};
 
-/// Maximum order of an integral. For higher orders transforms are as fast.
+/// Maximum order of an integral. For higher orders, transforms are as fast.
 pub const MAX_SUMS: usize = 6;
 
-/// Number of right-hand sides solved in parallel lanes, which hides the latency of the recursion.
+/// Number of right-hand sides solved in parallel SIMD lanes, which hides the latency of the recursion.
 pub const RIGHT_SIDE_LANES: usize = 4;
 
-/// Terms of one chunk, so that its inputs stay in the cache.
+/// Number of terms that are processed in one chunk. The inputs of a chunk stay in the cache.
 const CHUNK_TERMS: usize = 256;
 
-/// Weights of the running sums Q^0 … Q^η in I^η of pulse means.
+/// Return the weights of the running sums Q^0 … Q^η in the integral I^η of pulse means, with Q = 1/(1 − z) and the
+/// one-step delay z. `step` is the sampling interval h.
 ///
-/// By Frobenius' identity they are h^η/(η+1)!·(−1)^{η−l}·(l+1)!·S(η+1, l+1), S Stirling's numbers of the second kind.
+/// By Frobenius' identity the weights are h^η/(η+1)!·(−1)^{η−l}·(l+1)!·S(η+1, l+1), l = 0 … η, with Stirling numbers S
+/// of the second kind.
 ///
 /// ```
 /// // I^1 of a pulse: half of it within the pulse, all of it in every later one.
@@ -50,39 +54,41 @@ pub fn running_sums(eta: usize, step: f64) -> Vec<f64> {
     weights
 }
 
-/// Input of one equation: `weight` times I^`order` of a series.
+/// Input of one equation: `weight` times the integral I^`order` of a series.
 #[derive(Debug, Clone, Copy)]
 pub struct Source<'a> {
     /// Index of the equation.
     pub equation: usize,
     /// Integer order of the integral.
     pub order: usize,
-    /// Coefficient.
+    /// Coefficient of the integral.
     pub weight: f64,
     /// Series of the input.
     pub series: &'a [f64],
 }
 
-/// System y_i = Σ c·I^η y_j + inputs, for any number of right-hand sides.
+/// System y_i = Σ c·I^η y_j + inputs with integrals I^η of integer order, for any number of right-hand sides.
 #[derive(Debug, Clone)]
 pub struct RunningSumSystem {
+    /// Number of equations.
     n: usize,
     /// Number of running sums of each equation.
     sums: usize,
+    /// Sampling interval \[s\].
     step: f64,
-    /// Weight of each unknown in each sum of each equation: `[(i·(sums + 1) + l)·n + j]`.
+    /// Weight of unknown j in running sum l of equation i, at index (i·(sums + 1) + l)·n + j for n equations.
     own: Vec<f64>,
     /// Inverse of the matrix of leading coefficients, row-major.
     inverse: Vec<f64>,
 }
 
 impl RunningSumSystem {
-    /// System of n equations with terms (i, j, η, c): c·I^η y_j in equation i. `sums` is the highest η of terms and
-    /// sources.
+    /// Build a system of n equations from terms (i, j, η, c), each for c·I^η y_j in equation i. `sums` is the highest η
+    /// of terms and inputs, and `step` the sampling interval.
     ///
     /// # Errors
-    /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Structure`] for an order
-    /// above `sums`, or above [`MAX_SUMS`].
+    /// [`Error::LeadingZero`] if the matrix of leading coefficients is singular. [`Error::Structure`] for an order
+    /// above `sums`, or for `sums` above [`MAX_SUMS`].
     pub fn new(n: usize, sums: usize, step: f64, terms: &[(usize, usize, usize, f64)]) -> Result<Self> {
         let highest = terms.iter().map(|&(.., order, _)| order).max().unwrap_or(0);
         if highest > sums || sums > MAX_SUMS {
@@ -100,13 +106,13 @@ impl RunningSumSystem {
         Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
     }
 
-    /// Solve for the n unknown series of m terms, for each list of sources.
+    /// Solve the system for each list of inputs. Return n unknown series of m terms per list.
     ///
     /// # Errors
-    /// [`Error::Length`] for a source shorter than m.
+    /// [`Error::Length`] for an input series shorter than m.
     ///
     /// # Panics
-    /// If a source names an equation that does not exist or an order above the sums.
+    /// If an input has an equation that does not exist or an order above the number of sums.
     pub fn solve(&self, m: usize, lists: &[Vec<Source>]) -> Result<Vec<Vec<Vec<f64>>>> {
         for source in lists.iter().flatten() {
             if source.series.len() < m {
@@ -129,7 +135,8 @@ impl RunningSumSystem {
         Ok(solved.map(|answer| vec![answer]).collect())
     }
 
-    /// Solve a system of one unknown for up to [`RIGHT_SIDE_LANES`] right-hand sides. L is the number of sums plus one.
+    /// Solve a system of one unknown for up to [`RIGHT_SIDE_LANES`] lists of inputs. L is the number of running sums
+    /// plus one.
     fn solve_one_unknown<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
         let mut own = [0.0; L];
         own.copy_from_slice(&self.own[..L]);
@@ -160,11 +167,12 @@ impl RunningSumSystem {
         out
     }
 
-    /// Weights with which a source enters each running sum.
+    /// Return the weights with which an input enters each running sum.
     fn weights(&self, source: &Source) -> Vec<f64> {
         running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect()
     }
 
+    /// Solve a system of several unknowns for one list of inputs. Return n series of m terms.
     fn solve_coupled(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
         let (n, stride) = (self.n, self.sums + 1);
         // Inputs of each sum, term by term, then equation by equation.
@@ -201,12 +209,18 @@ impl RunningSumSystem {
     }
 }
 
-/// SIMD task that solves for one unknown and [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms.
+/// Solution for one unknown and [`RIGHT_SIDE_LANES`] right-hand sides over a chunk of terms. It is compiled for the
+/// widest vector instructions available.
 struct Block<'a, const L: usize> {
+    /// Weight of the unknown in each running sum.
     own: &'a [f64; L],
+    /// Reciprocal of the leading coefficient of the equation.
     inverse: f64,
+    /// Values of the running sums, updated in place.
     states: &'a mut [[f64; RIGHT_SIDE_LANES]; L],
+    /// Input of each running sum for each right-hand side, by term.
     drive: &'a [[[f64; RIGHT_SIDE_LANES]; L]],
+    /// Values of the unknown for each right-hand side, by term.
     answer: &'a mut [[f64; RIGHT_SIDE_LANES]],
 }
 

@@ -1,4 +1,5 @@
-//! Evaluation of one batch: screen, simulate the candidates that no bound excludes, count every outcome.
+//! Evaluation of one batch of candidates: exclude candidates by lower bounds, simulate the remaining ones, and count
+//! every outcome.
 
 use std::sync::atomic::Ordering;
 
@@ -14,33 +15,38 @@ use crate::order_search::result::{Failure, Part, Row, TopRows, Verdict, MAX_LIST
 use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 use crate::parallel::PerThread;
 
-/// Pulses simulated between two checkpoints, about 0.1 s on one core.
+/// Number of samples simulated between two checkpoints, about 0.1 s on one core.
 const CHECKPOINT_PULSES: usize = 1 << 21;
-/// Number of candidates that a task screens by bounds.
+/// Number of candidates for which one parallel task computes lower bounds.
 const BOUND_CHUNK_CANDIDATES: u64 = 512;
-/// Number of candidates that a task ranks by the Gram matrix alone, which costs about 1 ns per candidate.
+/// Number of candidates that one parallel task ranks by the Gram matrix alone, at about 1 ns per candidate.
 const GRAM_CHUNK_CANDIDATES: u64 = 1 << 13;
-/// Number of slices on which boxes are tried if candidates are hard to exclude. Boxes must exclude at least one in
-/// [`MAX_CANDIDATES_PER_EXCLUSION`] candidates. Boxes that exclude nothing make a search 50 % longer.
+/// Number of slices on which branch and bound over boxes is tried if candidates are hard to exclude. It is used if
+/// boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates. Boxes that exclude nothing make a search
+/// 50 % longer.
 const TRIAL_SLICES: u64 = 32;
-/// Maximum number of candidates per candidate that boxes exclude. Above it boxes cost more time than they save.
+/// Maximum ratio of the number of candidates to the number of candidates that boxes exclude. At a larger ratio, boxes
+/// cost more time than they save.
 const MAX_CANDIDATES_PER_EXCLUSION: u64 = 8;
-/// Initial and largest number of candidates simulated between two updates of the limit.
+/// Initial and largest number of candidates that are simulated between two updates of the limit.
 const SIMULATION_CHUNK_RANGE: (u64, u64) = (256, 16_384);
-/// Initial and largest number of candidates with refined coefficients between two updates of the limit. One refinement
-/// takes about 1 ms, so frequent updates are worthwhile.
+/// Initial and largest number of candidates with refined coefficients that are evaluated between two updates of the
+/// limit. One refinement takes about 1 ms, so frequent updates save time.
 const REFINEMENT_CHUNK_RANGE: (u64, u64) = (32, 1024);
 
 /// Evaluation of a range of batches.
 pub(super) struct BatchEvaluation<'a> {
     pub(super) catalogue: &'a CandidateIndex<'a>,
+    /// Branch and bound over boxes, if it is used.
     boxes: Option<&'a BranchAndBound>,
     pub(super) pool: &'a rayon::ThreadPool,
     control: &'a Control,
+    /// Workspace of each thread.
     scratches: PerThread<Scratch>,
-    /// Result of the completed batches, and of the candidates evaluated in the current batch, without its rows.
+    /// Result of the completed batches, and counts and failures of the current batch. The rows of the current batch are
+    /// not included.
     pub(super) result: Part,
-    /// True if the next checkpoint is the first one of this evaluation of the range.
+    /// True if the next checkpoint is the first one of this evaluation of the range of batches.
     pub(super) replaces_previous: bool,
 }
 
@@ -62,16 +68,19 @@ impl<'a> BatchEvaluation<'a> {
         }
     }
 
+    /// Return true after a stop request.
     pub(super) fn is_stopped(&self) -> bool {
         self.control.is_stopped()
     }
 
+    /// Return [`crate::error::Error::Interrupted`] after a stop request.
     pub(super) fn check_stop(&self) -> Result<()> {
         self.control.check_stop()
     }
 
-    /// Screen a batch and simulate the candidates that no bound excludes, starting at a position. Return `false` if the
-    /// position belongs to another evaluation order, as on another kind of processor.
+    /// Screen the candidates in the index range `bounds` and simulate those that no bound excludes, starting at the
+    /// position `place`. Return false if the position belongs to another evaluation order, which may occur on another
+    /// kind of processor.
     pub(super) fn evaluate_batch(
         &mut self,
         bounds: (u64, u64),
@@ -132,7 +141,8 @@ impl<'a> BatchEvaluation<'a> {
         self.simulate_open(&open, top_rows, place, true).map(|()| true)
     }
 
-    /// Whether boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates on trial slices.
+    /// Return true if boxes exclude more than one in [`MAX_CANDIDATES_PER_EXCLUSION`] candidates of trial slices, at a
+    /// limit of the raw score (Σ|e| or Σe²).
     pub(super) fn boxes_are_worthwhile(&self, limit: f64) -> Result<bool> {
         let Some(boxes) = self.boxes else { return Ok(false) };
         let (catalogue, control) = (self.catalogue, self.control);
@@ -155,7 +165,9 @@ impl<'a> BatchEvaluation<'a> {
         Ok(boxed * MAX_CANDIDATES_PER_EXCLUSION > all)
     }
 
-    /// Split the candidates of a batch into chunks: a large slice as a whole, others in small numbers.
+    /// Split the candidates `start … end − 1` of a batch into chunks, one per parallel task: (first candidate,
+    /// candidate after the last one, slice). A chunk with a slice is processed by branch and bound, other chunks are
+    /// small.
     fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<GridSlice>)> {
         let mut chunks = Vec::new();
         // With boxes, a chunk must not extend far into the next slice.
@@ -179,8 +191,8 @@ impl<'a> BatchEvaluation<'a> {
         chunks
     }
 
-    /// Simulate candidates that no bound excludes in this order, starting at a position. Rows are added to `top_rows`.
-    /// If `counted`, counts and checkpoints are updated.
+    /// Simulate the candidates `open` in this order, starting at the position `place`, and add their rows to
+    /// `top_rows`. If `counted` is true, counts and checkpoints are updated.
     pub(super) fn simulate_open(
         &mut self,
         open: &[OpenCandidate],
@@ -233,7 +245,8 @@ impl<'a> BatchEvaluation<'a> {
         }
     }
 
-    /// Simulate these candidates up to a limit. Return the rows below it.
+    /// Simulate these candidates up to a limit of the raw score (Σ|e| or Σe²). Return the rows of candidates whose
+    /// score is at most the limit. If `counted` is true, counts are updated.
     fn simulate_chunk(&mut self, open: &[OpenCandidate], limit: f64, counted: bool) -> Result<Vec<Row>> {
         let (catalogue, control, scratches) = (self.catalogue, self.control, &self.scratches);
         let problem = &catalogue.problem;
@@ -261,7 +274,7 @@ impl<'a> BatchEvaluation<'a> {
                 };
                 scratch.positions = positions;
                 scratch.initial = initial;
-                // Candidates excluded by a bound are counted as processed elsewhere.
+                // [`Self::count_verdict`] counts candidates that a bound excludes as processed.
                 if counted && !matches!(verdict, Verdict::Bounded(_)) {
                     control.count(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
                 }
@@ -281,6 +294,7 @@ impl<'a> BatchEvaluation<'a> {
         Ok(rows)
     }
 
+    /// Add the outcome of a candidate to the counts, and add a failure to the list of failures.
     fn count_verdict(&mut self, index: u64, verdict: Verdict) {
         match verdict {
             Verdict::Score(_) => self.result.counts.beaten += 1,
@@ -300,7 +314,8 @@ impl<'a> BatchEvaluation<'a> {
     }
 }
 
-/// Digest of the evaluation order of candidates, below 2^63 and never 0 (64-bit FNV-1a over their indices).
+/// Return a digest of the evaluation order of candidates, below 2^63 and never 0. It is the 64-bit FNV-1a hash of their
+/// indices without the last bit.
 fn digest(open: &[OpenCandidate]) -> u64 {
     let bytes = open.iter().flat_map(|candidate| candidate.index.to_le_bytes());
     let whole =

@@ -1,16 +1,17 @@
-//! Evaluator of an order search. It is parallel, reproducible and interruptible, and counts the outcome of every
+//! Evaluator of an order search. It is parallel, reproducible and interruptible, and it counts the outcome of every
 //! candidate.
 //!
-//! Candidates are processed in batches. All candidates of a batch get coefficients in parallel lanes, and a lower bound
-//! excludes most of them. The remaining candidates are simulated in the order of their score estimates. Each simulation
-//! stops once its partial sum exceeds the worst score in the table. An excluded candidate cannot enter the table, so
-//! the table equals that of brute force, ties by index.
+//! Candidates are processed in batches. The coefficients of all candidates of a batch are computed in parallel SIMD
+//! lanes, and a lower bound excludes most candidates. The remaining ones are simulated in ascending order of an
+//! estimate of their score. Each simulation stops once its partial sum exceeds the worst score in the result table. An
+//! excluded candidate cannot enter the table. The table therefore equals that of brute force, and candidates of equal
+//! score are ordered by index.
 //!
-//! Generations hold 1, 2, 4, … batches. The result of a batch depends only on the batch and on the rows found before
-//! its generation. Result and counts are therefore bitwise reproducible on processors of one kind: with any number of
-//! threads, on another machine with the same vector instructions, or after resuming from a checkpoint. On another kind
-//! of processor the last digits may differ, because dense products and transforms select their kernels by instruction
-//! set.
+//! Successive batches form generations of 1, 2, 4, … batches. The result of a batch depends only on the batch and on
+//! the rows found before its generation. Result and counts are therefore bitwise reproducible on processors of one
+//! kind. They do not depend on the number of threads, the machine (with the same vector instructions), or a restart
+//! from a checkpoint. On another kind of processor the last digits may differ, because dense products and transforms
+//! select their kernels by instruction set.
 
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
@@ -31,12 +32,13 @@ use crate::regressors::Record;
 
 /// Search an order grid for one equation on one or several records.
 ///
-/// The slice `fixed` holds the fixed coefficients, one entry per term. The table equals that of brute force for any
-/// number of threads.
+/// The slice `fixed` has one entry per term, `None` for a free coefficient. The result table equals that of brute force
+/// for any number of threads.
 ///
 /// # Errors
-/// An option out of range, records without the signals of the equation, a wrong number of fixed coefficients,
-/// regressors beyond the memory limit, threads that cannot be started, [`crate::error::Error::Interrupted`].
+/// An option out of range, records that lack a signal of the equation, a wrong number of fixed coefficients, or
+/// regressors beyond the memory limit. Also threads that cannot be started, or a stop request
+/// ([`crate::error::Error::Interrupted`]).
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -75,20 +77,22 @@ pub fn search(
     Ok(all.outcome(options.norm, ready.catalogue.problem.samples()))
 }
 
-/// Evaluator of an order search, prepared for its batches.
+/// Evaluator of an order search, with the data that all batches share.
 pub struct BatchEvaluator<'a> {
     catalogue: CandidateIndex<'a>,
-    /// Branch and bound, if it excludes whole boxes of candidates.
+    /// Branch and bound over boxes of candidates, if it saves time.
     boxes: Option<BranchAndBound>,
-    /// Raw score above which no candidate can enter the table, from the initial sample.
+    /// Raw score (Σ|e| or Σe²) above which no candidate can enter the table, from an initial sample of candidates.
     limit: f64,
 }
 
 impl<'a> BatchEvaluator<'a> {
-    /// Build the data shared by all batches: regressors, their products, test vectors and an initial limit.
+    /// Build the data shared by all batches: regressors, their inner products, test vectors and an initial limit of the
+    /// score.
     ///
     /// # Errors
-    /// An option out of range, signals that the records lack, too little memory, or a stop request ([`search`]).
+    /// The errors of [`search`]: an option out of range, signals that the records lack, too little memory, or a stop
+    /// request.
     pub fn new(
         records: &[Record],
         lattice: Cow<'a, OrderGrid>,
@@ -130,7 +134,7 @@ impl<'a> BatchEvaluator<'a> {
                 if let Some(adapted) = &mut catalogue.problem.tailored_vectors {
                     adapted.vectors.extend(vectors);
                 }
-                // Candidates that no vector excludes are likely to be good.
+                // Candidates that no test vector excludes are likely to have a low score.
                 BatchEvaluation::new(&catalogue, None, pool, control).refine_from(
                     &candidates,
                     &mut top_rows,
@@ -153,7 +157,8 @@ impl<'a> BatchEvaluator<'a> {
         }
         let mut boxes = pool.install(|| if pay { BranchAndBound::new(&catalogue) } else { None });
         control.check_stop()?;
-        // Boxes, and tailored test vectors with them, may fail on the candidates that are open in the initial sample.
+        // Boxes and tailored test vectors may fail to exclude the candidates of the initial sample that are still to be
+        // simulated.
         if hard
             && boxes.is_some()
             && !BatchEvaluation::new(&catalogue, boxes.as_ref(), pool, control).boxes_are_worthwhile(limit)?
@@ -164,15 +169,16 @@ impl<'a> BatchEvaluator<'a> {
         Ok(Self { catalogue, boxes, limit })
     }
 
-    /// Evaluate batches `first … last − 1`, which must belong to one generation (see [`generation_ends`]), and return
-    /// counts and best rows.
+    /// Evaluate batches `first … last − 1`, and return their counts and best rows. The batches must belong to one
+    /// generation ([`generation_ends`]).
     ///
-    /// `seed` holds index and raw score of the rows found before the generation. `from` resumes a checkpoint of the
-    /// same range and seed that holds all rows found since its start. The range is restarted if the checkpoint belongs
-    /// to another evaluation order, as on another kind of processor.
+    /// `seed` lists index and raw score (Σ|e| or Σe²) of the best rows found before the generation. `from` resumes a
+    /// checkpoint of the same range and seed. It must contain all rows found since the start of the range. The range is
+    /// restarted if the checkpoint belongs to another evaluation order, which may occur on another kind of processor.
     ///
     /// # Errors
-    /// [`crate::error::Error::Interrupted`], or batches, seed or checkpoint of another search.
+    /// [`crate::error::Error::Interrupted`] after a stop request. [`crate::error::Error::Structure`] for batches, a
+    /// seed or a checkpoint of another search.
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -232,8 +238,8 @@ impl<'a> BatchEvaluator<'a> {
             return Err(mismatch_error(format!("a row of score {score} has index {index} among {count} candidates")));
         }
         self.check(&from.part)?;
-        // Batches are distributed over the grid, so that early generations sample all of it and later ones start with a
-        // good limit.
+        // Batches are distributed over the grid. Early generations therefore sample all of it, and later ones start
+        // with a low limit.
         let order = low_discrepancy_order(all);
         let mut hunt = BatchEvaluation::new(&self.catalogue, self.boxes.as_ref(), pool, control);
         let Checkpoint { mut place, part, .. } = from;
@@ -253,7 +259,7 @@ impl<'a> BatchEvaluator<'a> {
             top_rows.insert_rows(hunt.result.rows.iter().filter(|row| own(row)).cloned());
             hunt.result.rows.retain(|row| !own(row));
             if !hunt.evaluate_batch(bounds, &mut top_rows, place)? {
-                // Its candidates would be evaluated twice or never, so the foreign result is discarded.
+                // Some candidates would be evaluated twice or never, so the result of the checkpoint is discarded.
                 control.finished_count.fetch_sub(processed, Ordering::Relaxed);
                 (hunt.result, hunt.replaces_previous, place) = (Part::default(), true, BatchPosition::start(first));
                 continue;
@@ -269,7 +275,7 @@ impl<'a> BatchEvaluator<'a> {
         Ok(hunt.result)
     }
 
-    /// Return an error for a partial result of another search.
+    /// Return [`crate::error::Error::Structure`] for a partial result that belongs to another search.
     fn check(&self, part: &Part) -> Result<()> {
         let (count, width) = (self.catalogue.lattice.count(), self.catalogue.lattice.width());
         let other = |row: &Row| row.coefficients.len() != width || row.index >= count || is_invalid_score(row.score);
@@ -292,35 +298,36 @@ impl<'a> BatchEvaluator<'a> {
     }
 }
 
-/// Whether a value cannot be a raw sum of errors.
+/// Return true if a value cannot be a raw score (Σ|e| or Σe²).
 fn is_invalid_score(score: f64) -> bool {
     score.is_nan() || score < 0.0
 }
 
 /// Number of candidates per batch if they are ranked by the Gram matrix alone (16 ns per candidate). A batch takes long
-/// enough to be sent to another machine, and so short that its loss is acceptable.
+/// enough to justify sending it to another machine, and so short that its loss is acceptable.
 const BATCH_SIZE_GRAM: u64 = 1 << 18;
-/// Number of candidates per batch if bounds screen them (about 1 µs per candidate).
+/// Number of candidates per batch if lower bounds exclude candidates before simulation (about 1 µs per candidate).
 const BATCH_SIZE_BOUNDED: u64 = 1 << 16;
 /// Number of candidates per batch if all are simulated.
 const BATCH_SIZE_SIMULATED: u64 = 1 << 12;
-/// Minimum number of candidates for branch and bound. Batches then grow with the grid up to [`MAX_BATCH_SIZE`], because
-/// tables of boxes shared by two batches are computed twice.
+/// Minimum number of candidates of a search for branch and bound over boxes. Above it, the batch size grows with the
+/// grid up to [`MAX_BATCH_SIZE`], because tables of a slice that two batches share are computed twice.
 pub(super) const MIN_BOX_CANDIDATES: u64 = 1 << 25;
 /// Maximum number of candidates per batch.
 const MAX_BATCH_SIZE: u64 = 1 << 22;
-/// Minimum number of candidates for the close bounds (unstable zeros and linearized test vectors), if candidates are
-/// ranked by simulation. A smaller search ends before these bounds are built.
+/// Minimum number of candidates of a search for the expensive bounds (unstable zeros and linearized test vectors), if
+/// candidates are ranked by simulation. A smaller search would end before these bounds are built.
 const MIN_CLOSE_BOUND_CANDIDATES: u64 = 1 << 18;
-/// Maximum number of candidates with refined coefficients that are evaluated without an initial sample: one batch.
+/// Maximum number of candidates of a search with refined coefficients that skips the initial sample. It is one batch.
 pub(super) const MAX_UNSAMPLED_CANDIDATES: u64 = BATCH_SIZE_SIMULATED;
 
-/// Whether a search over this many candidates uses close bounds.
+/// Return true if a search over `candidates` candidates may use the expensive bounds (unstable zeros and linearized
+/// test vectors).
 pub(super) fn uses_close_bounds(candidates: u64, options: &Options) -> bool {
     candidates >= MIN_CLOSE_BOUND_CANDIDATES && options.ranks_by_simulation()
 }
 
-/// Number of candidates per batch of a search.
+/// Return the number of candidates per batch for a search over `candidates` candidates.
 pub(super) fn batch_size(candidates: u64, options: &Options) -> u64 {
     if options.refines() || !options.pruning {
         BATCH_SIZE_SIMULATED
@@ -335,13 +342,14 @@ pub(super) fn batch_size(candidates: u64, options: &Options) -> u64 {
     }
 }
 
-/// Number of batches of a search over this many candidates.
+/// Return the number of batches of a search over this many candidates.
 #[must_use]
 pub fn batch_count(candidates: u64, options: &Options) -> u64 {
     candidates.div_ceil(batch_size(candidates, options))
 }
 
-/// End of each generation for this number of batches: 1, 3, 7, …
+/// Return the end of each generation of batches: 1, 3, 7, … and finally the number `rounds` of batches. A generation
+/// ends before the batch with this number.
 ///
 /// ```
 /// # use ftlm::order_search::options::Options;

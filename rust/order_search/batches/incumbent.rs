@@ -1,6 +1,6 @@
-//! Incumbent of a search from an initial sample of the grid and a local refinement.
+//! Initial incumbent of a search, from a sample of the order grid and a local search around its best candidates.
 //!
-//! The sample also selects the test vectors.
+//! The test vectors of the dual bound are selected by the candidates of the sample that they exclude.
 
 use std::collections::HashSet;
 
@@ -16,33 +16,37 @@ use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor};
 use crate::order_search::result::TopRows;
 use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 
-/// Number of candidates of the initial sample, distributed over the grid. They select the test vectors and give the
-/// first incumbent.
+/// Number of candidates of the initial sample, distributed over the grid. The sample determines the test vectors and
+/// the first incumbent.
 const INITIAL_SAMPLE_CANDIDATES: u64 = 2048;
-/// Maximum number of test vectors used in a search.
+/// Maximum number of fixed test vectors used in a search.
 const MAX_SEARCH_VECTORS: usize = 16;
-/// Number of candidates whose score is estimated to find those whose coefficients are refined first. Estimates are
-/// cheap, and low scores from a large part of the grid exclude most of it.
+/// Number of candidates whose score is estimated if coefficients are refined. Candidates with low estimates are refined
+/// first. Estimates are cheap, and low scores from a large part of the grid exclude most of it.
 const RANKED_CANDIDATES: u64 = 1 << 18;
 
-/// Inverse of the smallest fraction of the sample that must remain open, so that close bounds are worthwhile. Measured:
-/// 0.3 to 2 % open (9 % at twice the noise) if the grid contains a true equation, and 53 to 100 % otherwise.
+/// Inverse of a fraction of the sample. The expensive bounds (unstable zeros and linearized test vectors) save time if
+/// the other bounds leave at least this fraction. Measured: 0.3 to 2 % are not excluded (9 % at twice the noise) if the
+/// grid contains a true equation, and 53 to 100 % otherwise.
 const HARD_SEARCH_OPEN_RATIO: usize = 8;
 
-/// Incumbent found by the initial sample.
+/// Best candidates of the initial sample, the selected test vectors, and whether expensive bounds save time.
 pub(super) struct InitialIncumbent {
-    /// Rows that give the initial limit.
+    /// Best rows of the result table, which give the initial limit of the score.
     pub(super) top_rows: TopRows,
+    /// Indices of the candidates that have been evaluated.
     pub(super) evaluated: HashSet<u64>,
-    /// Whether so many candidates remain open at this limit that close bounds are worthwhile.
+    /// True if the bounds exclude so few candidates of the sample that the expensive bounds (unstable zeros and
+    /// linearized test vectors) save time.
     pub(super) needs_close_bounds: bool,
-    /// Indices of the selected test vectors, the best first.
+    /// Indices of the selected test vectors, the best first. `None` if all are used.
     pub(super) selected_vectors: Option<Vec<usize>>,
 }
 
 impl BatchEvaluation<'_> {
-    /// Find an initial incumbent and select test vectors. `thorough` also evaluates the neighbors of the best rows.
-    /// `closely` also tests whether close bounds are worthwhile.
+    /// Find an initial incumbent and select test vectors. If `thorough` is true, the neighbors of the best rows are
+    /// also evaluated. If `closely` is true, also decide whether the expensive bounds (unstable zeros and linearized
+    /// test vectors) save time.
     pub(super) fn find_incumbent(&mut self, thorough: bool, closely: bool) -> Result<InitialIncumbent> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
@@ -104,12 +108,13 @@ impl BatchEvaluation<'_> {
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
             hard = closely && many(top_rows.limit);
         } else if closely && top_rows.rows.first().is_some_and(|best| many(best.score)) {
-            // In a small sample the best score is near the final limit. The worst row of the table is not.
+            // In a small sample the best score is near the final limit. The score of the worst row of the table is far
+            // above it.
             self.refine_incumbent(&mut top_rows, &mut evaluated)?;
             hard = many(top_rows.limit);
         }
         let limit = top_rows.limit;
-        // Without initial coefficients all test vectors are used.
+        // Without initial coefficients, all test vectors are used.
         let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = candidates.into_iter().map(|(_, each)| each).collect();
             select_test_vectors(&each, MAX_SEARCH_VECTORS.min(bound.len()), limit)
@@ -118,7 +123,8 @@ impl BatchEvaluation<'_> {
     }
 }
 
-/// Select the test vectors that together exclude most of a sample, by greedy selection.
+/// Select at most `most` test vectors that together exclude most candidates of a sample, by greedy selection. `each`
+/// gives the bound of each test vector for each candidate. Return the indices of the selected vectors.
 fn select_test_vectors(each: &[Vec<f64>], most: usize, limit: f64) -> Vec<usize> {
     let mut open: Vec<bool> = vec![true; each.len()];
     let mut selection: Vec<usize> = Vec::new();
@@ -140,26 +146,28 @@ fn select_test_vectors(each: &[Vec<f64>], most: usize, limit: f64) -> Vec<usize>
     selection
 }
 
-/// Number of rows whose neighbors are evaluated.
+/// Number of best rows of the result table whose neighbors on the order grid are evaluated.
 const LOCAL_SEARCH_ROWS: usize = 64;
-/// Maximum number of neighbors evaluated around the best rows.
+/// Maximum number of neighbors on the order grid that are evaluated around the best rows.
 const MAX_NEIGHBOR_EVALUATIONS: usize = 1 << 14;
-/// Maximum number of directions of neighbors: all combinations of up to five orders, or pairs of more orders.
+/// Maximum number of directions to neighbors on the order grid. Up to five varying orders, all combinations of changes
+/// are used. With more orders, only two orders change at a time.
 const MAX_NEIGHBOR_DIRECTIONS: usize = 243;
-/// Number of sampled blocks of candidates, and their length.
+/// Number of sampled blocks of consecutive candidates, and number of candidates in a block.
 const SAMPLE_BLOCKS_AND_LENGTH: (u64, u64) = (2048, 64);
-/// Maximum number of candidates not excluded by bounds that are evaluated.
+/// Maximum number of candidates not excluded by bounds that are evaluated to improve the incumbent.
 const MAX_OPEN_EVALUATIONS: usize = 512;
 
 impl BatchEvaluation<'_> {
-    /// Refine the incumbent from the best rows, and from open candidates sampled over the whole grid.
+    /// Improve the incumbent: evaluate neighbors of the best rows, then a sample of candidates from the whole grid that
+    /// no bound excludes, then neighbors again.
     pub(super) fn refine_incumbent(&mut self, top_rows: &mut TopRows, evaluated: &mut HashSet<u64>) -> Result<()> {
         self.search_neighbors(top_rows, evaluated)?;
         let hard = self.sample_unexcluded(top_rows)?;
         self.refine_from(&hard, top_rows, evaluated)
     }
 
-    /// Evaluate these candidates, then search around the best rows.
+    /// Evaluate the candidates `open` that are not in `evaluated`, then search around the best rows.
     pub(super) fn refine_from(
         &mut self,
         open: &[OpenCandidate],
@@ -171,7 +179,8 @@ impl BatchEvaluation<'_> {
         self.search_neighbors(top_rows, evaluated)
     }
 
-    /// Evaluate neighbors of the best rows, distant ones first, until none improves them.
+    /// Evaluate neighbors of the best rows that are not in `evaluated`. The distance is halved whenever no neighbor
+    /// improves the best rows. The search ends at distance 1 or after [`MAX_NEIGHBOR_EVALUATIONS`] evaluations.
     pub(super) fn search_neighbors(&mut self, top_rows: &mut TopRows, evaluated: &mut HashSet<u64>) -> Result<()> {
         let lattice = &*self.catalogue.lattice;
         let longest = lattice.groups().iter().flat_map(|group| &group.axes).map(Vec::len);
@@ -198,7 +207,7 @@ impl BatchEvaluation<'_> {
         Ok(())
     }
 
-    /// Neighbors of a candidate at this distance in any of its varying orders.
+    /// Return the indices of the candidates at a distance of `stride` grid values in one or more of the varying orders.
     fn grid_neighbors(&self, index: u64, stride: usize) -> Vec<u64> {
         let lattice = &*self.catalogue.lattice;
         let cursor = Cursor::at(lattice, index);
@@ -208,7 +217,7 @@ impl BatchEvaluation<'_> {
         for group in lattice.groups() {
             group.terms.iter().zip(&group.axes).for_each(|(&term, axis)| lengths[term] = axis.len());
         }
-        // The order of the equation comes last.
+        // The order α of the equation comes last.
         digits.push(cursor.block());
         lengths.push(lattice.blocks().len());
         let vary: Vec<usize> = (0..digits.len()).filter(|&i| lengths[i] > 1).collect();
@@ -245,7 +254,7 @@ impl BatchEvaluation<'_> {
         moves.into_iter().filter_map(neighbor).collect()
     }
 
-    /// Sample of candidates that no bound excludes, the most promising first.
+    /// Return a sample of candidates that no bound excludes, in ascending order of their estimated score.
     fn sample_unexcluded(&mut self, top_rows: &TopRows) -> Result<Vec<OpenCandidate>> {
         let catalogue = self.catalogue;
         if catalogue.problem.residual_sums.is_none() {

@@ -1,5 +1,6 @@
-//! Generation of tailored and linearized test vectors, as long as they exclude enough candidates.
+//! Generation of tailored and linearized test vectors, for as long as new vectors exclude enough candidates.
 //!
+//! A tailored vector is exact for one candidate, and a linearized vector is corrected to first order for others.
 //! Vectors are built for the candidates in a sample of the grid that no other vector excludes.
 
 use std::collections::BTreeMap;
@@ -14,45 +15,49 @@ use crate::order_search::dual_bound::tailored_vectors::TailoredVector;
 use crate::order_search::grid::traversal::{low_discrepancy_order, Cursor};
 use crate::order_search::screening::{screen, sort_by_guess, OpenCandidate};
 
-/// Minimum size of the sample in which open candidates are searched. The first pass uses this size. Later passes use a
-/// fraction of a large grid, since few candidates remain open. The sample consists of blocks, because all candidates of
-/// a block are usually open, or none.
+/// Minimum number of candidates in the sample for tailored test vectors. The first pass uses this number. Later passes
+/// use a fraction of a large grid, because then few candidates are not excluded. The sample consists of blocks of
+/// consecutive candidates, because usually all candidates of a block are excluded or none.
 const MIN_TAILORED_SAMPLE: u64 = 1 << 17;
-/// Number of candidates of a large grid per sampled candidate.
+/// Ratio of the number of candidates of a large grid to the number in the sample for tailored test vectors.
 const TAILORED_SAMPLE_RATIO: u64 = 512;
-/// Number of candidates in a block of this sample.
+/// Number of consecutive candidates in a block of the sample for tailored test vectors.
 const TAILORED_SAMPLE_BLOCK: u64 = 16;
+/// Number of blocks of candidates that are screened between two checks of the number of candidates found.
 const BLOCKS_PER_SCREENING: u64 = 1 << 11;
-/// Number of open candidates at which sampling stops.
+/// Number of candidates found that no bound excludes, at which sampling stops.
 const OPEN_SAMPLE_CANDIDATES: usize = 512;
-/// Maximum number of vectors tried per pass.
+/// Maximum number of tailored test vectors that are built in one pass of vector generation.
 const MAX_TRIAL_VECTORS: usize = 32;
-/// Maximum number of vectors selected from those tried in a pass.
+/// Maximum number of tailored test vectors that are selected from those built in a pass.
 const MAX_SELECTED_VECTORS: usize = 12;
-/// Maximum number of passes.
+/// Maximum number of passes that generate tailored test vectors.
 const MAX_GENERATION_PASSES: u64 = 4;
-/// Minimum number of candidates not yet excluded for another pass. One pass costs as much time as simulating this many
-/// candidates.
+/// Minimum estimated number of candidates of the grid not yet excluded for which another pass of vector generation
+/// saves time. One pass takes as long as simulating this many candidates.
 const MIN_OPEN_CANDIDATES: f64 = 16_384.0;
-/// Minimum number of candidates that a test vector must exclude to be kept.
+/// Minimum estimated number of candidates of the grid that a tailored test vector must exclude to be selected.
 const MIN_VECTOR_EXCLUSIONS: f64 = 512.0;
+/// Factor on the number of candidates of the sample that the selected test vectors do not exclude. It corrects the bias
+/// of the selection: the vectors exclude fewer candidates elsewhere.
 const SELECTION_BIAS_FACTOR: usize = 4;
-/// Maximum memory of test vectors, including those on trial \[bytes\].
+/// Maximum memory of tailored test vectors, including those built but not selected \[bytes\].
 const MAX_TAILORED_BYTES: u64 = 256 << 20;
 
-/// Result of one pass of vector generation.
+/// Result of one pass that generates tailored test vectors.
 #[derive(Default)]
 pub(super) struct GeneratedVectors {
     pub(super) vectors: Vec<TailoredVector>,
-    /// Candidates of the sample that the vectors leave open.
+    /// Candidates of the sample that the vectors do not exclude.
     pub(super) open: Vec<OpenCandidate>,
-    /// True if another pass may be worthwhile.
+    /// True if another pass of vector generation may save time.
     pub(super) is_worth_repeating: bool,
 }
 
 impl BatchEvaluation<'_> {
-    /// Sample of candidates that no bound excludes at this limit, the most promising first. Also returns the number of
-    /// candidates that each represents. Each pass draws another sample.
+    /// Return a sample of candidates that no bound excludes at this limit of the raw score (Σ|e| or Σe²), in ascending
+    /// order of their estimated score. Also return the number of candidates of the grid per sampled candidate. Each
+    /// pass `time` draws another sample.
     pub(super) fn sample_open(&self, limit: f64, time: u64) -> Result<(Vec<OpenCandidate>, f64)> {
         let catalogue = self.catalogue;
         let count = catalogue.lattice.count();
@@ -80,8 +85,9 @@ impl BatchEvaluation<'_> {
         Ok((open, each))
     }
 
-    /// Generate test vectors that together exclude most open candidates at this limit. The first pass includes a vector
-    /// for the best row and its neighbors. Empty if the vectors are not worthwhile or memory is lacking.
+    /// Generate tailored test vectors that together exclude most candidates not yet excluded at this limit of the raw
+    /// score (Σ|e| or Σe²). The first pass (`time` 0) includes a vector for the best row. The result has no vectors if
+    /// they save no time or memory is lacking.
     pub(super) fn generate_tailored_vectors(
         &self,
         limit: f64,
@@ -141,7 +147,7 @@ impl BatchEvaluation<'_> {
         }
         let is_open: Vec<OpenCandidate> =
             open.into_iter().zip(is_open).filter_map(|(open, is_open)| is_open.then_some(open)).collect();
-        // The vectors were selected on this sample, so they leave more of other candidates open.
+        // The vectors were selected on this sample, so they exclude a smaller fraction of other candidates.
         let again = time + 1 < MAX_GENERATION_PASSES
             && !new_vectors.is_empty()
             && all(SELECTION_BIAS_FACTOR * is_open.len()) >= MIN_OPEN_CANDIDATES;
@@ -149,31 +155,33 @@ impl BatchEvaluation<'_> {
     }
 }
 
-/// Subsample at most `most` candidates, evenly spaced.
+/// Return at most `most` of the candidates, evenly spaced in the list.
 pub(super) fn subsample(all: &[OpenCandidate], most: usize) -> Vec<OpenCandidate> {
     let count = all.len().min(most);
     (0..count).map(|i| all[i * all.len() / count]).collect()
 }
 
-/// Maximum size of the sample for linearized vectors. Of a small grid one candidate in eight is sampled.
+/// Maximum number of candidates in the sample for linearized test vectors. One in eight candidates of a small grid is
+/// sampled.
 const MAX_LINEARIZED_SAMPLE: u64 = 1 << 19;
-/// Number of candidates of a small grid per sampled candidate.
+/// Ratio of the number of candidates of a small grid to the number in the sample for linearized test vectors.
 const LINEARIZED_SAMPLE_RATIO: u64 = 8;
-/// Number of candidates in a block of this sample.
+/// Number of consecutive candidates in a block of the sample for linearized test vectors.
 const LINEARIZED_SAMPLE_BLOCK: u64 = 8;
-/// Minimum number of exclusions per vector, and of open candidates for another vector. Building a vector costs as much
-/// as ten to twenty simulations.
+/// Minimum number of candidates of the grid that a linearized test vector must exclude. Also the minimum number not yet
+/// excluded for building another vector. Building a vector costs as much as ten to twenty simulations.
 const MIN_LINEARIZED_EXCLUSIONS: f64 = 32.0;
-/// Maximum number of vectors for the same orders of the output terms.
+/// Maximum number of linearized test vectors for the same orders of the output terms.
 const MAX_LINEARIZED_VECTORS: usize = 24;
-/// Maximum number of vectors in sequence that exclude too few candidates.
+/// Maximum number of linearized test vectors that exclude too few candidates, for the same orders of the output terms.
 const MAX_FAILED_VECTORS: usize = 6;
-/// Maximum memory of all vectors \[bytes\].
+/// Maximum memory of all linearized test vectors \[bytes\].
 const MAX_LINEARIZED_BYTES: u64 = 1 << 30;
 
 impl BatchEvaluation<'_> {
-    /// Generate vectors for each combination of orders of the output terms, which exclude the open candidates of a
-    /// sample. `None` if no vector is worthwhile or memory is lacking.
+    /// Generate linearized test vectors for each combination of orders of the output terms. They exclude candidates of
+    /// a sample that no bound excludes at this limit of the raw score (Σ|e| or Σe²). `None` if no vector saves time or
+    /// memory is lacking.
     pub(super) fn generate_linearized_vectors(&self, limit: f64) -> Result<Option<LinearizedVectors>> {
         let problem = &self.catalogue.problem;
         let mut tangents = problem.empty_linearized_vectors();
@@ -217,8 +225,8 @@ impl BatchEvaluation<'_> {
         Ok((tangents.len() > 0).then_some(tangents))
     }
 
-    /// Candidates in a sample of the grid that no bound excludes at this limit, and the number of candidates that each
-    /// represents.
+    /// Return columns and coefficients of the candidates in a sample of the grid that no bound excludes at this limit
+    /// of the raw score (Σ|e| or Σe²). Also return the number of candidates of the grid per sampled candidate.
     #[allow(clippy::cast_precision_loss)]
     fn sample_grid(&self, limit: f64) -> Result<(Vec<SolvedCandidate>, f64)> {
         let catalogue = self.catalogue;
@@ -253,8 +261,10 @@ impl BatchEvaluation<'_> {
         Ok((open, count as f64 / (sample_count * LINEARIZED_SAMPLE_BLOCK) as f64))
     }
 
-    /// Generate vectors for candidates with the same columns of the output. The first vector is built at the median of
-    /// the first coefficient. Then both halves of the candidates are processed likewise.
+    /// Generate linearized test vectors for candidates with the same output columns `own`. The first vector is built
+    /// for the candidate at the median of the first output coefficient. The candidates on both sides are then processed
+    /// likewise. `weight` is the number of candidates of the grid per sampled candidate, `room` the maximum number of
+    /// vectors.
     fn generate_for_own_columns(
         &self,
         tangents: &LinearizedVectors,

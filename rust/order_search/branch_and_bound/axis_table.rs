@@ -1,63 +1,72 @@
-//! Axis tables of one order of a slice: projections, coefficients and deviations from linearity.
+//! Tables along one order of a slice: projections, coefficients and deviations from linear interpolation.
 //!
-//! For each value of the order, û is its column x, orthogonal to the remaining columns of the slice and scaled to unit
-//! norm. Over an interval any quantity deviates from linear interpolation between the ends by at most one eighth of the
-//! squared length times the largest second difference: f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i −
-//! lo)(hi − i)/2.
+//! For each grid value of the order, x is the regressor column. The vector û is x made orthogonal to the fixed-order
+//! columns of the slice and scaled to unit norm. Let l be the linear interpolation of a quantity f between the ends of
+//! an interval. Then f deviates from l by at most one eighth of the squared length times the largest second difference.
+//! This follows from f_i − l_i = −Σ_j G_ij Δ²f_j with 0 ≤ G and Σ_j G_ij = (i − lo)(hi − i)/2.
 
 use crate::order_search::candidate::normal_equations::Normal;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, NO_INDEX};
 use crate::simd::LANE_COUNT;
 
-/// Vector of one value for each of [`LANE_COUNT`] test vectors.
+/// One value for each of [`LANE_COUNT`] test vectors.
 pub(super) type Wide = [f64; LANE_COUNT];
 pub(super) const ZERO_LANES: Wide = [0.0; LANE_COUNT];
 
-/// Products of a column x with test vectors t: ⟨t, x⟩ and g‖t‖, each as real and imaginary part.
+/// Products of a column x with a group of test vectors t: ⟨t, x⟩ and g‖t‖, each as real and imaginary part. Here g is
+/// the projection of Fᵀt on t, and F is the kernel matrix of x. For a column of another signal than the output, g is 0.
 pub(super) type VectorProducts = [Wide; 4];
 
-/// Largest values and second differences over an interval of 2^l values of an order.
+/// Maxima over one interval of an order, for one group of [`LANE_COUNT`] test vectors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
-    /// Largest second differences of ⟨t, û⟩ and of g‖t‖ along the axis. Here t is a test vector, û the normalized
-    /// column of this order, and g the projection of Fᵀt on t.
+    /// Four maxima over the interval of grid values. The first two are second differences of ⟨t, û⟩ and g‖t‖ along the
+    /// order. The third is ‖Fᵀt − g t‖. The fourth bounds the difference of Fᵀt − g t from its value for the
+    /// fixed-order output column. Here t is a test vector, and û is the column of the varying order, orthogonal to the
+    /// fixed-order columns and of unit norm. F is its kernel matrix, and g is the projection of Fᵀt on t.
     pub(super) second_differences: [Wide; 4],
 }
 
-/// Largest sums of coefficients over an interval of values.
+/// Maximum, over an interval of grid values of one order, of a sum of coefficient moduli.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct CoefficientSums {
-    /// Maximum over the interval of Σ|c|, where c are the coefficients of û.
+    /// Maximum over the interval of Σ|c|. Here c are the coefficients of a normalized column in terms of the regressor
+    /// column of its order and the fixed-order columns. The normalized column is orthogonal to the fixed-order columns
+    /// and has unit norm.
     pub(super) sum: f64,
 }
 
-/// Intervals of one length along an order.
+/// Maxima over all intervals of grid values of one length, along one order.
 pub(super) struct Level {
+    /// Largest sum of coefficient moduli, by interval of grid values.
     pub(super) coefficient_sums: Vec<CoefficientSums>,
-    /// Largest second differences of the coefficients of û on the remaining columns, k per interval.
+    /// Largest second differences of the coefficients of the normalized column (orthogonal to the fixed-order columns,
+    /// of unit norm) on the fixed-order columns. The entries are ordered by interval, then by fixed-order column.
     pub(super) mixed: Vec<f64>,
-    /// Nodes by interval, then by group of test vectors.
+    /// Maxima of quantities of the test vectors, by interval of grid values, then by group of test vectors.
     pub(super) nodes: Vec<Node>,
 }
 
-/// Columns of a slice whose orders do not vary.
+/// Regressor columns of a slice of the order grid whose orders do not vary.
 pub(super) struct RemainingColumns<'a> {
     pub(super) normal: &'a Normal,
     pub(super) test_vectors: &'a [TestVectors],
-    /// Positions of the remaining columns.
+    /// Column indices of the fixed-order columns in the bank of regressors.
     pub(super) columns: &'a [usize],
+    /// Inverse of the correlation matrix of the fixed-order columns, row-major k × k for k columns.
     pub(super) inverse: &'a [f64],
-    /// Trace of `inverse`.
+    /// Trace of `inverse`, at least 1.
     pub(super) trace: f64,
-    /// Rounding-error bound of a product of unit columns.
+    /// Rounding-error bound of the product of two unit-norm columns.
     pub(super) rounding: f64,
-    /// Index in `columns` of a column of the output itself, if there is one. Its coefficient and the coefficient of a
-    /// varying output column may cancel.
+    /// Index in `columns` of a column of the output, if there is one. A varying column may also belong to the output.
+    /// The coefficients of the two columns may then cancel.
     pub(super) partner: Option<usize>,
 }
 
 impl RemainingColumns<'_> {
-    /// Solve for the coefficients of a column on the remaining columns, given its products with them.
+    /// Compute the coefficients of the projection of a column on the fixed-order columns, given the inner products of
+    /// the column with them.
     pub(super) fn solve(&self, products: &[f64], out: &mut [f64]) {
         let k = self.columns.len();
         for (i, out) in out.iter_mut().enumerate() {
@@ -65,9 +74,9 @@ impl RemainingColumns<'_> {
         }
     }
 
-    /// Upper bound of ‖(Fᵀt − g t) − (Fₚᵀt − gₚ t)‖ for each test vector t of a group. F is the convolution matrix of
-    /// an output column, g the projection of Fᵀt on t, and Fₚ, gₚ belong to the remaining output column `partner`. The
-    /// bound is zero if `column` is not an output column or there is no partner.
+    /// Return an upper bound of ‖(Fᵀt − g t) − (Fₚᵀt − gₚ t)‖ for each test vector t of a group. F is the kernel matrix
+    /// of the output column `column`, and g the projection of Fᵀt on t. Fₚ and gₚ are the same quantities of the
+    /// fixed-order output column. The bound is 0 if `column` is not an output column or no fixed-order column is one.
     #[inline(always)]
     fn distance_to_partner(&self, record: usize, group: usize, column: usize) -> Wide {
         let probes = &self.test_vectors[record];
@@ -82,7 +91,8 @@ impl RemainingColumns<'_> {
         way
     }
 
-    /// Products ⟨t, x⟩ and g‖t‖ of a unit column x with a group of test vectors t, and ‖Fᵀt − g t‖.
+    /// Return the products ⟨t, x⟩ and g‖t‖ of a column x, scaled to unit norm, with a group of test vectors t, and ‖Fᵀt
+    /// − g t‖. F is the kernel matrix of x, and g is the projection of Fᵀt on t.
     #[inline(always)]
     pub(super) fn vector_products(&self, record: usize, group: usize, column: usize) -> (VectorProducts, Wide) {
         let probes = &self.test_vectors[record];
@@ -106,25 +116,38 @@ impl RemainingColumns<'_> {
     }
 }
 
-/// Tables along one order of a slice.
+/// Tables along one varying order of a slice of the order grid. For each grid value, x is the regressor column, and û
+/// is x made orthogonal to the fixed-order columns and scaled to unit norm.
 pub(super) struct AxisTable {
+    /// Index of the regressor column in the bank of regressors, by grid value.
     pub(super) columns: Vec<usize>,
-    /// Inverse norm of each column x after projection, which scales it to û.
+    /// Inverse norm, by grid value, of the regressor column (of unit norm) after projection orthogonal to the
+    /// fixed-order columns.
     pub(super) scale: Vec<f64>,
+    /// Product of the output with the normalized column (orthogonal to the fixed-order columns, of unit norm), by grid
+    /// value.
     pub(super) target: Vec<f64>,
-    /// Products of each column with the remaining columns, k per value.
+    /// Products of the regressor column (of unit norm) with the fixed-order columns, by grid value, then by fixed-order
+    /// column.
     pub(super) shared: Vec<f64>,
+    /// Coefficients, with the opposite sign, of the normalized column (orthogonal to the fixed-order columns, of unit
+    /// norm) on the fixed-order columns. Ordered by grid value, then by fixed-order column.
     pub(super) mixed: Vec<f64>,
-    /// Sum of the coefficient of û on the remaining output column `partner` and its coefficient on x. Empty without a
-    /// partner.
+    /// Negative sum, by grid value, of two coefficients of the normalized column (orthogonal to the fixed-order
+    /// columns, of unit norm). They belong to the fixed-order output column and to the regressor column itself if it is
+    /// an output column. The second is converted to the scale of the first. Empty if no fixed-order column belongs to
+    /// the output.
     pub(super) paired: Vec<f64>,
-    /// Products with test vectors, by value, then by group of test vectors.
+    /// Products of the normalized column (orthogonal to the fixed-order columns, of unit norm) with the test vectors,
+    /// by grid value, then by group of [`LANE_COUNT`] test vectors.
     pub(super) vector_products: Vec<VectorProducts>,
+    /// Maxima over all intervals of 1, 2, 4, … grid values, by interval length.
     pub(super) levels: Vec<Level>,
 }
 
 impl AxisTable {
-    /// Build the tables for these columns. `None` if a column is nearly a combination of the remaining columns.
+    /// Build the tables for these columns. `None` if a column is nearly a linear combination of the fixed-order
+    /// columns, or if a product is not finite.
     #[inline(always)]
     pub(super) fn new(others: &RemainingColumns<'_>, columns: Vec<usize>) -> Option<Self> {
         let (k, n, normal) = (others.columns.len(), columns.len(), others.normal);
@@ -194,7 +217,7 @@ impl AxisTable {
                 rests.push([rest, way]);
             }
         }
-        // Reject NaN and infinity, whose multiple by 0 is NaN.
+        // Reject NaN and infinity: their product with 0 is NaN.
         if sound.iter().any(|v| v.is_nan()) {
             return None;
         }
@@ -204,7 +227,8 @@ impl AxisTable {
         Some(side)
     }
 
-    /// Build the levels of intervals with 1, 2, 4, … values, for `k` remaining columns.
+    /// Compute the maxima over intervals of 1, 2, 4, … grid values, for `k` fixed-order columns. `rests` contains the
+    /// norms of [`Node`] that are not second differences, by grid value, then by group of test vectors.
     #[inline(always)]
     fn build(&mut self, k: usize, groups: usize, rests: &[[Wide; 2]]) {
         let n = self.columns.len();
@@ -257,8 +281,8 @@ impl AxisTable {
                 let start = level.mixed.len();
                 level.mixed.extend_from_slice(&below.mixed[left * k..(left + 1) * k]);
                 if right < halves {
-                    // The last value of the left half and the first of the right half become inner values, except at
-                    // the end.
+                    // The last value of the left half and the first value of the right half become interior values,
+                    // except at the end.
                     let joint = right * length;
                     let inner = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
                     all.sum = all.sum.max(below.coefficient_sums[right].sum);
@@ -301,7 +325,7 @@ impl AxisTable {
     }
 }
 
-/// All groups of test vectors as (record, group number).
+/// Iterate over all groups of test vectors as pairs (record, group).
 pub(super) fn vector_groups(probes: &[TestVectors]) -> impl Iterator<Item = (usize, usize)> + '_ {
     probes.iter().enumerate().flat_map(|(r, probes)| (0..probes.groups).map(move |g| (r, g)))
 }

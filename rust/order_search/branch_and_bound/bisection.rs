@@ -21,23 +21,25 @@ use crate::parallel::{pool, Stop};
 use crate::regressors::Record;
 use crate::simd::{self, LANE_COUNT};
 
-/// Minimum number of candidates of a slice for which axis tables are worthwhile.
+/// Minimum number of candidates of a slice of the order grid for which building axis tables saves time.
 pub(crate) const MIN_SLICE_CANDIDATES: u64 = 4096;
-/// Initial level of a box: intervals of 32 values.
+/// Base-2 logarithm of the initial number of grid values along each side of a box of orders.
 const INITIAL_BOX_LEVEL: usize = 5;
-/// Sum of the two levels of a box at or below which its candidates are screened one by one.
+/// Sum of the base-2 logarithms of both side lengths of a box of orders at or below which its candidates are screened
+/// one by one.
 const SCREENING_LEVEL_SUM: usize = 4;
 
-/// Constants of branch and bound, shared by all boxes of a search.
+/// Constants of branch and bound that all boxes of a search share.
 pub(crate) struct BranchAndBound {
     common: SearchConstants,
+    /// Rounding-error bound of the product of two unit-norm columns.
     rounding: f64,
 }
 
 impl BranchAndBound {
-    /// True if branch and bound applies to a search and is worthwhile. It requires zero initial conditions with ranking
-    /// by simulation, or ranking by squared equation error. It also requires coefficients from the normal equations,
-    /// and a large slice.
+    /// Return true if branch and bound applies to a search and saves time. Candidates must be ranked by simulation from
+    /// zero initial conditions, or by squared equation error. Their coefficients must follow from the normal equations,
+    /// and some slice must have at least [`MIN_SLICE_CANDIDATES`] candidates.
     pub(crate) fn is_worthwhile(catalogue: &CandidateIndex<'_>) -> bool {
         let (options, lattice) = (&catalogue.options, &*catalogue.lattice);
         options.pruning
@@ -52,11 +54,11 @@ impl BranchAndBound {
             })
     }
 
-    /// Compute the shared constants. `None` without a dual bound. Runs on the current thread pool.
+    /// Compute the constants of a search. `None` if there is no dual bound. Runs on the current thread pool.
     pub(crate) fn new(catalogue: &CandidateIndex<'_>) -> Option<Self> {
         let problem = &catalogue.problem;
         let (probes, normal) = (test_vectors_of(problem)?, problem.box_equations()?);
-        // A column may have its whole size in rows of weight 1, where it is the difference of large numbers.
+        // A column may differ from 0 only in rows of weight 1, where it is the difference of large numbers.
         #[allow(clippy::cast_precision_loss)]
         let (samples, weights) = (problem.samples() as f64, catalogue.options.weights() as f64);
         let rounding = f64::EPSILON * samples * weights;
@@ -74,6 +76,8 @@ impl BranchAndBound {
         Some(Self { common, rounding })
     }
 
+    /// Return the columns of a slice of the order grid whose orders do not vary, with the inverse of their correlation
+    /// matrix. `None` if there is no dual bound.
     fn remaining_columns<'a>(
         &self,
         catalogue: &'a CandidateIndex<'_>,
@@ -94,7 +98,8 @@ impl BranchAndBound {
     }
 }
 
-/// Test vectors of a search. Empty if candidates are ranked by squared equation error, `None` if no bound exists.
+/// Return the test vectors of a search, by record. Empty if candidates are ranked by squared equation error, `None` if
+/// there is no dual bound.
 fn test_vectors_of(problem: &Problem) -> Option<&[TestVectors]> {
     match (&problem.residual_sums, &problem.bound) {
         (Some(_), _) => Some(&[]),
@@ -102,9 +107,9 @@ fn test_vectors_of(problem: &Problem) -> Option<&[TestVectors]> {
     }
 }
 
-/// Screen candidates `lo … hi − 1` of a slice against a limit. Return the candidates that are not excluded, the number
-/// of singular candidates outside excluded boxes, and the number of candidates in excluded boxes. `None` if no box of
-/// this slice has a bound.
+/// Screen candidates `lo … hi − 1` of a slice of the order grid against a limit of the raw score (Σ|e| or Σe²). Return
+/// the candidates that are not excluded, the indices of singular candidates outside excluded boxes, and the number of
+/// candidates in excluded boxes. `None` if no box of this slice has a bound.
 pub(crate) fn screen_slice(
     catalogue: &CandidateIndex<'_>,
     boxes: &BranchAndBound,
@@ -115,7 +120,7 @@ pub(crate) fn screen_slice(
     simd::dispatch_simd(SliceScreening { catalogue, boxes, slab, lo, hi, limit })
 }
 
-/// SIMD task of [`screen_slice`].
+/// Arguments of [`screen_slice`] as a task that is compiled for the widest vector instructions available.
 struct SliceScreening<'a> {
     catalogue: &'a CandidateIndex<'a>,
     boxes: &'a BranchAndBound,
@@ -201,13 +206,14 @@ impl simd::SimdKernel for SliceScreening<'_> {
     }
 }
 
-/// Column of every term at the first candidate of a slice.
+/// Return the column index of every term at the first candidate of a slice of the order grid.
 #[inline(always)]
 fn first_columns(catalogue: &CandidateIndex<'_>, slab: &traversal::GridSlice) -> Vec<usize> {
     slab.digits.iter().enumerate().map(|(term, &digit)| catalogue.columns(slab.block, term)[digit]).collect()
 }
 
-/// Columns of the terms whose orders do not vary, and the inverse of their correlation matrix.
+/// Return the column indices of the terms whose orders do not vary in a slice of the order grid, and the inverse of
+/// their correlation matrix. `None` without a dual bound, or if the matrix is singular.
 #[inline(always)]
 fn factor_remaining_columns(
     catalogue: &CandidateIndex<'_>,
@@ -221,7 +227,8 @@ fn factor_remaining_columns(
     Some((others, inverse))
 }
 
-/// Build the tables of some rows of a slice.
+/// Build the tables of some rows of a slice of the order grid. `None` if a varying column is nearly a combination of
+/// the fixed-order columns.
 #[inline(always)]
 fn build_slice_tables<'a>(
     catalogue: &CandidateIndex<'_>,
@@ -237,7 +244,8 @@ fn build_slice_tables<'a>(
     Some(SliceTables::new(others, &boxes.common, sides))
 }
 
-/// Inverse of the correlation matrix of some columns.
+/// Return the inverse of the correlation matrix of some columns, row-major. `product` returns the correlation of two
+/// columns.
 fn inverse_correlation(columns: &[usize], product: impl Fn(usize, usize) -> f64) -> Result<Vec<f64>> {
     if columns.is_empty() {
         return Ok(Vec::new());
@@ -247,31 +255,33 @@ fn inverse_correlation(columns: &[usize], product: impl Fn(usize, usize) -> f64)
     small::inverse(&matrix, columns.len())
 }
 
-/// Lower bound of the error that holds for every candidate of a box.
+/// Lower bound of the error that holds for every candidate of a box of orders.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoxBound {
-    /// First candidate. The box contains the candidates `first + i·stride + j` with i below `rows` and j below
-    /// `values`.
+    /// Index of the first candidate. The box contains the candidates `first + i·stride + j` with i below `rows` and j
+    /// below `values`.
     pub first: u64,
-    /// Number of rows i.
+    /// Number of rows, indexed by i.
     pub rows: u64,
-    /// Number of candidates j in a row.
+    /// Number of candidates in a row, indexed by j.
     pub values: u64,
-    /// Difference of the indices of two rows.
+    /// Difference of the candidate indices of two adjacent rows.
     pub stride: u64,
-    /// Lower bound of the raw errors Σ|e| or Σe² of all candidates. Initial conditions are zero.
+    /// Lower bound of the raw error (Σ|e| or Σe², from zero initial conditions) of every candidate of the box of
+    /// orders. 0 if nothing is proved.
     pub bound: f64,
 }
 
-/// Lower bound of every box of the slice that contains a candidate. Boxes of all sizes down to single candidates are
-/// returned, for output errors in either norm or for squared equation errors.
+/// Return a lower bound for every box of the slice of the order grid that contains candidate `index`. The boxes have
+/// all sizes down to single candidates. The bounds apply to output errors in either norm, or to squared equation
+/// errors.
 ///
-/// Empty if no box of the slice has a bound, or if the grid has no slices: the fastest signal has several terms, or no
-/// other order varies.
+/// Empty if no box of the slice of the order grid has a bound, or if there is no slice. A slice exists if the fastest
+/// varying signal has a single term and the order of another signal varies.
 ///
 /// # Errors
-/// An option out of range, signals that the records lack, or too little memory
-/// ([`crate::order_search::batches::search`]).
+/// The errors of [`crate::order_search::batches::search`]: an option out of range, signals that the records lack, or
+/// too little memory.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -319,12 +329,12 @@ pub fn box_bounds(records: &[Record], lattice: &OrderGrid, options: &Options, in
     })
 }
 
-/// Candidates `lo … hi − 1` of the slice containing `index` that no bound excludes. They include all whose raw error is
-/// at most `limit`. Empty if [`box_bounds`] is empty.
+/// Return the candidates of the index range in the slice of the order grid containing `index` that no bound excludes.
+/// They include all candidates whose raw error (Σ|e| or Σe²) is at most `limit`. Empty if [`box_bounds`] is empty.
 ///
 /// # Errors
-/// An option out of range, signals that the records lack, or too little memory
-/// ([`crate::order_search::batches::search`]).
+/// The errors of [`crate::order_search::batches::search`]: an option out of range, signals that the records lack, or
+/// too little memory.
 pub fn open_candidates(
     records: &[Record],
     lattice: &OrderGrid,
@@ -340,8 +350,8 @@ pub fn open_candidates(
     })
 }
 
-/// Apply a function to the slice that contains a candidate, with all test vectors built. Empty if the slice has no
-/// boxes.
+/// Apply `work` to the slice of the order grid that contains candidate `index`, after all test vectors are built.
+/// Return an empty list if there is no such slice or `work` returns `None`.
 fn with_slice<T>(
     records: &[Record],
     lattice: &OrderGrid,
@@ -380,7 +390,8 @@ mod tests {
     use crate::order_search::grid::TermAxis;
     use crate::order_search::options::Norm;
 
-    /// Two joint angles and a link deflection under steps, with closely and widely spaced orders.
+    /// Return record and order grid of a test case: two joint angles and a link deflection under steps, with closely or
+    /// widely spaced orders.
     fn problem(case: u32) -> Result<(Record, OrderGrid)> {
         let m = 150;
         let time = |k: i32| f64::from(k) * 0.03;
@@ -401,14 +412,14 @@ mod tests {
         Ok((Record::from_rows(0.03, signals, None)?, OrderGrid::new(0, &[1.7], &axes, |s| s == 2)?))
     }
 
-    /// Bilinear function with these corner values at −1 ≤ s, t ≤ 1.
+    /// Return the value at (s, t) of the bilinear function with these values at the corners of −1 ≤ s, t ≤ 1.
     fn interpolate_bilinear(corners: [f64; 4], (s, t): (f64, f64)) -> f64 {
         let shares = [(1.0 - s) * (1.0 - t), (1.0 + s) * (1.0 - t), (1.0 - s) * (1.0 + t), (1.0 + s) * (1.0 + t)];
         corners.iter().zip(shares).map(|(c, share)| 0.25 * c * share).sum()
     }
 
-    /// Deviations of ⟨t, w⟩ and the denominator of a candidate from their bilinear approximations over the box,
-    /// relative to the proved bounds. One value for each of [`LANE_COUNT`] test vectors.
+    /// Return the deviations of products and denominators of a candidate from their bilinear approximations over the
+    /// box of orders, relative to the proved bounds. Each has one value per test vector.
     fn relative_deviations(whole: &CornerValues, one: &CornerValues, place: (f64, f64)) -> [Wide; 2] {
         let corners = |of: &dyn Fn(usize) -> f64| interpolate_bilinear(std::array::from_fn(of), place);
         let apart = |part: usize, n: usize| one.values[0][part][n] - corners(&|c| whole.values[c][part][n]);

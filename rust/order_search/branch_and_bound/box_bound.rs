@@ -1,13 +1,17 @@
 //! Lower bound of the errors of all candidates in a box of two orders.
 //!
-//! û and v̂ are the two varying columns, orthogonal to the remaining columns and scaled to unit norm. The coefficients
-//! on them solve p + B q = û·y, B p + q = v̂·y with B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)). They are computed
-//! for all candidates, so their deviation from bilinear functions over a box is known exactly. Over a box, −1 ≤ s, t ≤
-//! 1, every other quantity is a linear interpolation between the ends plus a bounded remainder. The test-vector
-//! products ⟨t, w⟩, the denominator 1 − Σ c g and the coefficients are then bilinear in s and t up to remainders of
-//! second order. A bound of bilinear functions at the corners holds over the box: |⟨t, w⟩| is at least its projection
-//! on one direction, which is bilinear. Subtracting λ times moduli of bilinear functions gives a function that is
-//! concave in s and in t, with its minimum at a corner.
+//! Here x_u and x_v are the regressor columns of the two varying orders. The vectors û and v̂ are these columns, made
+//! orthogonal to the fixed-order columns and scaled to unit norm. Their coefficients p and q solve p + B q = û·y, B p +
+//! q = v̂·y with B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)). The coefficients are computed for all candidates, so
+//! their deviation from bilinear functions over a box is known exactly.
+//!
+//! The coordinates −1 ≤ s, t ≤ 1 describe the position in a box. Along each coordinate, every other quantity is a
+//! linear interpolation between the ends plus a bounded remainder. The bound needs the product ⟨t, w⟩ of a test vector
+//! t with the equation error w, and the denominator 1 − Σ c g. Here c are coefficients, and g is the projection of Fᵀt
+//! on t for the kernel matrix F of an output column. All of them are bilinear in the coordinates up to remainders of
+//! second order. The modulus |⟨t, w⟩| is at least its projection on one direction, which is bilinear. Subtracting a
+//! multiple of moduli of bilinear functions gives a function that is concave in each coordinate. Its minimum over the
+//! box is therefore at a corner.
 
 use std::ops::Range;
 
@@ -18,14 +22,16 @@ use crate::order_search::dual_bound::test_vectors::NO_INDEX;
 use crate::order_search::options::Norm;
 use crate::simd::LANE_COUNT;
 
-/// Factor of the rounding-error bound of coefficients. The bound is this factor times the trace of the inverse
-/// correlation matrix times the squared number of terms. It is far above the error of the elimination.
+/// Factor of the rounding-error bound of coefficients, far above the error of the elimination. The other factors are
+/// the trace of the inverse correlation matrix, the squared number of terms, and the sum of moduli of output and
+/// coefficients.
 const ELIMINATION_ERROR: f64 = 16.0 * f64::EPSILON;
 
-/// Value of 1 − B² at or below which û and v̂ are numerically collinear.
+/// Value of 1 − B² at or below which the two varying columns are numerically collinear. B is the inner product of these
+/// columns after projection orthogonal to the fixed-order columns and scaling to unit norm.
 const COLLINEARITY_TOLERANCE: f64 = 1e-12;
 
-/// Maximum number of remaining columns of a slice.
+/// Maximum number of regressor columns of a slice of the order grid whose orders do not vary.
 pub(super) const MAX_REMAINING_COLUMNS: usize = 16;
 
 /// Constants shared by the boxes of all slices.
@@ -33,19 +39,22 @@ pub(super) struct SearchConstants {
     pub(super) norm: Norm,
     /// True if candidates are ranked by their squared equation error.
     pub(super) ranks_equation_error: bool,
-    /// Largest moduli of ⟨t, x⟩ and g‖t‖ over all unit columns, by group of test vectors.
+    /// For each group of [`LANE_COUNT`] test vectors t, the maxima of |⟨t, x⟩| and |g|‖t‖ over all unit-norm columns x.
+    /// Here g is the projection of Fᵀt on t, and F is the kernel matrix of x.
     pub(super) max_moduli: Vec<[Wide; 2]>,
-    /// Largest rounding-error bound of a unit column, by record.
+    /// For each record, the largest rounding-error bound of ⟨t, x⟩ over all unit-norm columns x.
     pub(super) rounding: Vec<f64>,
-    /// Norm of the output over all records.
+    /// Euclidean norm of the output over all records.
     pub(super) size: f64,
+    /// Product of `size` and the square root of the largest row weight of the normal equations.
     pub(super) weighted_size: f64,
-    /// Ratio of the largest to the smallest inverse norm of the columns.
+    /// One plus the ratio of the largest to the smallest inverse column norm.
     pub(super) ratio: f64,
 }
 
 impl SearchConstants {
-    /// Compute the constants for an output of this norm, and rows weighted by at most the square of `weight`.
+    /// Compute the constants. `size` is the Euclidean norm of the output over all records, and `weight` the square root
+    /// of the largest row weight of the normal equations.
     pub(super) fn new(
         others: &RemainingColumns<'_>,
         norm: Norm,
@@ -69,7 +78,8 @@ impl SearchConstants {
             })
             .collect();
         let sizes = || others.normal.inverse().iter().copied().filter(|&i| i > 0.0);
-        // A rounding error in one coefficient also counts for another one and for itself.
+        // In a sum of two coefficients, the error of one is scaled by the ratio of column norms. The term 1 is for the
+        // other.
         let ratio = 1.0 + sizes().fold(0.0, f64::max) / sizes().fold(f64::INFINITY, f64::min);
         let most = |rounding: &[f64]| -> f64 {
             rounding.iter().zip(others.normal.inverse()).map(|(r, i)| r * i).fold(0.0, f64::max)
@@ -86,7 +96,8 @@ impl SearchConstants {
     }
 }
 
-/// Interval of values of one order: node `at` of a level of the bisection tree.
+/// Interval of consecutive grid values of one order. It has at most 2^`level` values and starts at value number
+/// `at`·2^`level`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Interval {
     pub(super) level: usize,
@@ -94,14 +105,15 @@ pub(super) struct Interval {
 }
 
 impl Interval {
-    /// First and last value of the interval, out of n values.
+    /// Return the indices of the first and the last value of the interval, for an order with `n` grid values.
     #[inline(always)]
     pub(super) fn ends(self, n: usize) -> (usize, usize) {
         (self.at << self.level, n.min((self.at + 1) << self.level) - 1)
     }
 }
 
-/// Linear approximation over an interval: midpoint, slope and remainder.
+/// Linear approximation of a quantity over an interval: value at the midpoint, half the difference of the end values,
+/// and a bound of the deviation.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LinearApproximation {
     pub(super) middle: f64,
@@ -110,44 +122,55 @@ pub(super) struct LinearApproximation {
 }
 
 impl LinearApproximation {
+    /// Return the approximation from the values at both ends and a bound of the deviation.
     #[inline(always)]
     pub(super) fn new(first: f64, last: f64, remainder: f64) -> Self {
         Self { middle: (first + last) / 2.0, slope: (last - first) / 2.0, remainder }
     }
 }
 
-/// Coefficients of 1, s, t, st of the bilinear function with these values at (−1, −1), (1, −1), (−1, 1), (1, 1).
+/// Return the coefficients of 1, s, t and st of the bilinear function with these values at (s, t) = (−1, −1), (1, −1),
+/// (−1, 1), (1, 1).
 #[inline(always)]
 fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
     [(a + b + c + d) / 4.0, ((b + d) - (a + c)) / 4.0, ((c + d) - (a + b)) / 4.0, ((a + d) - (b + c)) / 4.0]
 }
 
-/// Quantities shared by all candidates of a box.
+/// Quantities shared by all candidates of a box of orders. The coefficients p and q belong to the two varying columns,
+/// made orthogonal to the fixed-order columns and scaled to unit norm.
 pub(super) struct BoxQuantities {
-    /// Row and value index of the corners.
+    /// Row of the slice of the order grid and index within the row, for each of the four corners.
     pub(super) at: [(usize, usize); 4],
-    /// One eighth of the squared length of each side.
+    /// One eighth of the squared length of each side, with the length in grid increments.
     pub(super) wide: [f64; 2],
-    /// Coefficient p at the corners.
+    /// Coefficient p of the first varying column at the four corners.
     pub(super) ps: [f64; 4],
+    /// Coefficient q of the second varying column at the four corners.
     pub(super) qs: [f64; 4],
+    /// Upper bounds over the box of orders of |p| and |q|, with the coefficients p and q of the two varying columns.
     pub(super) most: [f64; 2],
-    /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions.
+    /// Largest deviations of (p + q)/2 and (p − q)/2 over the box of orders from the bilinear functions with the same
+    /// corner values. Here p and q are the coefficients of the two varying columns. The deviations are 0 if candidates
+    /// are ranked by equation error, whose bound does not need them.
     pub(super) bilinear_deviation: [f64; 2],
-    /// Two sums of moduli: coefficients of s and st in the bilinear form of p, and coefficients of t and st in the form
-    /// of q. They bound the curvature of p times a linear function of s, and of q times a linear function of t.
+    /// Bounds of the curvature of p times a linear function of s, and of q times a linear function of t. Here −1 ≤ s, t
+    /// ≤ 1 are the coordinates in the box of orders, and p and q are the coefficients of the two varying columns. The
+    /// first bound sums the moduli of the coefficients of s and st in the bilinear form of p. The second sums those of
+    /// t and st in the form of q.
     pub(super) mixed_slopes: [f64; 2],
-    /// Upper bound over the box of the part of ‖y‖² that û and v̂ explain. Computed only if candidates are
-    /// ranked by equation error.
+    /// Upper bound over the box of the part of the squared output norm that the two varying columns explain. It is 0
+    /// unless candidates are ranked by equation error.
     pub(super) explained: f64,
-    /// Sum of the moduli of output and coefficients.
+    /// Upper bound of the sum of the weighted output norm and the moduli of all coefficients.
     pub(super) all: f64,
+    /// Rounding-error bound of one coefficient of a candidate.
     pub(super) rounding: f64,
 }
 
 impl BoxQuantities {
-    /// Deviation from a bilinear function of p times the first quantity plus q times the second, each linear along its
-    /// side.
+    /// Return an upper bound of the deviation of p a + q b from a bilinear function over the box of orders. Here p and
+    /// q are the coefficients of the two varying columns. The quantities a and b each depend on one of the two orders,
+    /// and are given by linear approximations.
     #[inline(always)]
     pub(super) fn remainder(&self, [a, b]: [LinearApproximation; 2]) -> f64 {
         let bent = self.mixed_slopes[0] * a.slope.abs() + self.mixed_slopes[1] * b.slope.abs();
@@ -160,46 +183,61 @@ impl BoxQuantities {
     }
 }
 
-/// Moduli of the coefficients of the remaining columns at the corners of a box, and their deviation from bilinear
-/// functions.
+/// Moduli of the coefficients of the fixed-order columns at the corners of a box of orders, and bounds of the deviation
+/// of the coefficients from bilinear functions.
 pub(super) struct Moduli {
+    /// Modulus of the coefficient of each fixed-order column at the four corners.
     others: [[f64; 4]; MAX_REMAINING_COLUMNS],
+    /// Bound of the deviation over the box of orders of the coefficient of each fixed-order column from a bilinear
+    /// function, with its rounding error.
     rests: [f64; MAX_REMAINING_COLUMNS],
-    /// Sum of two coefficients at each corner: of the remaining output column `partner`, and of the varying output
-    /// column. The two may cancel.
+    /// Modulus, at each corner, of the sum of two coefficients that may cancel. They belong to the fixed-order output
+    /// column and to the varying output column.
     sums: [f64; 4],
+    /// Bound of the deviation over the box of orders of the sum of the two coefficients of `sums` from a bilinear
+    /// function, with its rounding error.
     sums_rest: f64,
 }
 
-/// Products of a group of test vectors at the corners of a box, and their deviations from bilinear functions.
+/// Inner products and denominators of one group of [`LANE_COUNT`] test vectors at the corners of a box of orders, and
+/// their deviations from bilinear functions.
 pub(super) struct CornerValues {
-    /// Products ⟨t, w⟩ and denominators ‖t‖(1 − Σ c g) at the corners: real and imaginary part of each.
+    /// Products ⟨t, w⟩ of the test vectors t with the equation error w, and denominators ‖t‖(1 − Σ c g), by corner.
+    /// Each is given as real and imaginary part. The sum is over the output columns with coefficient c and kernel
+    /// matrix F, and g is the projection of Fᵀt on t.
     pub(super) values: [[Wide; 4]; 4],
-    /// Slack Σ|c|‖Fᵀt − g t‖ of the denominator at the corners.
+    /// Slack Σ|c|‖Fᵀt − g t‖ at the corners, by which the norm in the denominator of the bound may exceed ‖t‖|1 − Σ c
+    /// g|. The sum is over the output columns with coefficient c and kernel matrix F. Here t is a test vector, and g is
+    /// the projection of Fᵀt on t.
     pub(super) slack: [Wide; 4],
-    /// Deviations from bilinear functions of ⟨t, w⟩, and of denominator and slack together.
+    /// Bounds of the deviation from bilinear functions over the box of orders. The first is for the products of test
+    /// vectors with the equation error. The second is for the denominators of the bound with their slack.
     pub(super) remainders: [Wide; 2],
 }
 
-/// Tables of one slice from which its boxes are bounded.
+/// Tables of one slice of the order grid, from which the bounds of its boxes of orders are computed.
 pub(super) struct SliceTables<'a> {
     pub(super) others: &'a RemainingColumns<'a>,
     pub(super) common: &'a SearchConstants,
-    /// The order that changes from row to row, and the order along a row.
+    /// Tables along the two varying orders. The first order changes from row to row, the second within a row.
     pub(super) sides: [AxisTable; 2],
-    /// Index of the side that varies the order of an output term, if there is one.
+    /// Index in `sides` of the order that belongs to terms of the output. `None` if neither order does.
     own: Option<usize>,
-    /// Coefficients of the output on the remaining columns.
+    /// Coefficients of the projection of the output on the fixed-order columns.
     pub(super) base_coefficients: Vec<f64>,
-    /// Sum of squares of the output's residual after projection on the remaining columns.
+    /// Squared norm of the residual of the output after projection on the fixed-order columns.
     unexplained: f64,
-    /// Products ⟨t, y⟩ of test vectors t with this residual y, and norms ‖t‖, by group.
+    /// Product ⟨t, r⟩ and denominator ‖t‖(1 − Σ c g), by group of test vectors t. Here r is the residual of the output
+    /// after projection on the fixed-order columns. The sum is over these columns with coefficient c and kernel matrix
+    /// F, and g is the projection of Fᵀt on t.
     base: Vec<VectorProducts>,
-    /// Norms ‖Fᵀt − g t‖ of the remaining columns, k per group.
+    /// Norms ‖Fᵀt − g t‖ for the fixed-order columns with kernel matrix F and the test vectors t, scaled by the inverse
+    /// column norm. Here g is the projection of Fᵀt on t. The order is by group of test vectors, then by column.
     rests: Vec<Wide>,
 }
 
 impl<'a> SliceTables<'a> {
+    /// Build the tables of a slice of the order grid from the tables along its two varying orders.
     #[inline(always)]
     pub(super) fn new(others: &'a RemainingColumns<'a>, common: &'a SearchConstants, sides: [AxisTable; 2]) -> Self {
         let k = others.columns.len();
@@ -238,7 +276,8 @@ impl<'a> SliceTables<'a> {
         }
     }
 
-    /// Compute the coefficients of all candidates of some rows.
+    /// Compute the coefficients of the two varying columns for all candidates in these rows of the slice of the order
+    /// grid, and store them in `strip`.
     #[inline(always)]
     pub(super) fn compute_coefficients(&self, strip: &mut RowCoefficients, rows: Range<usize>) {
         let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
@@ -281,7 +320,8 @@ impl<'a> SliceTables<'a> {
         }
     }
 
-    /// Quantities shared by all candidates of a box. `None` if the box has no bound.
+    /// Compute the quantities shared by all candidates of a box of orders. `None` if the two varying columns may be
+    /// collinear in the box, because no bound exists then.
     #[inline(always)]
     pub(super) fn box_quantities(&self, strip: &RowCoefficients, [su, sv]: [Interval; 2]) -> Option<BoxQuantities> {
         let [u, v] = &self.sides;
@@ -335,8 +375,8 @@ impl<'a> SliceTables<'a> {
         })
     }
 
-    /// Return a lower bound of the raw score that holds for every candidate of a box. The sum over records stops once
-    /// it exceeds the limit.
+    /// Return a lower bound of the raw score (Σ|e| or Σe²) that holds for every candidate of a box of orders. The sum
+    /// over records stops once it exceeds `limit`.
     #[inline(always)]
     pub(super) fn bound(&self, both: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
         if self.common.ranks_equation_error {
@@ -346,7 +386,8 @@ impl<'a> SliceTables<'a> {
         }
     }
 
-    /// Lower bound of the squared equation errors.
+    /// Return a lower bound of the sum of squared equation errors of every candidate of the box of orders, 0 if nothing
+    /// is proved.
     #[inline(always)]
     fn equation_error_bound(&self, cell: &BoxQuantities) -> f64 {
         let rounding = self.others.rounding * cell.all + to_f64(self.others.columns.len() + 2) * cell.rounding;
@@ -359,7 +400,8 @@ impl<'a> SliceTables<'a> {
         }
     }
 
-    /// Lower bound of the output errors.
+    /// Return a lower bound of the raw output error (Σ|e| or Σe²) of every candidate of the box of orders. The sum over
+    /// records stops once it exceeds `limit`.
     #[inline(always)]
     fn output_error_bound(&self, both: [Interval; 2], cell: &BoxQuantities, limit: f64) -> f64 {
         let moduli = self.moduli(both, cell);
@@ -370,7 +412,7 @@ impl<'a> SliceTables<'a> {
                 let together = self.joint_partner(both, cell, &moduli, group);
                 let CornerValues { values, slack, remainders: rough } =
                     self.corner_values(both, cell, &moduli, (r, group), together);
-                // All corners are projected on the direction of the midpoint.
+                // All corner values are projected on the direction of their sum.
                 let mut along = [ZERO_LANES; 2];
                 for n in 0..LANE_COUNT {
                     let re = values[0][0][n] + values[1][0][n] + values[2][0][n] + values[3][0][n];
@@ -385,7 +427,7 @@ impl<'a> SliceTables<'a> {
                     for n in 0..LANE_COUNT {
                         let response = value[0][n] * along[0][n] + value[1][n] * along[1][n] - rough[0][n];
                         let size = (value[2][n] * value[2][n] + value[3][n] * value[3][n]).sqrt();
-                        // A hair more, for the rounding of the divisor and of the score itself.
+                        // Margin for the rounding errors of the divisor and of the score.
                         let bound = response / ((size + slack[n] + rough[1][n]) * (1.0 + probes.unit));
                         // Neither NaN nor an overflow proves anything.
                         let bound = if bound > 0.0 && bound < f64::MAX { bound } else { 0.0 };
@@ -407,7 +449,8 @@ impl<'a> SliceTables<'a> {
         sum
     }
 
-    /// Moduli of the coefficients of the remaining columns over a box.
+    /// Compute the moduli of the coefficients of the fixed-order columns at the corners of a box of orders. Also bound
+    /// the deviation of these coefficients from bilinear functions.
     #[inline(always)]
     pub(super) fn moduli(&self, [su, sv]: [Interval; 2], cell: &BoxQuantities) -> Moduli {
         let k = self.others.columns.len();
@@ -442,15 +485,15 @@ impl<'a> SliceTables<'a> {
         Moduli { others, rests, sums, sums_rest }
     }
 
-    /// Return the index of the remaining output column if a varying column also belongs to the output. The coefficients
-    /// of the two columns may cancel.
+    /// Return the index of a fixed-order column of the output if a varying column also belongs to the output. `None`
+    /// otherwise. The coefficients of the two columns may cancel.
     #[inline(always)]
     fn partner(&self) -> Option<usize> {
         self.others.partner.filter(|_| self.own.is_some())
     }
 
-    /// Remaining column of the output, if treating it together with the varying column gives a group of test vectors a
-    /// tighter bound.
+    /// Return the index of the fixed-order output column if a joint bound with the varying output column is tighter for
+    /// this group of test vectors. `None` otherwise.
     #[inline(always)]
     pub(super) fn joint_partner(
         &self,
@@ -474,7 +517,8 @@ impl<'a> SliceTables<'a> {
         (joint < apart).then_some(partner)
     }
 
-    /// Return the products with one group of test vectors on one record, at the corners of a box.
+    /// Compute inner products and denominators of one group of test vectors on one record, at the corners of a box of
+    /// orders. `together` is the fixed-order output column that is bounded jointly with the varying output column.
     #[inline(always)]
     pub(super) fn corner_values(
         &self,
@@ -529,7 +573,7 @@ impl<'a> SliceTables<'a> {
         let rounding =
             self.others.test_vectors[record].target_rounding + (all + rounding_error) * self.common.rounding[record];
         rough[0].iter_mut().for_each(|rough| *rough += rounding);
-        // Slack of the varying columns (their scale is at least 1), then of the remaining ones.
+        // Slack of the varying columns, whose scale is at least 1. The slack of the fixed-order columns follows.
         let mut slack = [ZERO_LANES; 4];
         let part = if together.is_some() { 3 } else { 2 };
         for n in 0..LANE_COUNT {
@@ -562,6 +606,7 @@ impl<'a> SliceTables<'a> {
         CornerValues { values, slack, remainders: rough }
     }
 
+    /// Convert a norm of the error to a raw score: Σ|e| for [`Norm::L1`], Σe² for [`Norm::L2`].
     #[inline(always)]
     pub(super) fn raw(&self, norm: f64) -> f64 {
         match self.common.norm {
@@ -571,38 +616,48 @@ impl<'a> SliceTables<'a> {
     }
 }
 
-/// One eighth of a squared length.
+/// Return one eighth of a squared length.
 #[inline(always)]
 fn eighth_of_square(length: usize) -> f64 {
     let length = to_f64(length);
     length * length / 8.0
 }
-/// Number of candidates of a row that are processed in parallel lanes.
+/// Number of candidates of a row that are processed in parallel SIMD lanes.
 const ROW_LANES: usize = 4;
 const LANE_OFFSETS: [f64; ROW_LANES] = [0.0, 1.0, 2.0, 3.0];
 
-/// Coefficients on û and v̂ of all candidates of some rows of a slice.
+/// Coefficients p and q of the two varying columns for all candidates of some rows of a slice of the order grid. The
+/// columns are orthogonal to the fixed-order columns and of unit norm.
 #[derive(Default)]
 pub(super) struct RowCoefficients {
-    /// First row.
+    /// Index of the first stored row in the slice of the order grid.
     pub(super) start: usize,
-    /// Number of values in a row.
+    /// Number of candidates in a row.
     pub(super) len: usize,
-    /// Half sum (p + q)/2; 0 if 1 − B² is negligible or NaN, as are the next two.
+    /// Half sum (p + q)/2 of the coefficients p and q of the two varying columns, by candidate. It is 0 if the columns
+    /// are collinear.
     pub(super) plus: Vec<f64>,
+    /// Half difference (p − q)/2 of the coefficients p and q of the two varying columns, by candidate. It is 0 if the
+    /// columns are collinear.
     pub(super) minus: Vec<f64>,
+    /// Value of 1 − B² by candidate, where B is the inner product of the two normalized varying columns. It is 0 if the
+    /// columns are collinear.
     pub(super) independence: Vec<f64>,
-    /// Product B = û·v̂ of the candidates of a row.
+    /// Inner product of the two normalized varying columns for each candidate of the current row, followed by
+    /// workspace.
     pub(super) product: Vec<f64>,
 }
 
 impl RowCoefficients {
+    /// Return the index in the stored vectors of the candidate number `value` in row `row` of the slice.
     #[inline(always)]
     pub(super) fn at(&self, row: usize, value: usize) -> usize {
         (row - self.start) * self.len + value
     }
 
-    /// Deviation of (p + q)/2 and (p − q)/2 from bilinear functions over a box, and the smallest 1 − B².
+    /// Return the largest deviations of (p + q)/2 and (p − q)/2 from the given bilinear functions over a box of orders,
+    /// and the smallest 1 − B². Here p and q are the coefficients of the two varying columns, and B is the product of
+    /// these columns.
     #[inline(always)]
     pub(super) fn bilinear_deviation(
         &self,
@@ -644,7 +699,8 @@ impl RowCoefficients {
         ([most(far[0]), most(far[1])], independence.into_iter().fold(f64::INFINITY, f64::min))
     }
 
-    /// Smallest 1 − B² over a box, and the largest part of ‖y‖² explained by û and v̂.
+    /// Return the smallest 1 − B² over a box of orders, and the largest part of the squared output norm that the two
+    /// varying columns explain. B is the product of these columns.
     #[inline(always)]
     pub(super) fn max_explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
         let (mut independence, mut most) = ([f64::INFINITY; ROW_LANES], [f64::NEG_INFINITY; ROW_LANES]);

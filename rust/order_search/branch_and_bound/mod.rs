@@ -1,9 +1,9 @@
 //! Branch and bound over boxes of orders: one dual bound excludes all candidates of a box.
 //!
-//! Two orders vary over a slice of the order grid. The quantities of the dual bound are tabulated once per slice along
-//! each order (`axis_table`), and the coefficients of all candidates are computed. Over a box, all quantities are
-//! interpolated between its corners, with bounded remainders (`box_bound`). Boxes are bisected until they are excluded
-//! or small (`bisection`).
+//! Two orders vary over a slice of the order grid. The inner products and norms that the bound needs are tabulated once
+//! per slice along each of the two orders (`axis_table`). The coefficients of all candidates of the slice are computed.
+//! Over a box, every other quantity is interpolated between the corners, with a bound of the interpolation error
+//! (`box_bound`). Boxes are bisected until the bound excludes them or they are small (`bisection`).
 
 mod axis_table;
 mod bisection;

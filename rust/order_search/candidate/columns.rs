@@ -1,4 +1,4 @@
-//! Regressors that the candidates of a search require, and the columns of several candidates in parallel lanes.
+//! Regressors that the candidates of a search require, and the columns of several candidates in parallel SIMD lanes.
 
 use std::collections::HashSet;
 
@@ -6,11 +6,13 @@ use crate::equation::{grains, Initial, ORDER_GRAIN};
 use crate::regressors::{Index, Key};
 use crate::simd::Lanes;
 
-/// Set of the regressors that candidates require, from their orders.
+/// Set of the regressors that candidates require, collected from their orders.
 pub(crate) struct RequiredRegressors<'a> {
     initial: &'a Initial,
     index: Index,
+    /// Orders α of equations whose regressors have been added, in units of the order resolution.
     alphas: HashSet<i64>,
+    /// Order α of the equation, signal and order ν of each term whose regressors have been added.
     orders: HashSet<(i64, usize, i64)>,
 }
 
@@ -19,7 +21,7 @@ impl<'a> RequiredRegressors<'a> {
         Self { initial, index: Index::default(), alphas: HashSet::new(), orders: HashSet::new() }
     }
 
-    /// Add the initial terms that every structure with the highest order α requires.
+    /// Add the initial terms that every equation with the highest order α requires.
     pub(crate) fn add_alpha(&mut self, alpha: f64) {
         if !self.alphas.insert(grains(alpha)) {
             return;
@@ -36,7 +38,7 @@ impl<'a> RequiredRegressors<'a> {
         }
     }
 
-    /// Add all regressors that a term of this order requires in an equation of order α.
+    /// Add all regressors that a term of a signal with this order requires in an equation of order `alpha`.
     pub(crate) fn add_term(&mut self, alpha: f64, signal: usize, order: f64) {
         if self.orders.insert((grains(alpha), signal, grains(order))) {
             self.index.insert(Key::integral(signal, alpha - order));
@@ -46,7 +48,7 @@ impl<'a> RequiredRegressors<'a> {
         }
     }
 
-    /// Add t^{from + i} for i = 0, 1, … below an order.
+    /// Add the initial terms t^{from + i} for all integers i ≥ 0 below `order`.
     fn add_powers(&mut self, from: f64, order: f64) {
         let mut i = 0.0;
         while i < order - ORDER_GRAIN {
@@ -55,39 +57,43 @@ impl<'a> RequiredRegressors<'a> {
         }
     }
 
-    /// Return all regressors. Neighbors on the order grid are adjacent.
+    /// Return all regressors, sorted. Neighbors on the order grid are adjacent.
     pub(crate) fn into_index(mut self) -> Index {
         self.index.sort();
         self.index
     }
 }
 
-/// Columns of one term for L candidates.
+/// Regressor columns (indices in a bank) of one term for L candidates.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Columns<const L: usize> {
+    /// Regressor column of each candidate.
     pub(crate) at: [usize; L],
-    /// True if all columns are equal.
+    /// True if all candidates have the same column.
     same: bool,
+    /// True if the columns are consecutive in ascending order.
     consecutive: bool,
 }
 
 impl<const L: usize> Columns<L> {
+    /// Build the columns of L candidates, which may be arbitrary.
     pub(crate) fn new(at: [usize; L]) -> Self {
         Self { at, same: L == 1, consecutive: false }
     }
 
-    /// Return one column for all candidates.
+    /// Build the columns of L candidates that all have the column `at`.
     #[inline(always)]
     pub(crate) fn one(at: usize) -> Self {
         Self { at: [at; L], same: true, consecutive: false }
     }
 
-    /// Return columns given in ascending order.
+    /// Build the columns of L candidates, which must ascend.
     #[inline(always)]
     pub(super) fn from_ascending(at: [usize; L]) -> Self {
         Self { at, same: L == 1, consecutive: at[L - 1] - at[0] == L - 1 }
     }
 
+    /// Determine whether the columns are equal or consecutive, because such columns are read faster.
     #[inline(always)]
     pub(crate) fn compare(&mut self) {
         let first = self.at[0];
@@ -95,7 +101,7 @@ impl<const L: usize> Columns<L> {
         self.consecutive = !self.same && self.at.iter().enumerate().all(|(n, &p)| p == first + n);
     }
 
-    /// Elements of a vector at these columns.
+    /// Return the elements of a vector at the columns of the L candidates.
     #[inline(always)]
     pub(super) fn of(&self, vector: &[f64]) -> Lanes<L> {
         if self.same {
@@ -109,7 +115,8 @@ impl<const L: usize> Columns<L> {
         }
     }
 
-    /// Elements of a symmetric matrix (row-major) at these columns and the given rows.
+    /// Return the elements of a symmetric matrix (row-major, `stride` values per row) at these columns and the columns
+    /// `rows`, one per candidate.
     #[inline(always)]
     pub(super) fn with(&self, rows: &Self, matrix: &[f64], stride: usize) -> Lanes<L> {
         if rows.same {
@@ -126,7 +133,7 @@ impl<const L: usize> Columns<L> {
     }
 }
 
-/// The first L elements.
+/// Return the first L elements of a slice.
 #[inline(always)]
 pub(crate) fn part_of<T: Copy, const L: usize>(values: &[T]) -> [T; L] {
     let mut out = [values[0]; L];

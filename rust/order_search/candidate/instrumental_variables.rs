@@ -1,6 +1,6 @@
-//! Coefficient step of an order search by refined instrumental variables.
+//! Refinement of the coefficients of a candidate by refined instrumental variables.
 //!
-//! The spectra of all regressors are computed once for all candidates.
+//! The spectra of all regressors are computed once and used for all candidates.
 
 use crate::error::{Error, Result};
 use crate::estimation::instrumental_variables::{
@@ -11,15 +11,16 @@ use crate::parallel::{self, Stop};
 use crate::regressors::{Bank, Index, Record};
 use crate::series::Kernel;
 
-/// Cutoff of the low-pass filter for the initial coefficients, relative to the output's bandwidth.
+/// Ratio of the cutoff of the low-pass filter for the initial coefficients to the bandwidth of the output.
 const START_BAND: f64 = 2.0;
 
-/// Spectra of one record for the refinement of all candidates.
+/// Spectra of one record, used for the refinement of all candidates.
 struct RecordSpectra {
     /// Spectrum of each column of the bank.
     columns: Vec<Kernel>,
-    /// Spectrum of the kernel of each column of the output itself.
+    /// Spectrum of the kernel of each output column. `None` for other columns.
     kernels: Vec<Option<Kernel>>,
+    /// Spectrum of the measured output.
     target: Kernel,
 }
 
@@ -30,8 +31,8 @@ pub(crate) struct Refiner {
 }
 
 impl Refiner {
-    /// Compute the spectra of the columns of `banks`, which contain the noise-free signals of the records. The result
-    /// is invalid after a stop request.
+    /// Compute the spectra of the columns of `banks`, which are built from the noise-free signals of the records. The
+    /// result is invalid after a stop request.
     pub(crate) fn new(
         records: &[Record],
         output: usize,
@@ -59,8 +60,8 @@ impl Refiner {
         Self { spectra, settings }
     }
 
-    /// Refine coefficients in place. The coefficients of the terms come first, then the coefficients of the initial
-    /// terms of each record. The result is invalid after a stop request.
+    /// Refine the coefficients of the terms (`coefficients`) and of the initial terms of each record (`weights`) in
+    /// place. Return the reason of a failure. The result is invalid after a stop request.
     pub(crate) fn refine(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -85,7 +86,7 @@ impl Refiner {
             })
             .collect();
         let start: Vec<f64> = coefficients.iter().chain(weights.iter()).copied().collect();
-        // An initial term with weight 0 in the initial guess is a combination of others.
+        // An initial term with coefficient 0 in the initial guess is a linear combination of others.
         let n = initial.len();
         let dropped: Vec<(usize, usize)> =
             weights.iter().enumerate().filter(|(_, w)| **w == 0.0).map(|(i, _)| (i / n, i % n)).collect();
@@ -102,10 +103,11 @@ impl Refiner {
     }
 }
 
-/// Bank and target for the initial coefficients: noise-free signals, low-pass filtered.
+/// Return the bank of regressors and the output from which initial coefficients are estimated. Their signals are
+/// noise-free and low-pass filtered.
 ///
 /// # Errors
-/// [`Error::Structure`] for a signal that the record lacks; [`Error::Interrupted`] after a stop request
+/// [`Error::Structure`] for a signal that the record lacks, [`Error::Interrupted`] after a stop request
 /// ([`Bank::new_interruptible`]).
 pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
     let band = START_BAND * power_frequency(record.signal(output), record.step());

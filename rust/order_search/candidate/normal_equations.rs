@@ -1,6 +1,6 @@
-//! Coefficients of candidates from precomputed normal equations, several candidates in parallel lanes.
+//! Coefficients of candidates from precomputed normal equations, for several candidates in parallel SIMD lanes.
 //!
-//! The squared equation error follows from the Gram matrix alone.
+//! The squared equation error follows from the Gram matrix of columns and measured output alone.
 
 use crate::error::Result;
 use crate::estimation::multi_innovation::{Innovation, RowBasis};
@@ -15,17 +15,19 @@ use crate::simd::Lanes;
 /// Normal equations of the columns of a bank, weighted by the estimator and scaled to a unit diagonal.
 pub(crate) struct Normal {
     width: usize,
-    /// Correlation matrix, row-major width × width; rows of zero columns are 0.
+    /// Correlation matrix of the columns, row-major width × width. Rows of zero columns are 0.
     correlation: Vec<f64>,
+    /// Products of the columns, scaled to unit norm, with the measured output.
     rhs: Vec<f64>,
-    /// Norm of each column.
+    /// Norm of each regressor column: square root of its Gram element plus the inverse prior covariance.
     size: Vec<f64>,
+    /// Inverse norm of each column, 0 for a zero column.
     inverse: Vec<f64>,
 }
 
 impl Normal {
-    /// Build the equations from a Gram matrix over columns and target, (width + 1)² row-major. `prior` has the inverse
-    /// prior covariances, which are added to its diagonal.
+    /// Build the equations from a Gram matrix over columns and measured output, (width + 1)² row-major. `prior` is the
+    /// inverse prior covariance of each coefficient, which is added to the diagonal.
     pub(super) fn new(gram: &[f64], width: usize, prior: &[f64]) -> Self {
         let stride = width + 1;
         let diagonal = |p: usize| gram[p * stride + p] + prior[p];
@@ -43,36 +45,38 @@ impl Normal {
         Self { width, correlation, rhs, size, inverse }
     }
 
-    /// Correlation of two columns.
+    /// Return the correlation of two regressor columns.
     #[inline(always)]
     pub(crate) fn product(&self, a: usize, b: usize) -> f64 {
         self.correlation[a * self.width + b]
     }
 
-    /// Correlations of one column with all.
+    /// Return the correlations of one regressor column with all regressor columns.
     #[inline(always)]
     pub(crate) fn products(&self, a: usize) -> &[f64] {
         &self.correlation[a * self.width..(a + 1) * self.width]
     }
 
-    /// Products of the unit columns with the target.
+    /// Return the products of the columns, scaled to unit norm, with the measured output.
     pub(crate) fn rhs(&self) -> &[f64] {
         &self.rhs
     }
 
-    /// Inverse norm of each column, 0 for a zero column.
+    /// Return the inverse norm of each column, 0 for a zero column.
     pub(crate) fn inverse(&self) -> &[f64] {
         &self.inverse
     }
 }
 
-/// Workspace for solving L candidates in parallel lanes.
+/// Workspace for solving the normal equations of L candidates in parallel SIMD lanes.
 pub(crate) struct Solve<const L: usize> {
+    /// Lower triangle of the correlation matrix, row-major.
     gram: Vec<Lanes<L>>,
-    /// Right-hand side; after the solve, the scaled solution.
+    /// Right-hand side, replaced by the solution for unit-norm columns.
     rhs: Vec<Lanes<L>>,
+    /// Coefficients of the terms of the L candidates.
     pub(crate) coefficients: Vec<Lanes<L>>,
-    /// Coefficients of the initial terms, record by record.
+    /// Coefficients of the initial terms of the L candidates, record by record.
     pub(crate) initial: Vec<Lanes<L>>,
 }
 
@@ -83,13 +87,15 @@ impl<const L: usize> Solve<L> {
 }
 
 /// Normal equations that all candidates share. The equations for the coefficients of the terms are summed over all
-/// records. Each record has its own equations for its initial terms.
+/// records. Each record has separate equations for its initial terms.
 pub(crate) struct NormalEquations {
+    /// Equations for the coefficients of the terms, summed over all records.
     terms: Normal,
     /// Equations of each record for its initial terms. Empty for zero initial conditions.
     record_equations: Vec<Normal>,
-    /// Coefficients by term, `None` for a free coefficient.
+    /// Fixed coefficients by term, `None` for a free coefficient.
     fixed: Vec<Option<f64>>,
+    /// Indices of the terms with a free coefficient.
     free: Vec<usize>,
 }
 
@@ -101,19 +107,21 @@ impl NormalEquations {
         Self { terms, record_equations, fixed: fixed.to_vec(), free }
     }
 
-    /// Normal equations over all records; None if a coefficient is fixed or there are initial terms.
+    /// Return the normal equations over all records. `None` if a coefficient is fixed or there are initial terms.
     pub(crate) fn unconstrained_equations(&self) -> Option<&Normal> {
         (self.record_equations.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
     }
 
-    /// Values of the fixed coefficients by term, `None` for a free coefficient.
+    /// Return the fixed coefficients by term, `None` for a free coefficient.
     pub(super) fn fixed_coefficients(&self) -> &[Option<f64>] {
         &self.fixed
     }
 
-    /// Solve for the coefficients of L candidates. Return a flag for each singular one.
+    /// Solve the normal equations for the coefficients of L candidates, and store them in `solve`. Return true for each
+    /// singular candidate.
     ///
-    /// `positions` holds the column of each term per candidate. The initial terms are common to all.
+    /// `positions` has the columns of each term for the L candidates. `initial` has the columns of the initial terms,
+    /// which are the same for all candidates.
     #[inline(always)]
     pub(crate) fn solve<const L: usize>(
         &self,
@@ -149,7 +157,8 @@ impl NormalEquations {
                 let a = free + r * initial.len() + i;
                 let row = &part.correlation[e * width..(e + 1) * width];
                 for (b, &tb) in self.free.iter().enumerate() {
-                    // Contribution of this record to a term's column, relative to the column's norm over all records.
+                    // Product with the column of a term on this record, relative to the norm of the column over all
+                    // records.
                     let columns = &positions[tb];
                     let (c, size, all) = (columns.of(row), columns.of(&part.size), columns.of(&normal.inverse));
                     gram[packed_index(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
@@ -195,12 +204,14 @@ impl NormalEquations {
     }
 }
 
-/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major. Invalid after a stop request.
+/// Return the Gram matrix of the columns of a bank and the measured output, (columns + 1)² row-major. The result is
+/// invalid after a stop request.
 pub(super) fn plain_gram(bank: &Bank, target: &[f64], stop: &Stop) -> Vec<f64> {
     dense::gram(bank.columns(), target, stop)
 }
 
-/// Apply multi-innovation weights to a Gram matrix: row j of m rows has the weight min(p, m − j).
+/// Apply multi-innovation weights to the Gram matrix of columns and measured output. Row j of m rows has the weight
+/// min(p, m − j), with the innovation length p and j from 0. Rows are samples or Haar coordinates.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn apply_innovation_weights(
     gram: &mut [f64],
@@ -209,7 +220,7 @@ pub(super) fn apply_innovation_weights(
     innovation: Innovation,
 ) -> Result<()> {
     let width = bank.len() + 1;
-    // Φ is orthogonal: the unweighted Gram matrix is the same in Haar coordinates.
+    // The Haar transform is orthogonal, so the unweighted Gram matrix is the same in Haar coordinates.
     let m = target.len();
     let tail = innovation.length.min(m) - 1;
     gram.iter_mut().for_each(|g| *g *= innovation.length.min(m) as f64);
@@ -235,24 +246,30 @@ pub(super) fn apply_innovation_weights(
     Ok(())
 }
 
-/// Gram matrix of columns and target summed over records, with the norms of the columns.
+/// Gram matrix of columns and measured output summed over records, for the residual sum of squares of any candidate.
 pub(crate) struct ResidualSumOfSquares {
+    /// Number of columns plus one for the measured output.
     stride: usize,
+    /// Gram matrix, row-major. The measured output comes last.
     gram: Vec<f64>,
-    /// Diagonal of the Gram matrix, and its square roots.
+    /// Diagonal of the Gram matrix: squared norms of the columns and the measured output.
     diagonal: Vec<f64>,
+    /// Norms of the columns and the measured output: square roots of the diagonal.
     norms: Vec<f64>,
-    /// Factor of the rounding-error bound of a residual sum of squares. The bound is this factor times (sum of the
-    /// column norms)².
+    /// Factor of the rounding-error bound of a residual sum of squares. It multiplies (‖y‖ + Σ|c|‖x‖)² for the measured
+    /// output y and terms with coefficient c and column x.
     unit: f64,
-    /// Rounding-error bound of the minimal residual sum of squares over all coefficients.
+    /// Factor of the rounding-error bound of the minimum of the residual sum of squares over all coefficients. It
+    /// multiplies (‖y‖ + Σ|c|‖x‖)² for the measured output y and terms with coefficient c and column x.
     slack: f64,
+    /// Minimum eigenvalue of a correlation matrix for which lower bounds are valid.
     min_eigenvalue: f64,
 }
 
 impl ResidualSumOfSquares {
-    /// Build from a Gram matrix over `width` columns and the target, row-major. `samples` is the length of its sums,
-    /// `terms` the number of terms of a candidate. `weights` is the largest weight of a row in the normal equations.
+    /// Build from a Gram matrix over `width` columns and the measured output, row-major. `samples` is the number of
+    /// summands of each element, `terms` the number of terms of a candidate. `weights` is the largest weight of a row
+    /// in the normal equations.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(gram: Vec<f64>, width: usize, samples: usize, terms: usize, weights: usize) -> Self {
         let slack = 4.0 * f64::EPSILON * (samples + 8 * terms + 16) as f64;
@@ -263,54 +280,56 @@ impl ResidualSumOfSquares {
             gram,
             unit: 4.0 * f64::EPSILON * samples as f64,
             slack,
-            // Candidates with this minimum eigenvalue are regular in the weighted equations, too.
+            // The normal equations of a candidate with this smallest eigenvalue are regular, also with row weights.
             min_eigenvalue: (2.0 * terms as f64 * slack).max(16.0 * weights as f64 * PIVOT_FLOOR),
         }
     }
 
-    /// Position of the target.
+    /// Return the index of the measured output in the Gram matrix.
     #[inline(always)]
     pub(super) fn target(&self) -> usize {
         self.stride - 1
     }
 
-    /// Products of all columns and the target with one of them.
+    /// Return the inner products of a column with all columns and the measured output.
     #[inline(always)]
     pub(super) fn row(&self, column: usize) -> &[f64] {
         &self.gram[column * self.stride..(column + 1) * self.stride]
     }
 
-    /// Inner product of two columns.
+    /// Return the inner product of two regressor columns.
     #[inline(always)]
     pub(super) fn product(&self, a: usize, b: usize) -> f64 {
         self.gram[a * self.stride + b]
     }
 
-    /// Squares of the norms of columns and target.
+    /// Return the squared norms of all columns and the measured output.
     #[inline(always)]
     pub(super) fn diagonal(&self) -> &[f64] {
         &self.diagonal
     }
 
-    /// Norms of columns and target.
+    /// Return the norms of all columns and the measured output.
     #[inline(always)]
     pub(super) fn norms(&self) -> &[f64] {
         &self.norms
     }
 
-    /// Rounding-error bound of a minimal residual sum of squares, divided by (sum of the column norms)².
+    /// Return the factor of the rounding-error bound of the minimum of a residual sum of squares over all coefficients.
+    /// It multiplies (‖y‖ + Σ|c|‖x‖)² for the measured output y and terms with coefficient c and column x.
     #[inline(always)]
     pub(super) fn slack(&self) -> f64 {
         self.slack
     }
 
-    /// Smallest eigenvalue of a correlation matrix for which the bound holds.
+    /// Return the minimum eigenvalue of a correlation matrix for which lower bounds are valid.
     #[inline(always)]
     pub(super) fn min_eigenvalue(&self) -> f64 {
         self.min_eigenvalue
     }
 
-    /// Lower bounds, including rounding errors, and computed values of the squared equation error of L candidates.
+    /// Return two values of the sum of squared equation errors for each of L candidates: a lower bound that includes
+    /// rounding errors, and the computed value.
     #[inline(always)]
     pub(crate) fn error<const L: usize>(
         &self,

@@ -1,4 +1,5 @@
-//! Data shared by all candidates of one equation, and the evaluation of one candidate: coefficients, bounds, error.
+//! Data shared by all candidates of one equation, and the evaluation of one candidate: coefficients, lower bounds,
+//! error.
 
 use crate::equation::{Initial, Structure};
 use crate::error::{check_finite, Error, Result};
@@ -22,41 +23,46 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::{self, LANE_COUNT};
 
-/// Cost of one simulation, in Fourier transforms. Test vectors are built only while they cost a small fraction of all
-/// simulations.
+/// Cost of one simulation, in Fourier transforms of a record. Test vectors are built only while they cost a small
+/// fraction of all simulations.
 const SIMULATION_COST_TRANSFORMS: u64 = 6;
-/// Cost of one refinement of coefficients, in Fourier transforms: a few steps with a division and a dozen transforms
-/// each.
+/// Cost of one refinement of coefficients, in Fourier transforms of a record. A refinement takes a few steps with a
+/// division and a dozen transforms each.
 const REFINEMENT_COST_TRANSFORMS: u64 = 100;
 
-/// Columns and coefficients of a candidate.
+/// Regressor columns (indices in the banks) and coefficients of the terms of a candidate.
 pub(crate) type SolvedCandidate = (Vec<usize>, Vec<f64>);
 
 /// Data shared by all candidates of one equation.
 pub(crate) struct Problem {
+    /// Regressors of all candidates and their column numbers in the banks.
     index: Index,
+    /// Bank of regressors of each record.
     banks: Vec<Bank>,
+    /// Measured output of each record.
     targets: Vec<Vec<f64>>,
     pub(crate) equations: NormalEquations,
-    /// Gram matrix without weights and prior, if candidates are ranked by squared equation error.
+    /// Gram matrix without weights and prior. Present if candidates are ranked by squared equation error.
     pub(crate) residual_sums: Option<ResidualSumOfSquares>,
     /// Normal equations without weights and prior. Present if the coefficients have weights or a prior and candidates
     /// are ranked by squared equation error.
     least_squares: Option<Normal>,
     pub(crate) bound: Option<Bound>,
-    /// Test vectors tailored to candidates of the search, if they are worthwhile.
+    /// Test vectors tailored to candidates of the search. Present if they save time.
     pub(crate) tailored_vectors: Option<TailoredVectors>,
-    /// Test for unstable zeros, if close bounds are used.
+    /// Test for unstable zeros of the denominator of a candidate. Present in large searches in which the other bounds
+    /// exclude too few candidates.
     pub(crate) unstable_zeros: Option<UnstableZeros>,
     pub(crate) linearized_vectors: Option<LinearizedVectors>,
     refiner: Option<Refiner>,
-    /// Regressor banks for the dual bound if coefficients are refined; empty after the bound is built.
+    /// Banks of regressors for the dual bound. Used only if coefficients are refined, and empty after the bound is
+    /// built.
     bound_banks: Vec<Bank>,
     options: Options,
     samples: usize,
 }
 
-/// SIMD task of [`Bound::evaluate`].
+/// Arguments of [`Bound::evaluate`] as a task that is compiled for the widest vector instructions available.
 struct BoundKernel<'a, F> {
     bound: &'a Bound,
     limit: f64,
@@ -75,7 +81,7 @@ where
     }
 }
 
-/// SIMD task of [`Bound::proves_infeasible`].
+/// Arguments of [`Bound::proves_infeasible`] as a task that is compiled for the widest vector instructions available.
 struct InfeasibilityKernel<'a> {
     bound: &'a Bound,
     limit: f64,
@@ -95,7 +101,8 @@ impl simd::SimdKernel for InfeasibilityKernel<'_> {
     }
 }
 
-/// SIMD task of the exclusion by tailored test vectors.
+/// Arguments of [`TailoredVectors::excludes_candidate`] as a task that is compiled for the widest vector instructions
+/// available.
 struct TailoredVectorKernel<'a> {
     adapted: &'a TailoredVectors,
     limit: f64,
@@ -113,7 +120,8 @@ impl simd::SimdKernel for TailoredVectorKernel<'_> {
     }
 }
 
-/// SIMD task of the exclusion by linearized test vectors.
+/// Arguments of [`LinearizedVectors::excludes_candidate`] as a task that is compiled for the widest vector instructions
+/// available.
 struct LinearizedVectorKernel<'a> {
     tangents: &'a LinearizedVectors,
     limit: f64,
@@ -136,14 +144,17 @@ pub(crate) struct Scratch {
     norm_cache: NormCache,
     lookup: VectorLookup,
     infeasibility: InfeasibilityProof,
+    /// Initial guess of the coefficients for the proof of infeasibility.
     start: Vec<f64>,
     one: Solve<1>,
     simulation: BlockSimulation,
-    /// Coefficients of the terms of the last candidate.
+    /// Coefficients of the terms of the most recent candidate.
     coefficients: Vec<f64>,
+    /// Coefficients of the initial terms of the most recent candidate, record by record.
     weights: Vec<f64>,
-    /// Columns of the terms of the current candidate.
+    /// Regressor columns (indices in the banks) of the terms of the current candidate.
     pub(crate) positions: Vec<usize>,
+    /// Regressor columns (indices in the banks) of the initial terms of the current candidate.
     pub(crate) initial: Vec<usize>,
 }
 
@@ -165,7 +176,8 @@ impl Default for Scratch {
 }
 
 impl Problem {
-    /// Build banks and Gram matrices for the regressors in `index`. The caller has checked that the memory suffices.
+    /// Build banks of regressors and Gram matrices for the regressors in `index`. The caller must check that the memory
+    /// suffices.
     pub(crate) fn new(
         records: &[Record],
         output: usize,
@@ -187,7 +199,7 @@ impl Problem {
         }
         let width = index.keys().len();
         let refined = options.refines();
-        // Noise of a measured output that enters as an input would be ranked like an error of the equation.
+        // If other measured outputs entered as inputs, their noise would be ranked like an error of the equation.
         let banks = records
             .iter()
             .map(|r| {
@@ -238,7 +250,8 @@ impl Problem {
             Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings, stop)),
             _ => None,
         };
-        // D e = w holds for integrals of the measured output.
+        // The dual bound uses D e = w with denominator D, output error e and equation error w. It requires integrals of
+        // the measured output.
         let bound_banks = if refined && options.pruning && options.criterion == Criterion::OutputError {
             records
                 .iter()
@@ -267,7 +280,8 @@ impl Problem {
         })
     }
 
-    /// Build the test vectors that are worthwhile for about this many candidates. Runs on the current thread pool.
+    /// Build as many fixed test vectors as save time in a search over about `candidates` candidates. Runs on the
+    /// current thread pool.
     pub(crate) fn with_bound(mut self, candidates: u64, stop: &Stop) -> Self {
         let banks = std::mem::take(&mut self.bound_banks);
         let (banks, transforms) = if self.refines() {
@@ -278,7 +292,7 @@ impl Problem {
         if self.options.pruning && self.residual_sums.is_none() && !banks.is_empty() {
             let output_error = self.options.criterion == Criterion::OutputError;
             let own = (0..self.index.keys().len()).filter(|&p| !banks[0].kernel(p).is_empty()).count() as u64;
-            // Two transforms for each own column and test vector. The products cost about one transform.
+            // Each test vector needs two transforms per output column. Its inner products cost about one transform.
             let each = 2 * own + 4;
             #[allow(clippy::cast_possible_truncation)]
             let groups = (candidates.saturating_mul(transforms) / 4 / (each * LANE_COUNT as u64))
@@ -291,23 +305,25 @@ impl Problem {
         self
     }
 
-    /// True if coefficients are refined by instrumental variables after a first estimate.
+    /// Return true if coefficients are refined by instrumental variables after a first estimate.
     pub(crate) fn refines(&self) -> bool {
         self.refiner.is_some()
     }
 
-    /// Return an empty set of tailored test vectors, and the memory that each needs \[bytes\].
+    /// Return an empty set of tailored test vectors, and the memory of one such vector \[bytes\].
     pub(crate) fn empty_tailored_vectors(&self) -> (TailoredVectors, u64) {
         (TailoredVectors::new(&self.banks, &self.targets, self.options.norm), TailoredVectors::bytes(&self.banks))
     }
 
-    /// Build the tailored test vector of the candidate with these columns and zero initial conditions.
+    /// Build the test vector tailored to the candidate with these columns, with zero initial conditions. `None` if the
+    /// candidate is singular or a value overflows.
     pub(crate) fn tailor_vector(&self, adapted: &TailoredVectors, positions: &[usize]) -> Option<TailoredVector> {
         let coefficients = self.coefficients(positions)?;
         adapted.fit(&self.banks, &self.targets, positions, &coefficients)
     }
 
-    /// True if these test vectors exclude the candidate with these columns at this limit.
+    /// Return true if these test vectors prove that the raw score (Σ|e| or Σe²) of the candidate with these columns
+    /// exceeds `limit`.
     pub(crate) fn excluded_by_tailored(&self, adapted: &TailoredVectors, positions: &[usize], limit: f64) -> bool {
         let Some(coefficients) = self.coefficients(positions) else { return false };
         let mut memory = NormCache::default();
@@ -325,8 +341,8 @@ impl Problem {
         LinearizedVectors::new(&self.banks, &self.targets, self.options.norm)
     }
 
-    /// Build the linearized test vector of the candidate with these columns and coefficients. Initial conditions are
-    /// zero.
+    /// Build the linearized test vector of the candidate with these columns and coefficients, with zero initial
+    /// conditions. `None` if the vector covers no sample or a value overflows.
     pub(crate) fn linearize_vector(
         &self,
         tangents: &LinearizedVectors,
@@ -337,7 +353,8 @@ impl Problem {
         tangents.fit((&self.banks, &self.targets), terms, c, limit)
     }
 
-    /// Return the candidates, by columns and coefficients, that this vector does not exclude.
+    /// Return those candidates, as columns and coefficients, that this vector does not exclude at this limit of the raw
+    /// score (Σ|e| or Σe²).
     pub(crate) fn not_excluded_by(
         &self,
         tangents: &LinearizedVectors,
@@ -348,8 +365,8 @@ impl Problem {
         all.iter().filter(|(terms, c)| !tangents.vector_excludes(linearized, terms, c, limit)).cloned().collect()
     }
 
-    /// Build the test for unstable zeros if its tables fit into this memory \[bytes\]. Return the memory used. Runs on
-    /// the current thread pool.
+    /// Build the test for unstable zeros if its tables fit into `spare` bytes. Return the memory used \[bytes\], 0 if
+    /// the test is not built. Runs on the current thread pool.
     pub(crate) fn add_unstable_zeros(&mut self, spare: u64) -> u64 {
         let bytes = UnstableZeros::bytes(&self.banks);
         if bytes > spare || !UnstableZeros::is_affordable(&self.targets) {
@@ -359,16 +376,16 @@ impl Problem {
         bytes
     }
 
-    /// Normal equations for the error bound of a box. If candidates are ranked by simulation, they are the equations of
-    /// the coefficients of the candidates, otherwise those of the smallest squared equation error. `None` with fixed
-    /// coefficients or initial terms.
+    /// Return the normal equations for the error bound of a box. If candidates are ranked by simulation, these
+    /// equations determine the coefficients of the candidates. Otherwise they minimize the squared equation error.
+    /// `None` with fixed coefficients or initial terms.
     pub(crate) fn box_equations(&self) -> Option<&Normal> {
         let own = self.equations.unconstrained_equations()?;
         Some(self.least_squares.as_ref().unwrap_or(own))
     }
 
-    /// Coefficients of the candidate with these columns by the normal equations, with zero initial conditions. `None`
-    /// if it is singular.
+    /// Solve the normal equations for the coefficients of the candidate with these columns, with zero initial
+    /// conditions. `None` if the equations are singular.
     pub(crate) fn coefficients(&self, positions: &[usize]) -> Option<Vec<f64>> {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let mut one = Solve::new();
@@ -376,24 +393,24 @@ impl Problem {
         (!singular).then(|| one.coefficients.iter().map(|c| c[0]).collect())
     }
 
-    /// Norm of the output over all records.
+    /// Return the Euclidean norm of the output over all records.
     pub(crate) fn size(&self) -> f64 {
         self.targets.iter().flatten().map(|y| y * y).sum::<f64>().sqrt()
     }
 
-    /// Number of samples of all records.
+    /// Return the total number of samples of all records.
     pub(crate) fn samples(&self) -> usize {
         self.samples
     }
 
-    /// Position of I^{α−ν} s in the banks.
+    /// Return the column number in the banks of the fractional integral of order `eta` of a signal.
     pub(crate) fn position(&self, signal: usize, eta: f64) -> Result<usize> {
         self.index
             .get(Key::integral(signal, eta))
             .ok_or_else(|| Error::Internal { what: format!("no regressor of signal {signal} at order {eta}") })
     }
 
-    /// Positions of the initial terms of a structure.
+    /// Write the regressor columns (indices in the banks) of the initial terms of a structure to `out`.
     pub(crate) fn initial_positions(&self, structure: &Structure, out: &mut Vec<usize>) {
         out.clear();
         out.extend(
@@ -404,9 +421,10 @@ impl Problem {
         );
     }
 
-    /// Evaluate a structure given the positions of its terms.
+    /// Evaluate the candidate whose terms have the columns `positions` and whose initial terms have the columns
+    /// `initial`. `limit` is a limit of the raw score (Σ|e| or Σe²).
     ///
-    /// Its coefficients are stored in `scratch`. If `bounded`, the dual bound is tried before the simulation.
+    /// The coefficients are stored in `scratch`. If `bounded` is true, the dual bound is tried before the simulation.
     pub(crate) fn evaluate(
         &self,
         positions: &[usize],
@@ -437,7 +455,8 @@ impl Problem {
         weights.clear();
         weights.extend(one.initial.iter().map(|c| c[0]));
         if let (Some(_), Some(bound), true) = (&self.refiner, &self.bound, limit < f64::INFINITY) {
-            // Refinement may change the coefficients arbitrarily, so only a bound over all coefficients excludes.
+            // Refinement may change the coefficients arbitrarily, so only a bound over all coefficients can exclude the
+            // candidate.
             start.clear();
             start.extend(coefficients.iter().chain(weights.iter()));
             let (terms, fixed) = (positions, self.equations.fixed_coefficients());
@@ -494,12 +513,12 @@ impl Problem {
         Verdict::Score(raw)
     }
 
-    /// Score from a sum of absolute or squared errors, by the selected norm.
+    /// Return the score of a sum of absolute or squared errors in the selected norm.
     pub(crate) fn score(&self, raw: f64) -> f64 {
         self.options.norm.score(raw, self.samples)
     }
 
-    /// Row of the last evaluated candidate, with this many initial terms per record.
+    /// Return the table row of the most recently evaluated candidate, with `initial` initial terms per record.
     pub(crate) fn row(&self, index: u64, raw: f64, initial: usize, scratch: &Scratch) -> Row {
         Row {
             index,
@@ -509,7 +528,7 @@ impl Problem {
         }
     }
 
-    /// Evaluate a single structure; return its outcome and its table row.
+    /// Evaluate a single structure up to a limit of the raw score (Σ|e| or Σe²). Return its outcome and its table row.
     pub(crate) fn evaluate_structure(
         &self,
         structure: &Structure,

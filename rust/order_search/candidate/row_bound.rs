@@ -1,37 +1,43 @@
-//! Lower bounds of the squared equation error for a row of candidates that differ in one term.
+//! Lower bounds of the squared equation error for a row of candidates, which differ in one term only.
 //!
-//! The varying term comes last in the factorization L D Lᵀ of the correlation matrix. All candidates of the row
-//! therefore share the factor of the other terms.
+//! The varying term comes last in the factorization L D Lᵀ of the Gram matrix. All candidates of the row therefore have
+//! the factor of the other (common) terms in common.
 
 use crate::order_search::candidate::columns::{part_of, Columns};
 use crate::order_search::candidate::normal_equations::ResidualSumOfSquares;
 use crate::simd::Lanes;
 
-/// Maximum number of common terms of a row, not counting the varying term.
+/// Maximum number of common terms of a row of candidates. The varying term is not counted.
 const MAX_COMMON_TERMS: usize = 7;
 
-/// Factor L D Lᵀ of the correlation matrix of all common terms, and the residual of the target's regression on these
-/// terms.
+/// Factor L D Lᵀ of the Gram matrix of the common terms of a row of candidates, and the regression of the measured
+/// output on these terms.
 pub(crate) struct CommonFactor<'a> {
     squares: &'a ResidualSumOfSquares,
+    /// Number of common terms, which all candidates of a row have.
     count: usize,
+    /// Regressor columns of the common terms.
     columns: [usize; MAX_COMMON_TERMS],
-    /// Rows of L below its unit diagonal.
+    /// Rows of the triangular factor L to the left of its unit diagonal.
     lower: [[f64; MAX_COMMON_TERMS]; MAX_COMMON_TERMS],
+    /// Inverse elements of the diagonal factor D, infinite for a nonpositive pivot.
     inverse: [f64; MAX_COMMON_TERMS],
-    /// Inner products of the terms with the target, multiplied by L⁻¹.
+    /// Inner products of the common terms with the measured output, multiplied by the inverse of the triangular factor
+    /// L.
     values: [f64; MAX_COMMON_TERMS],
+    /// Coefficients of the regression of the measured output on the common terms.
     common_coefficients: [f64; MAX_COMMON_TERMS],
+    /// Norms of the regressor columns of the common terms.
     norms: [f64; MAX_COMMON_TERMS],
-    /// Residual sum of squares of the target after the common terms.
+    /// Residual sum of squares of the regression of the measured output on the common terms.
     residual: f64,
     /// Trace of the inverse correlation matrix of the common terms. It bounds every inverse eigenvalue from above.
     trace: f64,
 }
 
 impl<'a> CommonFactor<'a> {
-    /// Factor the terms with these columns except column number `but`. `None` if there are too many terms, or if they
-    /// are so nearly dependent that no bound holds.
+    /// Factor the terms with these columns except term number `but`. `None` if there are too many terms, or if they are
+    /// so nearly dependent that no bound holds.
     #[inline(always)]
     pub(crate) fn new(squares: &'a ResidualSumOfSquares, columns: &[usize], but: usize) -> Option<Self> {
         let count = columns.len().checked_sub(1).filter(|count| *count <= MAX_COMMON_TERMS)?;
@@ -56,7 +62,7 @@ impl<'a> CommonFactor<'a> {
         (shared.trace * squares.min_eigenvalue() <= 1.0).then_some(shared)
     }
 
-    /// Add term `i` to the factor.
+    /// Add the common term number `i` to the triangular factor and to the regression.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangular arrays, indexed by row and column
     fn extend(&mut self, i: usize) {
@@ -80,7 +86,7 @@ impl<'a> CommonFactor<'a> {
         self.norms[i] = squares.norms()[column];
         let last = value * self.inverse[i];
         self.residual -= value * last;
-        // Back substitution: regression of this column on the previous ones, which changes their coefficients.
+        // Back substitution gives the regression of this column on the previous ones, which changes their coefficients.
         let mut sum = whole;
         for j in (0..i).rev() {
             row[j] = self.lower[i][j];
@@ -94,11 +100,11 @@ impl<'a> CommonFactor<'a> {
         self.trace += sum * self.inverse[i];
     }
 
-    /// Append the positions in `columns` (ascending) whose candidates this bound does not exclude. Each column is a
-    /// value of the varying term.
+    /// Append the indices into `columns` of the candidates that this bound does not exclude at a limit of the sum of
+    /// squared equation errors. `columns` ascends and gives the column of the varying term for each candidate.
     #[inline(always)]
     pub(crate) fn append_open<const L: usize>(&self, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
-        // Common sizes get loops of constant length.
+        // For frequent numbers of terms, the compiler generates loops of constant length.
         match self.count {
             0 => self.append_open_sized::<L>(0, columns, limit, open),
             1 => self.append_open_sized::<L>(1, columns, limit, open),
@@ -109,6 +115,7 @@ impl<'a> CommonFactor<'a> {
         }
     }
 
+    /// Do the work of [`Self::append_open`] for `count` common terms.
     #[inline(always)]
     fn append_open_sized<const L: usize>(&self, count: usize, columns: &[usize], limit: f64, open: &mut Vec<usize>) {
         let mut from = 0;
@@ -127,7 +134,7 @@ impl<'a> CommonFactor<'a> {
         }
     }
 
-    /// Append the lanes from position `from` on whose candidates are not excluded.
+    /// Append `from` + n for each of the first `lanes` SIMD lanes n whose candidate is not excluded.
     #[inline(always)]
     fn append_open_lanes<const L: usize>(
         &self,
@@ -144,7 +151,7 @@ impl<'a> CommonFactor<'a> {
         open.extend((from..from + lanes).zip(excluded).filter(|(_, excluded)| !excluded).map(|(at, _)| at));
     }
 
-    /// Flag of each of L candidates: true if no coefficients reduce its squared equation error to the limit.
+    /// Return true for each of L candidates if no coefficients reduce its sum of squared equation errors to the limit.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // triangular arrays of lanes, indexed by row and column
     fn exclusion_flags<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
@@ -152,7 +159,7 @@ impl<'a> CommonFactor<'a> {
         let whole = changing.of(squares.diagonal());
         let norms = changing.of(squares.norms());
         let (mut pivot, mut value) = (whole, changing.of(squares.row(squares.target())));
-        // Row of L D of the changing term, then of L.
+        // Row of L D for the varying term, later its row of L.
         let mut row: [Lanes<L>; MAX_COMMON_TERMS] = [[0.0; L]; MAX_COMMON_TERMS];
         for j in 0..count {
             let mut sum = changing.of(squares.row(self.columns[j]));
@@ -179,7 +186,8 @@ impl<'a> CommonFactor<'a> {
             error[n] = self.residual - value[n] * last[n];
             size[n] = squares.norms()[squares.target()] + last[n].abs() * norms[n];
         }
-        // Back substitution: regression of the varying column on the common ones, which changes their coefficients.
+        // Back substitution gives the regression of the varying column on the common ones, which changes their
+        // coefficients.
         for j in (0..count).rev() {
             for l in j + 1..count {
                 for n in 0..L {
@@ -210,7 +218,7 @@ mod tests {
     use crate::linalg::dense;
     use crate::parallel::Stop;
 
-    /// Reproducible numbers in [−1, 1).
+    /// Return reproducible pseudorandom numbers in [−1, 1).
     fn noise(state: &mut u64, count: usize) -> Vec<f64> {
         let mut next = || {
             *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -221,7 +229,7 @@ mod tests {
         (0..count).map(|_| next()).collect()
     }
 
-    /// Columns that deviate from a common one by this fraction, each in its own unit.
+    /// Return columns that deviate from a common one by the fraction `share`, with different scales.
     fn correlated_columns(state: &mut u64, count: usize, m: usize, share: f64) -> Vec<Vec<f64>> {
         let base = noise(state, m);
         let mut one = |i: usize| {

@@ -1,16 +1,19 @@
-//! Blockwise simulation ŷ = N/D of one candidate, compared with the measurement block by block.
+//! Blockwise simulation ŷ = N/D of one candidate, compared with the measured output block by block. N is the input part
+//! of the equation, D its denominator.
 
 use crate::order_search::control::Control;
 use crate::order_search::options::Norm;
 use crate::order_search::result::{Failure, Verdict};
 use crate::series::{Division, BLOCK_TERMS};
 
-/// Column and its coefficient.
+/// Regressor column or kernel, and its coefficient.
 type Weighted<'a> = (&'a [f64], f64);
 
-/// Workspace of simulations, reused from one candidate to the next.
+/// Workspace of simulations, reused for all candidates.
 pub(crate) struct BlockSimulation {
+    /// Denominator of the simulated output as a series, as far as computed.
     divisor: Vec<f64>,
+    /// Input part of the equation (numerator) in the current block.
     block: Vec<f64>,
     division: Option<Division>,
 }
@@ -22,10 +25,11 @@ impl Default for BlockSimulation {
 }
 
 impl BlockSimulation {
-    /// Add the error of a simulation to a raw sum. Stops once the sum exceeds the limit or the caller requests a stop.
+    /// Simulate a candidate and add its error Σ|e| or Σe² to the sum `raw`. The simulation stops once the sum exceeds
+    /// the limit or the caller requests a stop.
     ///
-    /// D = 1 − Σ c F over the kernels in `own`, N = Σ c x over the columns in `driven`. Only the part of a kernel up to
-    /// the current block is read.
+    /// The simulated output is N/D. The denominator D = 1 − Σ c F is summed over the kernels F in `own`. The numerator
+    /// N = Σ c x is summed over the columns x in `driven`. Only the part of a kernel up to the current block is read.
     #[allow(clippy::too_many_arguments)]
     pub(crate) fn accumulate_error<'a>(
         &mut self,
@@ -39,7 +43,7 @@ impl BlockSimulation {
     ) -> Verdict {
         let m = target.len();
         let Self { divisor, block, division } = self;
-        // Records may differ in length, but a division has a fixed one.
+        // Records may differ in length, but the length of a division is fixed.
         let division = match division {
             Some(d) if d.terms() == m => {
                 d.reset();
@@ -73,7 +77,7 @@ impl BlockSimulation {
             if !raw.is_finite() {
                 return Verdict::Failed(Failure::Diverged);
             }
-            // An interrupted candidate must not be taken for a scored one.
+            // An interrupted candidate must not be ranked by its partial sum.
             if raw > limit || control.is_stopped() {
                 return Verdict::Stopped(raw);
             }
@@ -82,7 +86,8 @@ impl BlockSimulation {
         Verdict::Score(raw)
     }
 
-    /// Add the residuals y − Σ c x to a raw sum. Stops once the sum exceeds the limit.
+    /// Add Σ|ε| or Σε² of the equation error ε = y − Σ c x to the sum `raw`. The computation stops once the sum exceeds
+    /// the limit.
     pub(crate) fn residuals<'a>(
         &mut self,
         target: &[f64],
@@ -106,7 +111,7 @@ impl BlockSimulation {
     }
 }
 
-/// Sum Σ c x of the weighted columns over the block that starts at `lo`.
+/// Write the sum Σ c x of the weighted columns x to the block that starts at sample `lo`.
 #[inline]
 fn combine<'a>(block: &mut [f64], lo: usize, columns: impl Iterator<Item = Weighted<'a>>) {
     block.fill(0.0);

@@ -1,4 +1,5 @@
-//! Bisection of the cells of a region until no cell can contain an error far below the smallest error found.
+//! Bisection of the cells (boxes of orders) of a region. It ends when no cell can contain an equation error far below
+//! the smallest error found.
 
 use std::sync::atomic::Ordering;
 
@@ -12,58 +13,62 @@ use crate::order_search::control::Control;
 use crate::parallel::pool;
 use crate::regressors::Record;
 
-/// Number of cells that a task bounds.
+/// Number of cells (boxes of orders) whose bounds one parallel task computes.
 const CELLS_PER_TASK: usize = 256;
+/// Number of cells (boxes of orders) whose bounds are computed between two updates of the best orders.
 const CELLS_PER_PASS: usize = 1 << 16;
-/// Memory per cell while cells are bisected \[bytes\].
+/// Memory per cell (box of orders) during the bisection \[bytes\].
 const CELL_MEMORY_BYTES: u64 = 4 * size_of::<Cell>() as u64;
 
-/// Maximum number of evaluations of the local search from the best orders.
+/// Maximum number of evaluations of one local search from the best orders.
 const MAX_POLISH_EVALUATIONS: usize = 400;
-/// Number of midpoints per pass that are tried as new best orders.
+/// Number of cell midpoints per pass that are evaluated as candidates for the best orders.
 const MIDPOINTS_PER_PASS: usize = 4;
 
-/// Options of a certificate.
+/// Options of a certificate, a proved lower bound of the equation error over a region of orders.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CertificateOptions {
-    /// Relative tolerance: no orders may have an error below (1 − tolerance) times the best error found.
+    /// Relative tolerance. The certificate is complete if no orders have an error below (1 − tolerance) times the best
+    /// error found.
     pub tolerance: f64,
-    /// Maximum sum of the terms' norms, relative to the norm of the output y: Σ ‖c x‖ ≤ `max_coefficient`·‖y‖.
+    /// Largest admissible sum of the norms of the terms, relative to the norm of the output y: Σ‖c x‖ ≤
+    /// `max_coefficient`·‖y‖ with coefficients c and columns x.
     pub max_coefficient: f64,
-    /// Maximum number of cells. If it is reached, the bisection ends with the bound proved up to then.
+    /// Maximum number of cells (boxes of orders). If it is reached, the bisection ends with the lower bound proved so
+    /// far.
     pub max_cells: u64,
     /// Number of threads.
     pub threads: usize,
-    /// Memory limit \[bytes\].
+    /// Memory limit of a certificate \[bytes\].
     pub memory: u64,
 }
 
 /// Lower bound of the equation error over all orders of a region.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Certificate {
-    /// Lower bound of the root mean squared equation error; 0 without a proof. It holds for all orders of the region
-    /// and all admissible coefficients.
+    /// Lower bound of the root mean square of the equation error, 0 without a proof. It holds for all orders of the
+    /// region and all admissible coefficients.
     pub lower_bound: f64,
-    /// Smallest root mean squared equation error found; infinite if none was found.
+    /// Smallest root mean square of the equation error found, infinite if none was found.
     pub best: f64,
-    /// Order of the equation with the error `best`.
+    /// Order α of the equation with the error `best`. If no such equation was found, the middle of the interval of α.
     pub order: f64,
-    /// Orders of the terms of that equation.
+    /// Orders ν of the terms of that equation, empty if none was found.
     pub orders: Vec<f64>,
-    /// Number of bounded cells.
+    /// Number of cells (boxes of orders) for which a bound was computed.
     pub cells: u64,
-    /// Number of open cells: their bound is too small, and they cannot be bisected further.
+    /// Number of open cells (boxes of orders): their bound is too small, and they cannot be bisected further.
     pub open_cells: u64,
 }
 
-/// Certify a lower bound of the squared equation error over all orders of a region. Coefficients are optimal for each
-/// order. Equations whose terms nearly cancel are not covered.
+/// Compute a lower bound of the equation error that holds for all orders of a region. The coefficients are optimal for
+/// each order. Equations whose terms nearly cancel are not covered ([`CertificateOptions::max_coefficient`]).
 ///
 /// The result is bitwise identical for any number of threads.
 ///
 /// # Errors
-/// A region without orders, records without the signals of the region, an option out of range, too many cells, too
-/// little memory, [`Error::Interrupted`].
+/// A region without orders, records that lack a signal of the region, an option out of range, too many cells (boxes of
+/// orders), or too little memory. [`Error::Interrupted`] after a stop request.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -119,7 +124,7 @@ pub fn certify(
     })
 }
 
-/// State of the bisection of the cells of a region.
+/// State of the bisection of the cells (boxes of orders) of a region.
 struct CellBisection<'a> {
     tables: GramTables,
     region: &'a Region,
@@ -128,6 +133,7 @@ struct CellBisection<'a> {
 }
 
 impl CellBisection<'_> {
+    /// Bisect the cells (boxes of orders) of the region, and return the certificate.
     fn run(&self, records: &[Record]) -> Result<Certificate> {
         let mut cells = self.initial_cells()?;
         if cells.is_empty() {
@@ -140,7 +146,7 @@ impl CellBisection<'_> {
         let target = |best: f64| (1.0 - self.options.tolerance).powi(2) * best;
         let most =
             self.options.max_cells.min(self.options.memory.saturating_sub(self.tables.bytes) / CELL_MEMORY_BYTES);
-        // A good incumbent saves bisections.
+        // Good initial orders save bisections.
         for cells in cells.chunks(CELLS_PER_PASS) {
             let bounds = self.bounds(cells, 0.0)?;
             self.update_best(records, (cells, &bounds), &mut best, &mut place)?;
@@ -152,7 +158,7 @@ impl CellBisection<'_> {
                 proved = cells.iter().fold(proved, |least, cell| least.min(cell.inherited_bound));
                 break;
             }
-            // Number of cells known so far. Further halves follow.
+            // The total is the number of cells known so far. Halves of these cells are added later.
             self.control.total.store(bounded + cells.len() as u64, Ordering::Relaxed);
             let mut next = Vec::new();
             for cells in cells.chunks(CELLS_PER_PASS) {
@@ -187,7 +193,8 @@ impl CellBisection<'_> {
         Ok(Certificate { lower_bound: at_least, best: root(best), order, orders, cells: bounded, open_cells: open })
     }
 
-    /// Compute the bounds of some cells.
+    /// Compute the bounds of some cells, relative to the squared norm of the output. `goal` is the bound at which a
+    /// cell (box of orders) is excluded.
     fn bounds(&self, cells: &[Cell], goal: f64) -> Result<Vec<CellBound>> {
         let bounds = |chunk: &'_ [Cell]| -> Vec<CellBound> {
             let all = chunk.iter().take(if self.control.is_stopped() { 0 } else { CELLS_PER_TASK });
@@ -198,7 +205,8 @@ impl CellBisection<'_> {
         Ok(cell_bounds)
     }
 
-    /// Update the best orders by a local evaluation near the best midpoints of some cells.
+    /// Evaluate the equation at the midpoints of the best of these cells (boxes of orders). If the relative squared
+    /// residual there is below `best`, store it in `best` and the orders of integration in `place`.
     fn update_best(
         &self,
         records: &[Record],
@@ -218,7 +226,8 @@ impl CellBisection<'_> {
         Ok(())
     }
 
-    /// Bound of one cell. The subspace bound is also computed if the first bound is below the goal.
+    /// Compute the bounds of one cell, relative to the squared norm of the output. The subspace bound is also computed
+    /// if the first bound is below `goal`.
     fn bound(&self, cell: &Cell, goal: f64) -> CellBound {
         let mut cell_bound = self.tables.local(cell).bound();
         if cell_bound.lower_bound.max(cell.inherited_bound) < goal {
@@ -228,7 +237,8 @@ impl CellBisection<'_> {
         cell_bound
     }
 
-    /// Relative squared residual at these orders of integration, computed without tables.
+    /// Compute the squared residual at these orders of integration without tables, relative to the squared norm of the
+    /// output.
     fn relative_residual(&self, records: &[Record], etas: &[f64]) -> Result<f64> {
         let terms = self.region.terms.iter().zip(etas).map(|(term, eta)| (term.signal, *eta, 0.0));
         Ok(expand_cell(records, self.region.output, &terms.collect::<Vec<_>>(), &self.control.stop)?
@@ -237,13 +247,13 @@ impl CellBisection<'_> {
             .midpoint_residual)
     }
 
-    /// Refine the best orders by a local search, changing one or two orders at a time. It reaches the edges of the
-    /// region, which have no midpoint.
+    /// Refine the best orders of integration `place` by a local search, which changes one or two orders at a time. It
+    /// also reaches the edges of the region, where no cell has its midpoint.
     fn polish(&self, records: &[Record], best: &mut f64, place: &mut Vec<f64>) -> Result<()> {
         if place.is_empty() {
             return Ok(());
         }
-        // The order of the equation comes last.
+        // The order α of the equation comes last.
         let k = place.len();
         let vary: Vec<usize> = (0..k)
             .filter(|&term| self.region.terms[term].lowest < self.region.terms[term].highest)
@@ -281,18 +291,20 @@ impl CellBisection<'_> {
         Ok(())
     }
 
+    /// Return the interval of orders of integration of each term in a cell (box of orders).
     fn cell_intervals(&self, cell: &Cell) -> Vec<(f64, f64)> {
         (0..self.region.terms.len()).map(|term| self.tables.order_interval(self.region, cell, term)).collect()
     }
 
+    /// Return true if a cell (box of orders) contains orders of the region.
     fn holds_orders(&self, cell: &Cell) -> bool {
         self.region.alpha_interval(&self.cell_intervals(cell)).is_some()
     }
 
-    /// Largest cells that contain orders of the region.
+    /// Return the largest cells that contain orders of the region.
     ///
     /// # Errors
-    /// [`Error::Structure`] if there are too many.
+    /// [`Error::Structure`] if there are more than four times the maximum number of cells (boxes of orders).
     fn initial_cells(&self) -> Result<Vec<Cell>> {
         let mut cells = vec![Cell { level: [0; MAX_TERMS], at: [0; MAX_TERMS], inherited_bound: 0.0 }];
         for term in 0..self.region.terms.len() {
@@ -324,8 +336,8 @@ impl CellBisection<'_> {
         Ok(cells)
     }
 
-    /// Both halves of a cell along the order with the largest cost, if they contain orders. `None` if all orders are at
-    /// the finest level.
+    /// Halve a cell (box of orders) along the order with the largest cost, and return the halves that contain orders of
+    /// the region. `None` if all orders are fixed or at the finest level.
     fn halve_cell(&self, cell: &Cell, least: f64, costs: &[f64; MAX_TERMS]) -> Option<[Option<Cell>; 2]> {
         let may = (0..self.region.terms.len())
             .filter(|&term| !self.tables.has_fixed_order(term) && cell.level[term] < MAX_CELL_LEVEL);

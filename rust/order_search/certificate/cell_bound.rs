@@ -1,13 +1,14 @@
-//! Lower bound of the least squared equation error over a cell of orders.
+//! Lower bound of the squared equation error over a cell (a box of orders), for optimal coefficients.
 //!
-//! With X the columns at the midpoint, G = XᵀX and any coefficients c₀ there, e = y − Xc₀. At other orders of the cell
-//! the columns are X + U. The part of U in the span of X is XA, and the remaining part P is orthogonal to X. For any
-//! coefficients c, with h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
+//! Let X be the regressor columns at the midpoint, G = XᵀX, and e = y − Xc₀ the residual of the output y for any
+//! coefficients c₀. At other orders of the cell the columns are X + U. The part of U in the span of X is XA, and the
+//! remaining part P is orthogonal to X. For any coefficients c, with h = c + Ac − c₀, τ = Xᵀe and γ = Uᵀe,
 //!
 //!   ‖y − (X + U)c‖² = ‖e − Xh − Pc‖² ≥ ‖e‖² − 2τᵀh − 2(γ − Aᵀτ)ᵀc + ‖Xh‖².
 //!
-//! c = (I + A)⁻¹(c₀ + h), so with (I + Aᵀ)β = γ − Aᵀτ the minimum over h is ‖e‖² − 2βᵀc₀ − (β + τ)ᵀG⁻¹(β + τ). The
-//! moduli of γ and A are bounded by the expansions of the columns. B bounds |β| if B ≥ |γ| + |A|ᵀ(|τ| + B).
+//! Here c = (I + A)⁻¹(c₀ + h). With the solution β of (I + Aᵀ)β = γ − Aᵀτ, the minimum over h is ‖e‖² − 2βᵀc₀ − (β +
+//! τ)ᵀG⁻¹(β + τ). The moduli of γ and A are bounded by the expansions of the columns. A vector B is a bound of |β| if B
+//! ≥ |γ| + |A|ᵀ(|τ| + B).
 
 use crate::error::{check_length, Error, Result};
 use crate::linalg::dense::inner_products;
@@ -18,29 +19,38 @@ use crate::order_search::certificate::subspace_bound::DerivativeSubspace;
 use crate::parallel::Stop;
 use crate::regressors::Record;
 
+/// One value per term of the equation.
 type Row = [f64; MAX_TERMS];
 
-/// Relative margin of B, far above its rounding error.
+/// Relative margin of the vector of [`dominating_vector`], far above its rounding error.
 const BOUND_MARGIN: f64 = 1e-6;
+/// Relative margin for the error of the inverse Gram matrix. No bound is computed if an estimate of this error exceeds
+/// the square of the margin.
 const INVERSE_TOLERANCE: f64 = 1.0 / 16.0;
 
-/// Inner products of the columns at the midpoint of a cell, for all k terms. The columns and the target have unit norm.
+/// Inner products of the regressor columns and their derivatives at the midpoint of a cell (box of orders). The columns
+/// and the measured output have unit norm. Derivatives are taken by the order of integration.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellProducts {
+    /// Number of terms of the equation.
     pub(super) k: usize,
-    /// Products x_i·x_j⁽ᵐ⁾ of columns with derivatives of order m of columns, by m, then i, then j.
+    /// Products of the column of term i with the mth derivative of the column of term j, by m, then i, then j.
+    /// Derivatives are taken by the order of integration.
     pub(super) products: [[Row; MAX_TERMS]; EXPANSION_COLUMNS],
-    /// Products x_j⁽ᵐ⁾·y with the target.
+    /// Products of the measured output with the mth derivative of the column of term j, by m, then j.
     pub(super) target: [Row; EXPANSION_COLUMNS],
+    /// Upper bounds of the norms of the mth derivatives of the column of term j, by m, then j.
     pub(super) sizes: [Row; EXPANSION_COLUMNS],
-    /// Remainders of the expansions of the columns.
+    /// Upper bound of the remainder of the expansion of each column within the cell (box of orders).
     pub(super) rests: Row,
+    /// Half width of the cell (box of orders) for each order of integration.
     pub(super) halves: Row,
-    /// Rounding-error bound of a product of two unit columns.
+    /// Rounding-error bound of the product of two unit-norm columns.
     pub(super) rounding: f64,
 }
 
 impl CellProducts {
+    /// Return products of 0 for `k` terms and `samples` samples, to be filled in.
     pub(super) fn new(k: usize, samples: usize) -> Self {
         Self {
             k,
@@ -49,24 +59,26 @@ impl CellProducts {
             sizes: [[0.0; MAX_TERMS]; EXPANSION_COLUMNS],
             rests: [0.0; MAX_TERMS],
             halves: [0.0; MAX_TERMS],
-            // Products of stored columns have an eighth of the rounding error of a chain of transforms.
+            // The rounding error of products of stored columns is an eighth of the error of a chain of transforms.
             rounding: rounding_unit(samples) / 8.0,
         }
     }
 }
 
-/// Bound of a cell, relative to the squared norm of the target.
+/// Bound of a cell (a box of orders), relative to the squared norm of the measured output.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CellBound {
-    /// Lower bound of the relative squared residual of all orders in the cell; 0 without a proof.
+    /// Lower bound of the relative squared residual at all orders in the cell (box of orders), 0 without a proof.
     pub(super) lower_bound: f64,
-    /// Relative squared residual at the midpoint, infinite if it cannot be computed.
+    /// Relative squared residual at the midpoint of the cell (box of orders), infinite if it cannot be computed.
     pub(super) midpoint_residual: f64,
-    /// Decrease of the bound due to the width of the cell in each order.
+    /// Decrease of the bound due to the width of the cell (box of orders) in each order. The cell is halved along the
+    /// order with the largest value.
     pub(super) costs: Row,
 }
 
 impl CellProducts {
+    /// Compute the bound of the cell (box of orders) for any coefficients.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn bound(&self) -> CellBound {
         let k = self.k;
@@ -90,7 +102,7 @@ impl CellProducts {
         let along = |m: usize, j: usize| -> f64 {
             self.target[m][j] - (0..k).map(|i| c[i] * self.products[m][i][j]).sum::<f64>()
         };
-        // ‖e‖² from the quadratic form, which is valid for any coefficients.
+        // ‖e‖² follows from the quadratic form, which is valid for any coefficients.
         let explained: f64 = (0..k).map(|i| c[i] * (self.target[0][i] + along(0, i))).sum();
         let square = 1.0 - explained;
         let error = self.rounding * all * all;
@@ -140,7 +152,7 @@ impl CellProducts {
     }
 }
 
-/// Inverse of a positive definite matrix.
+/// Return the inverse of a positive definite k × k matrix. `None` if a pivot is not positive and finite.
 fn inverse(mut matrix: [Row; MAX_TERMS], k: usize) -> Option<[Row; MAX_TERMS]> {
     let mut out = [[0.0; MAX_TERMS]; MAX_TERMS];
     (0..k).for_each(|i| out[i][i] = 1.0);
@@ -164,7 +176,8 @@ fn inverse(mut matrix: [Row; MAX_TERMS], k: usize) -> Option<[Row; MAX_TERMS]> {
     Some(out)
 }
 
-/// Vector B with B > γ + Aᵀ(τ + B), which proves that I + A is nonsingular. `None` if no such vector is found.
+/// Return a vector B with B > γ + Aᵀ(τ + B), which proves that I + A is nonsingular. The arguments are bounds of the
+/// moduli of the matrix A and the vectors γ and τ. `None` if no such vector is found.
 fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> Option<Row> {
     let (mut matrix, mut right) = ([[0.0; MAX_TERMS]; MAX_TERMS], [0.0; MAX_TERMS]);
     for i in 0..k {
@@ -197,14 +210,15 @@ fn dominating_vector(a: &[Row; MAX_TERMS], gamma: &Row, tau: &Row, k: usize) -> 
     (0..k).all(proved).then_some(b)
 }
 
-/// Two lower bounds of Σε² over a cell of orders, 0 without a proof. ε is the equation error with zero initial
-/// conditions. `terms` lists (signal, midpoint, half width) of the orders of integration, one entry per term.
+/// Return two lower bounds of Σε² over a cell (a box of orders), 0 without a proof. ε is the equation error with zero
+/// initial conditions. `terms` lists (signal, midpoint, half width) of the order of integration of each term.
 ///
-/// The first bound holds for any coefficients. The second, optimized for `goal`, holds for coefficients whose terms sum
-/// up to at most `largest` times the norm of the output.
+/// The first bound holds for any coefficients. The second is optimized to reach `goal`. It holds for coefficients for
+/// which the norms of the terms sum up to at most `largest` times the norm of the output.
 ///
 /// # Errors
-/// No records or terms, too many terms, a signal that is missing or zero, a midpoint below its half width.
+/// [`Error::Structure`] without records or terms, for too many terms, or for a signal that is missing or zero.
+/// [`Error::OutOfRange`] for a midpoint below its half width.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -239,7 +253,8 @@ pub fn cell_bounds(
     Ok((local.bound().lower_bound * square, span.bound(largest, goal / square) * square))
 }
 
-/// Inner products and subspace of a cell with these midpoints and half widths, and the squared norm of the output.
+/// Compute the inner products and the subspace of a cell (box of orders). `terms` lists (signal, midpoint, half width)
+/// of the order of integration of each term. Also return the squared norm of the output.
 pub(super) fn expand_cell(
     records: &[Record],
     output: usize,
@@ -276,7 +291,9 @@ pub(super) fn expand_cell(
     Ok((local, span, square))
 }
 
-/// Return an error for records or signals to which certificates do not apply.
+/// Return an error for records or signals to which certificates do not apply: [`Error::Length`] for records with
+/// different numbers of signals. [`Error::Structure`] without records, for a missing signal, a zero or overflowing
+/// output, or a number of terms outside 1 to [`MAX_TERMS`].
 pub(super) fn check_records(records: &[Record], output: usize, signals: impl Iterator<Item = usize>) -> Result<()> {
     let Some(first) = records.first() else {
         return Err(Error::Structure { what: "no record is given".into(), remedy: "give at least one run".into() });

@@ -1,5 +1,5 @@
-//! Inner products for a certificate, computed once for the midpoints of all cells; also the region of orders and its
-//! cells.
+//! Inner products for a certificate, computed once for the midpoints of all cells. Also the region of orders and its
+//! cells (boxes of orders).
 
 use std::collections::BTreeMap;
 
@@ -12,71 +12,86 @@ use crate::order_search::control::Control;
 use crate::parallel;
 use crate::regressors::Record;
 
-/// Width of the largest cells. A bound over wider cells rarely proves anything.
+/// Width of the largest cells in each order. A bound over wider cells rarely exceeds 0.
 const MAX_CELL_WIDTH: f64 = 0.1;
-/// Maximum bisection level for which tables are stored. Deeper cells, up to [`MAX_CELL_LEVEL`], use expansions about
-/// the midpoints of stored tables.
+/// Maximum bisection level for which inner products are stored. For deeper cells (boxes of orders), up to
+/// [`MAX_CELL_LEVEL`], they are expanded about the midpoints of this level.
 const MAX_TABLE_LEVEL: u8 = 3;
+/// Maximum bisection level of a cell (box of orders).
 pub(super) const MAX_CELL_LEVEL: u8 = 10;
-/// Pairs of derivatives with tabulated products, in the order of [`pair_position`].
+/// Orders of the pairs of derivatives whose products are stored, in the sequence of [`pair_position`].
 const DERIVATIVE_PAIRS: [(usize, usize); EXPANSION_COLUMNS * (EXPANSION_COLUMNS + 1) / 2] =
     [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)];
-/// Number of columns per task whose products with all others are computed.
+/// Number of columns per parallel task whose products with all columns are computed.
 const COLUMNS_PER_TASK: usize = 64;
 
-/// Cell of the bisection: level and position of each term's interval.
+/// Cell of the bisection: an interval of orders of integration for each term.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cell {
+    /// Bisection level of the interval of each term.
     pub(super) level: [u8; MAX_TERMS],
+    /// Number of the interval of each term. It starts at this number times the width of the level.
     pub(super) at: [u32; MAX_TERMS],
-    /// Lower bound inherited from the parent cell.
+    /// Lower bound of the relative squared residual that was proved for the parent cell.
     pub(super) inherited_bound: f64,
 }
 
-/// Intervals of the integration orders of one signal, by level: number of the first interval, and index of its
-/// midpoint.
+/// Intervals of the orders of integration of one signal, by bisection level: number of the first interval, and index of
+/// the midpoint (node) of that interval.
 type LevelIntervals = Vec<(usize, usize)>;
 
-/// Tables of inner products for the bounds of cells. A node is the midpoint of an interval of orders of one signal.
+/// Tables of inner products for the bounds of cells (boxes of orders). A node is the midpoint of an interval of orders
+/// of integration of one signal.
 pub(super) struct GramTables {
-    /// Intervals and node of each term. A term of fixed order has a node and no intervals.
+    /// Intervals of orders of integration of each term. A term of fixed order has no intervals but the index of its
+    /// node.
     terms: Vec<(Option<LevelIntervals>, usize)>,
-    /// Highest level with tables.
+    /// Highest bisection level of intervals with stored inner products.
     table_level: u8,
     /// Memory of the tables \[bytes\].
     pub(super) bytes: u64,
+    /// Number of nodes: orders of integration with stored inner products.
     nodes: usize,
+    /// Total number of samples of all records.
     samples: usize,
-    /// Products x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ of derivatives of columns, by [`DERIVATIVE_PAIRS`] of n and m, then j, then i.
+    /// Products x_i⁽ⁿ⁾·x_j⁽ᵐ⁾ of the derivatives of orders n and m of the columns at nodes i and j. Ordered by the pair
+    /// (n, m) of [`DERIVATIVE_PAIRS`], then j, then i.
     products: [Vec<f64>; DERIVATIVE_PAIRS.len()],
+    /// Products of the regressor columns and their derivatives by the order with the measured output, scaled to unit
+    /// norm. Ordered by derivative, then by node.
     target: [Vec<f64>; EXPANSION_COLUMNS],
+    /// Upper bounds of the norms of a regressor column and its derivatives by the order, by node.
     sizes: Vec<[f64; EXPANSION_COLUMNS]>,
+    /// Upper bound of the remainder of the Taylor expansion in the order, by node.
     rests: Vec<f64>,
 }
 
-/// Relative distance from an interval up to which orders belong to it, above the rounding error.
+/// Distance from an interval, relative to its width, up to which orders belong to it. It is above the rounding error.
 const TOUCHING_TOLERANCE: f64 = 1e-6;
 
-/// Position of n and m in [`DERIVATIVE_PAIRS`], n ≤ m.
+/// Return the position of the pair (n, m), n ≤ m, in [`DERIVATIVE_PAIRS`].
 fn pair_position(n: usize, m: usize) -> usize {
     m * (m + 1) / 2 + n
 }
 
-/// Term at the midpoint of a cell: node, distance from the node, half width.
+/// Midpoint of a cell (box of orders) for one term. A node is an order of integration with stored inner products.
 #[derive(Debug, Clone, Copy, Default)]
 struct Middle {
+    /// Index of the node about which inner products are expanded.
     node: usize,
-    /// Powers of the distance from the node, divided by factorials.
+    /// Powers of the distance of the midpoint from the node, divided by factorials, from power 0 on.
     off: [f64; EXPANSION_COLUMNS],
+    /// Half width of the interval of orders of integration.
     half: f64,
 }
 
-/// Width of an interval at this level.
+/// Return the width of an interval of orders at this bisection level.
 pub(super) fn cell_width(level: u8) -> f64 {
     MAX_CELL_WIDTH / f64::from(1_u32 << level)
 }
 
-/// Intervals of a level that contain or touch orders in this range: the first and their number.
+/// Return the intervals of a bisection level that contain or touch orders in this range: the number of the first
+/// interval, and their count.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn level_intervals((low, high): (f64, f64), level: u8) -> (usize, usize) {
     let first = (low / cell_width(level) - TOUCHING_TOLERANCE).floor().max(0.0) as usize;
@@ -84,13 +99,16 @@ fn level_intervals((low, high): (f64, f64), level: u8) -> (usize, usize) {
     (first, end.max(first + 1) - first)
 }
 
-/// Nodes of all signals. A node is the midpoint of an interval of integration orders of one signal.
+/// Nodes of all signals. A node is the midpoint of an interval of orders of integration of one signal.
 struct NodeLayout {
-    /// Signal, midpoint and half width of each node.
+    /// Signal, order of integration at the midpoint, and half width of each node.
     nodes: Vec<(usize, f64, f64)>,
+    /// Intervals of orders of integration of each term. A term of fixed order has no intervals but the index of its
+    /// node.
     terms: Vec<(Option<LevelIntervals>, usize)>,
 }
 
+/// Return the nodes of a region, for bisection levels up to `deepest`.
 #[allow(clippy::cast_precision_loss)]
 fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
     let mut nodes = Vec::new();
@@ -125,16 +143,17 @@ fn lay_out_nodes(region: &Region, deepest: u8) -> NodeLayout {
     NodeLayout { nodes, terms }
 }
 
-/// Memory of the regressors, of their derivatives and of all inner products for this number of nodes \[bytes\].
+/// Return the memory of the regressors, their derivatives and all inner products for this number of nodes \[bytes\].
 fn bytes(nodes: usize, samples: usize) -> u64 {
     8 * nodes as u64 * (DERIVATIVE_PAIRS.len() * nodes + 2 * EXPANSION_COLUMNS * samples) as u64
 }
 
 impl GramTables {
-    /// Build the tables to the deepest level that the memory allows. Runs on the current thread pool.
+    /// Build the tables to the deepest bisection level that `memory` \[bytes\] allows. Runs on the current thread pool.
     ///
     /// # Errors
-    /// [`Error::Memory`], [`Error::Interrupted`], and the errors of the regressor expansion.
+    /// [`Error::Memory`] if even the tables to level 2 need too much memory, [`Error::Interrupted`] after a stop
+    /// request. [`Error::Structure`] for a signal that is zero or overflows.
     pub(super) fn new(records: &[Record], region: &Region, memory: u64, control: &Control) -> Result<Self> {
         let target: Vec<f64> = records.iter().flat_map(|r| r.signal(region.output)).copied().collect();
         let samples = target.len();
@@ -194,12 +213,12 @@ impl GramTables {
         })
     }
 
-    /// Whether a term's order of integration is fixed.
+    /// Return true if the order of integration of a term is fixed.
     pub(super) fn has_fixed_order(&self, term: usize) -> bool {
         self.terms[term].0.is_none()
     }
 
-    /// Interval of the integration order of a term in a cell.
+    /// Return the interval of orders of integration of a term in a cell (box of orders).
     pub(super) fn order_interval(&self, region: &Region, cell: &Cell, term: usize) -> (f64, f64) {
         if self.has_fixed_order(term) {
             let (_, fixed_order) = region.integrations(term);
@@ -209,7 +228,8 @@ impl GramTables {
         (at * width, (at + 1.0) * width)
     }
 
-    /// Intervals of a term at the coarsest level: the first and their number.
+    /// Return the intervals of a term at the coarsest bisection level: the number of the first interval, and their
+    /// count.
     pub(super) fn initial_intervals(&self, region: &Region, term: usize) -> (usize, usize) {
         if self.has_fixed_order(term) {
             (0, 1)
@@ -218,7 +238,7 @@ impl GramTables {
         }
     }
 
-    /// Midpoint of a cell.
+    /// Return the midpoint of a cell (box of orders) for each term.
     fn middle(&self, cell: &Cell) -> [Middle; MAX_TERMS] {
         let mut out = [Middle::default(); MAX_TERMS];
         for (term, ((stretches, fixed_node), out)) in self.terms.iter().zip(&mut out).enumerate() {
@@ -240,7 +260,7 @@ impl GramTables {
         out
     }
 
-    /// Product of the nth derivative of one column and the mth derivative of another column, at nodes.
+    /// Return the product of the nth derivative of the column at node i and the mth derivative of the column at node j.
     fn raw(&self, (i, n): (usize, usize), (j, m): (usize, usize)) -> f64 {
         if n <= m {
             self.products[pair_position(n, m)][j * self.nodes + i]
@@ -249,7 +269,8 @@ impl GramTables {
         }
     }
 
-    /// Product of the nth and mth derivative of two columns at midpoints, from cubic expansions about the nodes.
+    /// Return the product of the nth derivative of one column and the mth derivative of another, both at cell
+    /// midpoints. It follows from cubic expansions about the nodes, at which products are stored.
     fn product(&self, a: &Middle, n: usize, b: &Middle, m: usize) -> f64 {
         let mut sum = 0.0;
         for p in n..EXPANSION_COLUMNS {
@@ -263,7 +284,8 @@ impl GramTables {
         sum
     }
 
-    /// Product of the mth derivative with the target, and an upper bound of its norm.
+    /// Return the product of the measured output with the mth derivative of a column at a cell (box of orders)
+    /// midpoint. Also return an upper bound of the norm of this derivative.
     fn target_product(&self, a: &Middle, m: usize) -> (f64, f64) {
         let all = (m..EXPANSION_COLUMNS).map(|q| (a.off[q - m], q));
         all.fold((0.0, 0.0), |(sum, size), (weight, q)| {
@@ -271,7 +293,7 @@ impl GramTables {
         })
     }
 
-    /// Inner products from which a cell is bounded.
+    /// Return the inner products from which the bound of a cell (box of orders) is computed.
     pub(super) fn local(&self, cell: &Cell) -> CellProducts {
         let k = self.terms.len();
         let middles = self.middle(cell);
@@ -289,7 +311,7 @@ impl GramTables {
         local
     }
 
-    /// Subspace spanned by the columns of a cell and their first derivatives.
+    /// Return the subspace spanned by the columns at the midpoint of a cell (box of orders) and their derivatives.
     pub(super) fn span(&self, cell: &Cell) -> DerivativeSubspace {
         let middles = self.middle(cell);
         let mut span = DerivativeSubspace::new(self.samples);
@@ -303,13 +325,13 @@ impl GramTables {
     }
 }
 
-/// Rounding tolerance of an order.
+/// Rounding tolerance of an order or of a difference of orders.
 const ORDER_TOLERANCE: f64 = 1e-9;
 
-/// Interval of orders of one term.
+/// Interval of orders ν of one term.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {
-    /// Signal of the term.
+    /// Signal index of the term.
     pub signal: usize,
     /// Lowest order, equal to `highest` for a fixed order.
     pub lowest: f64,
@@ -320,11 +342,11 @@ pub struct Range {
 /// Region of orders of one equation: an interval for each order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Region {
-    /// Output of the equation.
+    /// Signal index of the output.
     pub output: usize,
-    /// Lowest and highest order of the equation.
+    /// Lowest and highest order α of the equation.
     pub alpha: (f64, f64),
-    /// Intervals of the terms' orders, none above the order of the equation.
+    /// Intervals of the orders of the terms. Orders above the order of the equation are excluded.
     pub terms: Vec<Range>,
     /// Minimum difference between the order of an output term and the order of the equation, and between two orders of
     /// one signal. At difference 0 the equation would be an identity, or two terms would coincide.
@@ -332,7 +354,7 @@ pub struct Region {
 }
 
 impl Region {
-    /// Raise an error if the intervals do not form a region.
+    /// Return [`Error::OutOfRange`] if the intervals do not form a region.
     pub(super) fn check(&self) -> Result<()> {
         let range = |name: &str, value: f64, range: &str| Error::OutOfRange {
             name: name.into(),
@@ -355,24 +377,24 @@ impl Region {
         Ok(())
     }
 
-    /// True if the signal of a term is the output.
+    /// Return true if the signal of a term is the output.
     fn own(&self, term: usize) -> bool {
         self.terms[term].signal == self.output
     }
 
-    /// Lowest and highest integration order α − ν of a term.
+    /// Return the lowest and the highest order of integration α − ν of a term.
     pub(super) fn integrations(&self, term: usize) -> (f64, f64) {
         let least = if self.own(term) { self.min_separation } else { 0.0 };
         ((self.alpha.0 - self.terms[term].highest).max(least), self.alpha.1 - self.terms[term].lowest)
     }
 
-    /// Whether two terms may be interchanged.
+    /// Return true if two terms are interchangeable: their signals and intervals are equal, and their orders vary.
     fn are_interchangeable(&self, a: usize, b: usize) -> bool {
         self.terms[a] == self.terms[b] && self.terms[a].lowest < self.terms[a].highest
     }
 
-    /// Interval of the equation's order for which the first terms have orders of integration within these intervals.
-    /// `None` if it is empty.
+    /// Return the interval of the order α of the equation for which the first terms may have orders of integration
+    /// within these intervals. `None` if it is empty.
     pub(super) fn alpha_interval(&self, within: &[(f64, f64)]) -> Option<(f64, f64)> {
         let (mut low, mut high) = self.alpha;
         for (term, &(a, b)) in within.iter().enumerate() {
@@ -387,7 +409,7 @@ impl Region {
                 if self.terms[other].signal != self.terms[term].signal {
                     continue;
                 }
-                // Interchangeable terms are ordered by their orders.
+                // Interchangeable terms are sorted by their orders.
                 let ways = [d - a, if self.are_interchangeable(other, term) { f64::NEG_INFINITY } else { b - c }];
                 if ways[0].max(ways[1]) < self.min_separation - ORDER_TOLERANCE {
                     return None;
@@ -397,8 +419,8 @@ impl Region {
         (low <= high + ORDER_TOLERANCE).then_some((low, high))
     }
 
-    /// Return (order of the equation, orders of its terms) for the integration orders `etas`; None if no order
-    /// of the equation in the region allows them.
+    /// Return the order α of the equation and the orders ν of its terms for the orders of integration `etas`. `None` if
+    /// no α of the region allows them.
     pub(super) fn orders(&self, etas: &[f64]) -> Option<(f64, Vec<f64>)> {
         let points: Vec<(f64, f64)> = etas.iter().map(|&eta| (eta, eta)).collect();
         let (low, high) = self.alpha_interval(&points)?;
@@ -406,7 +428,8 @@ impl Region {
         Some((alpha, etas.iter().map(|eta| alpha - eta).collect()))
     }
 
-    /// Integration orders in the region that are nearest to the midpoint of a cell. `None` if the cell contains none.
+    /// Return the orders of integration in the region that are nearest to the midpoint of a cell (box of orders), given
+    /// as one interval per term. `None` if the cell contains no orders of the region.
     pub(super) fn midpoint_orders(&self, within: &[(f64, f64)]) -> Option<Vec<f64>> {
         let (low, high) = self.alpha_interval(within)?;
         let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);
@@ -414,7 +437,8 @@ impl Region {
         self.of_orders(alpha, &etas.iter().map(|eta| alpha - eta).collect::<Vec<_>>())
     }
 
-    /// Orders of integration for an equation's order and its terms' orders, each clipped to its interval.
+    /// Return the orders of integration for the order `alpha` of the equation and the orders of its terms, each clipped
+    /// to its interval. `None` if the result is not in the region.
     pub(super) fn of_orders(&self, alpha: f64, orders: &[f64]) -> Option<Vec<f64>> {
         let alpha = alpha.clamp(self.alpha.0, self.alpha.1);
         let inside = |(term, order): (usize, &f64)| {

@@ -1,48 +1,57 @@
-//! Taylor expansion of the regressor I^η s in its order η, with a bound of the remainder.
+//! Taylor expansion of a regressor I^η s in its order of integration η, with a bound of the remainder. I^η is the
+//! fractional integral of order η, and s a signal.
 //!
-//! The kernel v_n = Δ²n^{η+1} is differentiated term by term. Columns may be scaled, also by e^{−λ(η−η₀)}. If λ is the
-//! mean logarithmic slope of the column at η₀, the scaled column changes its direction but hardly its norm. The
-//! remainder follows from a bound of the fourth derivative, which is a mean of d²/dt² t^{η+1}(ln t − λ)⁴ over two
-//! pulses. Its terms increase with η for t ≥ 1.
+//! The kernel v_n = Δ²n^{η+1} of I^η at distance n is differentiated by η term by term. Columns may be scaled, also by
+//! e^{−λ(η−η₀)}. If λ is the mean logarithmic slope of the column at η₀, the scaled column changes its direction but
+//! hardly its norm. The remainder follows from a bound of the fourth derivative by η. This derivative is a mean of
+//! d²/dt² t^{η+1}(ln t − λ)⁴ over two pulses (sampling intervals), with the distance t. The terms of the bound increase
+//! with η for t ≥ 1.
 
 use crate::error::{Error, Result};
 use crate::parallel::Stop;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 
-/// Maximum number of terms of an equation.
+/// Maximum number of terms of an equation with a certificate.
 pub(super) const MAX_TERMS: usize = 6;
-/// Highest derivative of the expansion.
+/// Highest derivative by the order of integration in the Taylor expansion of a regressor.
 pub(super) const EXPANSION_DEGREE: usize = 3;
 /// Number of columns of the expansion: the value and its derivatives.
 pub(super) const EXPANSION_COLUMNS: usize = EXPANSION_DEGREE + 1;
 
-/// Number of terms of the binomial sum at distances below [`NEAR_DISTANCE_PULSES`], where it converges slowly, and
-/// above. The omitted terms, 4^−26 and 64^−10, are below the rounding error.
+/// Number of terms of the binomial sum of the kernel: at distances below [`NEAR_DISTANCE_PULSES`], where it converges
+/// slowly, and at larger distances. The omitted terms, 4^−26 and 64^−10, are below the rounding error.
 const BINOMIAL_TERMS: [usize; 2] = [26, 10];
+/// Distance \[sampling intervals\] from which the binomial sum converges fast.
 const NEAR_DISTANCE_PULSES: usize = 8;
 
 /// Factorials of 0 to 4.
 const FACTORIAL_TABLE: [f64; 5] = [1.0, 1.0, 2.0, 6.0, 24.0];
 
-/// Expansion of the regressor of one signal about one order. Records are concatenated, and the value has unit norm.
+/// Expansion of the regressor of one signal about one order of integration. Records are concatenated, and the value has
+/// unit norm.
 pub(super) struct RegressorExpansion {
+    /// Value and derivatives of the regressor by the order η, at the order η₀ of the expansion. Before differentiation
+    /// it is scaled by e^{−λ(η−η₀)}, with its mean logarithmic slope λ at η₀.
     pub(super) columns: [Vec<f64>; EXPANSION_COLUMNS],
-    /// Norms of the columns.
+    /// Upper bounds of the norms of the value and the derivatives.
     pub(super) sizes: [f64; EXPANSION_COLUMNS],
-    /// Remainder: largest distance of a column within the half width from its Taylor series.
+    /// Upper bound of the distance of the scaled regressor from its Taylor series, for orders within the half width.
     pub(super) remainder: f64,
 }
 
-/// Binomial sums Σ_k C(η+1, 2k) n^{−2k}, their derivatives divided by factorials, n^{η+1} and ln n, for distances n ≥
-/// 2.
+/// Binomial sums of the kernel of I^η at distances n ≥ 2 \[sampling intervals\].
 struct BinomialSums {
+    /// Order of integration η.
     eta: f64,
+    /// Sum Σ_k C(η+1, 2k) n^{−2k} over k ≥ 1, and its derivatives by η divided by factorials, by distance n.
     sums: Vec<[f64; EXPANSION_COLUMNS]>,
+    /// Values n^{η+1} and ln n, by distance n.
     powers: Vec<(f64, f64)>,
 }
 
 impl BinomialSums {
+    /// Compute the binomial sums for distances from 2 to `m` − 1.
     #[allow(clippy::cast_precision_loss)]
     fn new(eta: f64, m: usize) -> Self {
         // Derivatives of binomial coefficients, as truncated series in the increment of η.
@@ -75,7 +84,7 @@ impl BinomialSums {
         Self { eta, sums: sums.collect(), powers: powers.collect() }
     }
 
-    /// Derivative (∂/∂η − μ)^j v_n of the scaled kernel, n = 1 … m.
+    /// Return the derivative (∂/∂η − μ)^j v_n of the kernel v of I^η, for n = 1 … m.
     fn derivative(&self, j: usize, mu: f64, m: usize) -> Vec<f64> {
         let power = |x: f64| x.powi(i32::try_from(j).unwrap_or(0));
         let double = libm::exp2(self.eta + 1.0);
@@ -95,7 +104,8 @@ impl BinomialSums {
     }
 }
 
-/// Sum over n of upper bounds of |(∂/∂η − μ)⁴ v_n|, for all orders up to `highest`.
+/// Return the sum over n = 1 … m of upper bounds of |(∂/∂η − μ)⁴ v_n| for all orders η up to `highest`. v is the kernel
+/// of I^η.
 #[allow(clippy::cast_precision_loss)]
 fn fourth_derivative_bound(highest: f64, mu: f64, m: usize) -> f64 {
     let b = highest;
@@ -115,20 +125,22 @@ fn fourth_derivative_bound(highest: f64, mu: f64, m: usize) -> f64 {
     sum
 }
 
+/// Return the inner product of two vectors.
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 impl RegressorExpansion {
-    /// Expand I^eta of a signal, for orders of integration within `half` of eta.
+    /// Expand the fractional integral of a signal about the order `eta`, for orders within `half` of it.
     ///
     /// # Errors
-    /// [`Error::Structure`] if its norm is not a positive finite number, [`Error::Interrupted`].
+    /// [`Error::Structure`] if the norm of the integral is not a positive finite number. [`Error::Interrupted`] after a
+    /// stop request.
     pub(super) fn new(records: &[Record], signal: usize, eta: f64, half: f64, stop: &Stop) -> Result<Self> {
         let mut columns: [Vec<f64>; EXPANSION_COLUMNS] = Default::default();
         let mut errors = [0.0; EXPANSION_COLUMNS];
         let mut expansions = Vec::with_capacity(records.len());
-        // The unit of time is the pulse length of the first record.
+        // The unit of time is the sampling interval of the first record.
         let first = records.first().map_or(1.0, Record::step);
         for record in records {
             stop.check()?;
@@ -192,7 +204,7 @@ impl RegressorExpansion {
 }
 
 impl BinomialSums {
-    /// Sum over n of the moduli of the summands of the derivative.
+    /// Return the sum over n = 1 … m of the moduli of the summands of [`Self::derivative`].
     fn moduli(&self, j: usize, mu: f64) -> f64 {
         let power = |x: f64| x.abs().powi(i32::try_from(j).unwrap_or(0));
         let near = power(mu) + libm::exp2(self.eta + 1.0) * power(std::f64::consts::LN_2 - mu) + 2.0 * power(mu);
@@ -208,12 +220,13 @@ impl BinomialSums {
     }
 }
 
-/// Relative rounding-error bound of a sum of `m` terms, with a safety factor.
+/// Return a relative rounding-error bound of a sum of `m` terms, with a safety factor.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn rounding_unit(m: usize) -> f64 {
     16.0 * f64::EPSILON * (m.max(64) as f64)
 }
 
+/// Return the truncated convolution of a kernel with the signal whose spectrum is given, multiplied by `scale`.
 fn product(kernel: &[f64], spectrum: &Kernel, scale: f64, buffers: &mut Buffers) -> Vec<f64> {
     let mut out = vec![0.0; kernel.len()];
     Kernel::new(kernel).times(spectrum, &mut out, buffers);
@@ -221,7 +234,7 @@ fn product(kernel: &[f64], spectrum: &Kernel, scale: f64, buffers: &mut Buffers)
     out
 }
 
-/// Taylor sum from the first to the third power: Σ `half`^j/j! times one value for each j.
+/// Return the Taylor sum Σ `half`^j/j!·`of(j)` for j = 1, 2, 3.
 pub(super) fn taylor_sum(half: f64, of: impl Fn(usize) -> f64) -> f64 {
     let mut power = 1.0;
     let mut sum = 0.0;

@@ -2,39 +2,47 @@
 //!
 //! Such columns determine the coefficients poorly, and the bound of `cell_bound` is then too low to exclude a cell.
 //! This bound is the distance of the output from a subspace. The columns at the midpoint and their first two
-//! derivatives by the order span it. Columns elsewhere in the cell differ from it by terms of third order only, so the bound holds for
-//! coefficients of limited size.
+//! derivatives by the order span it. Columns elsewhere in the cell differ from it by terms of third order only, so the
+//! bound holds for coefficients of limited size.
 
 use crate::order_search::certificate::regressor_expansion::{rounding_unit, EXPANSION_COLUMNS, MAX_TERMS};
 
 /// Number of columns of the subspace per term: the value and its derivatives.
 const SPANNED_DERIVATIVES: usize = 3;
+/// Maximum number of columns of a [`DerivativeSubspace`].
 const MAX_BASIS_ROWS: usize = SPANNED_DERIVATIVES * MAX_TERMS;
-/// Ridge on the sum of squared coefficients, relative to the goal. The ridge limits the coefficients of nearly
-/// dependent columns.
+/// Ridge parameter times the largest admissible sum of squared coefficients, relative to the goal of the bound. The
+/// ridge limits the coefficients of nearly dependent columns.
 const RIDGE_GOAL_SHARE: f64 = 0.05;
+/// Minimum ridge parameter of [`DerivativeSubspace::bound`].
 const MIN_RIDGE: f64 = 1e-11;
-/// Relative margin for the rounding of the bound.
+/// Relative margin for the rounding error of the lower bound.
 const ROUNDING_MARGIN: f64 = 1e-9;
 
-/// Subspace spanned by the scaled columns x, ωx′, ω²x″/2. In this scaling no derivative has larger coefficients than
-/// the value.
+/// Subspace spanned by the columns x, ωx′, ω²x″/2 of each term. Here ω is the half width of the cell (box of orders),
+/// and derivatives are taken by the order. In this scaling the coefficients of the derivatives are no larger than those
+/// of the values.
 pub(super) struct DerivativeSubspace {
-    /// Term, derivative and scale of each row.
+    /// Term, order of the derivative, and scale factor of each column of the subspace.
     rows: [((usize, usize), f64); MAX_BASIS_ROWS],
+    /// Number of columns of the subspace.
     count: usize,
+    /// Number of terms of the equation.
     terms: usize,
+    /// Inner products of the columns of the subspace.
     matrix: [[f64; MAX_BASIS_ROWS]; MAX_BASIS_ROWS],
+    /// Products of the columns of the subspace with the measured output, scaled to unit norm.
     target: [f64; MAX_BASIS_ROWS],
-    /// Bound of the omitted Taylor terms of a unit column.
+    /// Upper bound of the norm of the omitted Taylor terms of a unit-norm column.
     max_omitted_norm: f64,
-    /// Minimum norm within the cell of a column that has norm 1 at the midpoint.
+    /// Lower bound of the norm, within the cell (box of orders), of a column that has norm 1 at the midpoint.
     min_column_norm: f64,
-    /// Rounding-error bound of a product of two unit columns.
+    /// Rounding-error bound of the product of two unit-norm columns.
     rounding: f64,
 }
 
 impl DerivativeSubspace {
+    /// Return an empty subspace for `samples` samples.
     pub(super) fn new(samples: usize) -> Self {
         Self {
             rows: [((0, 0), 0.0); MAX_BASIS_ROWS],
@@ -48,7 +56,8 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Add a term: half its width, the norms of its columns and the remainder of its expansion.
+    /// Add a term: half width of its interval of orders, norms of its column and the derivatives, and remainder of its
+    /// expansion.
     pub(super) fn add(&mut self, half: f64, sizes: [f64; EXPANSION_COLUMNS], rest: f64) {
         let units = [1.0, half, half * half / 2.0, half * half * half / 6.0];
         for (derivative, unit) in units.into_iter().enumerate().take(if half > 0.0 { SPANNED_DERIVATIVES } else { 1 }) {
@@ -61,7 +70,8 @@ impl DerivativeSubspace {
         self.min_column_norm = self.min_column_norm.min(1.0 - off(1));
     }
 
-    /// Fill in the products of the columns of terms and derivatives, and those with the target.
+    /// Compute the inner products of the columns. `product` and `along` return the products of two derivatives, and of
+    /// a derivative with the measured output. A derivative is given as (term, order).
     pub(super) fn fill(
         &mut self,
         product: impl Fn((usize, usize), (usize, usize)) -> f64,
@@ -78,8 +88,9 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Return a lower bound of the relative squared residual over the cell, 0 without a proof. It holds for all
-    /// coefficients c with Σ‖c x‖ ≤ `largest`·‖y‖. The ridge parameter is tuned to reach the bound `goal`.
+    /// Return a lower bound of the squared residual over the cell (box of orders), relative to the squared norm of the
+    /// output y, 0 without a proof. It holds for all coefficients c with Σ‖c x‖ ≤ `largest`·‖y‖ over the columns x. The
+    /// ridge parameter is tuned to reach the bound `goal`.
     pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
         if self.min_column_norm.is_nan() || self.min_column_norm <= 0.5 || goal.is_nan() {
             return 0.0;
@@ -113,7 +124,7 @@ impl DerivativeSubspace {
         }
     }
 
-    /// Approximate minimizer of the quadratic form with the ridge added.
+    /// Return an approximate minimizer of the quadratic form with the ridge parameter `added` on its diagonal.
     fn ridge_solution(&self, added: f64) -> [f64; MAX_BASIS_ROWS] {
         let n = self.count;
         let mut factor = self.matrix;

@@ -1,24 +1,30 @@
-//! Proofs of infeasibility: no coefficients reduce the error of a candidate to the threshold.
+//! Proofs of infeasibility: no coefficients reduce the output error of a candidate to the limit.
 //!
-//! They are used before the coefficients of a candidate are refined. With d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of
-//! at most L requires |⟨t, w⟩|² ≤ L²(|d|‖t‖ + S)² for every test vector t, by the dual bound, and
+//! They are used before the coefficients of a candidate are refined. Let t be a test vector and w the equation error.
+//! Let d = 1 − Σ c g and S = Σ |c_i| ρ_i over the output terms with coefficients c and convolution matrices F. Here g
+//! is the projection of Fᵀt on t, and ρ = ‖Fᵀt − g t‖. By the dual bound, an error norm of at most L requires |⟨t, w⟩|²
+//! ≤ L²(|d|‖t‖ + S)² for every t. With a = |d|‖t‖,
 //!
 //!   (a + S)² ≤ (1+κ)a² + (1+1/κ)S², S² ≤ Σ c_i²ρ_i²/p_i for any κ, p_i > 0 with Σ p_i = 1.
 //!
-//! Each condition therefore implies that a quadratic form in (c, 1) is not positive. If a weighted sum of these forms
-//! is positive definite, no coefficients satisfy all conditions.
+//! Each condition therefore implies that a quadratic form in (c, 1) is not positive. If a sum of these forms with
+//! positive weights (the multipliers) is positive definite, no coefficients satisfy all conditions.
 
 use crate::linalg::small::packed_index;
 use crate::order_search::dual_bound::test_vectors::{TestVectors, Wide, NO_INDEX};
 use crate::simd::LANE_COUNT;
 
-/// Maximum number of iterations in the search for multipliers of the test vectors. Three suffice on average.
+/// Maximum number of iterations in the search for multipliers. Three suffice on average.
 const MAX_MULTIPLIER_STEPS: usize = 12;
-/// Relative rounding margin of a diagonal element and its row: k² ε with a safety factor.
+/// Relative rounding margin of a diagonal element of a k × k form. It exceeds the rounding error, about k² ε, by a
+/// safety factor.
 const DEFINITENESS_MARGIN: f64 = 1e-12;
 
-/// Contribution of one unknown to the conditions of a group of test vectors t. `error` is its part of ⟨t, w⟩ divided by
-/// the limit, and `divisor` its part of d‖t‖, each as real and imaginary part. `slack` is its ρ.
+/// Contribution of one unknown coefficient to the conditions |⟨t, w⟩| ≤ L(|d|‖t‖ + S) of a group of test vectors t.
+/// `error` is its part of ⟨t, w⟩/L, and `divisor` its part of d‖t‖, each as real and imaginary part. `slack` is its
+/// part of S with rounding errors. Here w is the equation error, and L is the limit of the error norm. The sums d = 1 −
+/// Σ c g and S = Σ |c| ‖Fᵀt − g t‖ are over output terms with coefficient c and convolution matrix F. The number g is
+/// the projection of Fᵀt on t.
 #[derive(Debug, Clone, Copy)]
 struct Effect {
     error: [Wide; 2],
@@ -26,26 +32,36 @@ struct Effect {
     slack: Wide,
 }
 
+/// Contribution of an unknown that does not enter the conditions.
 const NO_EFFECT: Effect =
     Effect { error: [[0.0; LANE_COUNT]; 2], divisor: [[0.0; LANE_COUNT]; 2], slack: [0.0; LANE_COUNT] };
 
-/// Workspace of an infeasibility proof, reused from candidate to candidate.
+/// Workspace of an infeasibility proof, reused for all candidates.
 #[derive(Default)]
 pub(crate) struct InfeasibilityProof {
-    /// Number of unknowns. The last one is the constant 1.
+    /// Number of unknown coefficients, plus one for the constant 1, which comes last.
     unknowns: usize,
-    /// Effect of unknown i on group g, at index g·unknowns + i.
+    /// Contribution of unknown coefficient i to the conditions of group g of test vectors, at index g·unknowns + i.
     effects: Vec<Effect>,
+    /// Current values of the unknown coefficients, then the constant 1.
     at: Vec<f64>,
+    /// Multiplier of the condition of each test vector, by group.
     weights: Vec<Wide>,
-    /// Lower triangle of the weighted quadratic form, row-major.
+    /// Lower triangle of the weighted sum of the quadratic forms, row-major.
     form: Vec<f64>,
+    /// Part of `form` from the squared moduli of the products of test vectors with the equation error, in the same
+    /// layout.
     errors: Vec<f64>,
+    /// Sum of the moduli of all contributions to each diagonal element of `form`.
     sizes: Vec<f64>,
+    /// Factor L D Lᵀ of a quadratic form: lower triangle, row-major.
     factor: Vec<f64>,
 }
 
 impl InfeasibilityProof {
+    /// Set up the conditions on the unknown coefficients that follow from an error norm of at most `limit`. The
+    /// arguments are as in
+    /// [`Bound::proves_infeasible`](crate::order_search::dual_bound::lower_bound::Bound::proves_infeasible).
     #[inline(always)]
     pub(super) fn set_conditions(
         &mut self,
@@ -126,9 +142,10 @@ impl InfeasibilityProof {
         self.at.push(1.0);
     }
 
-    /// Search for multipliers whose quadratic form is positive definite. Each step moves to the minimizer of the last
-    /// form and increases the multipliers of the conditions that are violated there. Return `false` once no condition
-    /// is violated.
+    /// Search for multipliers of the conditions for which the weighted sum of their quadratic forms is positive
+    /// definite, and return true if they are found. Each step moves to the minimizer of the form and increases the
+    /// multipliers of the conditions that are violated there. Return false if no condition is violated, a value is not
+    /// finite, or the maximum number of steps is reached.
     #[inline(always)]
     pub(super) fn find_multipliers(&mut self) -> bool {
         let k = self.unknowns;
@@ -191,7 +208,9 @@ impl InfeasibilityProof {
         false
     }
 
-    /// Violation ratio, |d|‖t‖ and S of each condition of one group at the current point.
+    /// Return three values for each condition |⟨t, w⟩|/L ≤ |d|‖t‖ + S of one group of test vectors t, at the current
+    /// values of the unknowns. They are the squared ratio of the left side to the right side, |d|‖t‖, and S, as in
+    /// [`Effect`].
     #[inline(always)]
     fn state(&self, group: usize) -> [Wide; 3] {
         let zero = [0.0; LANE_COUNT];
@@ -214,7 +233,8 @@ impl InfeasibilityProof {
         [ratios, size, slack]
     }
 
-    /// Assemble the weighted sum of the quadratic inequalities, each with equality at the current point.
+    /// Assemble the weighted sum of the quadratic forms. The free parameters of the underlying inequalities are chosen
+    /// so that equality holds at the current point. `smallest` is a lower bound for the modulus of an unknown.
     #[inline(always)]
     fn assemble(&mut self, states: &[[Wide; 3]], smallest: f64) {
         let k = self.unknowns;
@@ -271,8 +291,8 @@ impl InfeasibilityProof {
     }
 }
 
-/// Factor a symmetric matrix, given by lower rows, into L D Lᵀ. Return the number of leading positive pivots. The rows
-/// of L are valid up to and including the first nonpositive pivot.
+/// Factor a symmetric k × k matrix, given by the rows of its lower triangle, into L D Lᵀ. Return the number of leading
+/// positive pivots. The rows of L are valid up to and including the first nonpositive pivot.
 #[inline(always)]
 fn factorise(matrix: &[f64], k: usize, factor: &mut Vec<f64>) -> usize {
     factor.clear();

@@ -1,11 +1,12 @@
-//! Test vectors linearized in the coefficients: built for one candidate, corrected to first order for others.
+//! Test vectors that are exact for one candidate and corrected to first order for candidates with other coefficients.
 //!
-//! The test vector of the candidate with denominator D₀ and output error e₀ is t₀ = D₀⁻ᵀ sign(e₀).
+//! The denominator of a candidate is D = 1 − Σ c_i F_i over its output terms, with coefficients c_i and convolution
+//! matrices F_i. The test vector of the candidate with denominator D₀ and output error e₀ is t₀ = D₀⁻ᵀ sign(e₀).
 //!
-//! A candidate with the same orders of the output terms has D = D₀ − Σ x_m G_m, where the G_m are combinations of the
-//! kernels F_i of these terms. One Newton step for D⁻ᵀ sign(e₀) gives t = t₀ + Σ x_m v_m with v_m = D₀⁻ᵀ G_mᵀ t₀. Then
-//! Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m up to rounding. The decrease of the bound is of second order, and a few precomputed
-//! norms limit it.
+//! Another candidate with the same orders of the output terms has D = D₀ − Σ x_m G_m. The G_m are combinations of the
+//! F_i that make the vectors G_mᵀt₀ orthogonal. One Newton step for D⁻ᵀ sign(e₀) gives t = t₀ + Σ x_m v_m with v_m =
+//! D₀⁻ᵀ G_mᵀ t₀. Then Dᵀt = D₀ᵀt₀ − Σ x_m x_n G_nᵀ v_m up to rounding. The bound decreases by a term of second order,
+//! which a few precomputed norms limit.
 
 use std::collections::BTreeMap;
 
@@ -18,20 +19,23 @@ use crate::regressors::{Bank, Index, Key, Record};
 use crate::series::{divide, reciprocal, Buffers, Kernel, SumOfProducts};
 use crate::simd;
 
-/// Maximum number of output terms of a candidate.
+/// Maximum number of output terms of a candidate with linearized test vectors.
 pub(crate) const MAX_OWN_TERMS: usize = 4;
-/// Maximum ratio of error to limit on the samples that a vector covers. For a candidate with a larger error the vector
-/// covers only the first samples. The error on these samples is a lower bound of the error on all samples.
+/// Maximum ratio of the error to the limit on the samples that a test vector covers. For a candidate with a larger
+/// error, the vector covers only the first samples. The error on these samples is a lower bound of the error on all
+/// samples.
 const MAX_ERROR_LIMIT_RATIO: f64 = 4.0;
 /// Magnitude below which products of two values do not overflow.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
-/// Whether a test vector that was built for `made_for` proves that the output error of `equation`, Σ|y − ŷ| or
-/// Σ(y − ŷ)², exceeds `limit`. The vector is corrected to first order; the orders of the output must be the same.
+/// Return true if the test vector built for `made_for` proves that the output error of `equation` exceeds `limit`. The
+/// output error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions. The vector is corrected to first order. The
+/// output terms of both equations must have the same orders.
 ///
 /// # Errors
-/// Invalid orders or signals, a wrong number of coefficients, different orders of the output terms, or more than 4 such
-/// terms.
+/// [`Error::Structure`] for invalid signals, and [`Error::Length`] for a wrong number of coefficients.
+/// [`Error::OutOfRange`] for invalid orders, different orders of the output terms, or a number of output terms other
+/// than 1 to 4.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -84,48 +88,62 @@ pub fn excluded_by_linearized_vector(
     Ok(tangents.excludes_candidate(&positions[1], &equation.coefficients, limit, &mut VectorLookup::default()))
 }
 
-/// Test vector and its first-order corrections, over all records.
+/// Test vector t₀ of one candidate and its first-order corrections v_m, one per output term, over all records. D₀ is
+/// the denominator of this candidate, and G_m are orthogonalized kernel matrices of its output terms.
 pub(crate) struct LinearizedVector {
     /// Coefficients of the output terms of the candidate for which the vector is built.
     center: Vec<f64>,
-    /// Coefficients of the kernels in the basis: F_i = G_i + Σ_{j<i} mix[i·k + j] G_j.
+    /// Coefficients of the kernel matrices F_i of the k output terms in the basis of orthogonalized matrices G_i: F_i =
+    /// G_i + Σ_{j<i} mix[i·k + j] G_j.
     mix: Vec<f64>,
-    /// Largest magnitude of each first-order correction vector v_m of the test vector.
+    /// Largest modulus of the values of each first-order correction of the test vector.
     peak_values: Vec<f64>,
+    /// Rounding error ‖D₀ᵀv_m − G_mᵀt₀‖ of each first-order correction v_m of the test vector t₀, in the dual norm. D₀
+    /// is the denominator, and G_m an orthogonalized kernel matrix.
     solution_residuals: Vec<f64>,
-    /// Upper bounds of Σ|g_m| for the series G_m and for each of its components, times the largest norm.
+    /// For each orthogonalized kernel, an upper bound of its sum of moduli, times the largest dual norm of a vector.
+    /// The moduli of its components are also included.
     series_norms: Vec<f64>,
-    /// Norms ‖G_nᵀv_m + G_mᵀv_n‖ for n < m and ‖G_mᵀv_m‖, packed by rows.
+    /// Dual norms of the second-order terms ‖G_nᵀv_m + G_mᵀv_n‖ for n < m, then ‖G_mᵀv_m‖, for each m in sequence. G_m
+    /// are orthogonalized kernel matrices, and v_m the first-order corrections of the test vector.
     second_order_norms: Vec<f64>,
-    /// Norm ‖D₀ᵀt₀‖.
+    /// Dual norm ‖D₀ᵀt₀‖ of the test vector t₀ for the denominator D₀ of its candidate.
     norm: f64,
+    /// Upper bound of the dual norm ‖D₀ᵀt‖ for any vector t with values of at most 1 in modulus. D₀ is the denominator
+    /// of the candidate for which the test vector is built.
     center_norm: f64,
-    /// Products of t₀ and the v_m with the target, the output columns and all input columns, (k + 1) × (k + 1 + number
-    /// of input columns).
+    /// Products of the test vector and of each of its k corrections with the measured output, the k output columns and
+    /// all input columns. Row-major with one row per vector, shape (k + 1) × (k + 1 + number of input columns).
     products: Vec<f64>,
 }
 
-/// All linearized test vectors of a search. They are found by the output columns of a candidate.
+/// All linearized test vectors of a search. They are looked up by the output columns of a candidate.
 pub(crate) struct LinearizedVectors {
     rounding_bounds: RoundingBounds,
-    /// Index among the input columns, [`NO_INDEX`] for an output column.
+    /// Index of each column among the input columns, [`NO_INDEX`] for an output column.
     input_index: Vec<usize>,
+    /// Number of regressor columns of other signals than the output.
     width: usize,
+    /// Range of the vectors in `vectors` for given output columns: first vector, and vector after the last one.
     ranges: BTreeMap<Vec<usize>, (usize, usize)>,
     vectors: Vec<LinearizedVector>,
 }
 
-/// Lookup state of one thread, reused from candidate to candidate.
+/// State of the vector lookup of one thread, reused for all candidates.
 #[derive(Default)]
 pub(crate) struct VectorLookup {
+    /// Regressor columns of the most recent candidate that are integrals of the output.
     own: Vec<usize>,
+    /// Regressor columns of the current candidate that are integrals of the output.
     next_own: Vec<usize>,
+    /// Range of the vectors for these output columns: first vector, and vector after the last one.
     range: (usize, usize),
+    /// Index, within this range, of the vector that excluded the most recent candidate.
     last_vector: usize,
 }
 
 impl LinearizedVectors {
-    /// Return an empty set.
+    /// Return an empty set of linearized test vectors for these records.
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let mut input_index = Vec::new();
         let mut width = 0;
@@ -144,12 +162,12 @@ impl LinearizedVectors {
         }
     }
 
-    /// Memory of one vector for candidates with this many output terms \[bytes\].
+    /// Return the memory of one vector for candidates with `own` output terms \[bytes\].
     pub(crate) fn bytes(&self, own: usize) -> u64 {
         8 * ((own + 1) * (own + 1 + self.width) + own * (2 * own + 4) + 8) as u64
     }
 
-    /// Columns of a candidate that are integrals of the output.
+    /// Return those columns of a candidate that are integrals of the output.
     pub(crate) fn own_columns(&self, terms: &[usize]) -> Vec<usize> {
         terms.iter().copied().filter(|&p| self.input_index[p] == NO_INDEX).collect()
     }
@@ -161,17 +179,18 @@ impl LinearizedVectors {
         self.ranges.insert(own, (from, self.vectors.len()));
     }
 
+    /// Return the number of linearized test vectors.
     pub(crate) fn len(&self) -> usize {
         self.vectors.len()
     }
 
-    /// Memory of all vectors \[bytes\].
+    /// Return the memory of all linearized test vectors \[bytes\].
     pub(crate) fn memory_bytes(&self) -> u64 {
         self.ranges.iter().map(|(own, (from, to))| self.bytes(own.len()) * (to - from) as u64).sum()
     }
 
-    /// Build the vector of the candidate with these columns and coefficients, over the samples up to which its error is
-    /// not far above the limit. `None` if there are none, or on overflow.
+    /// Build the test vector of the candidate with columns `terms` and coefficients `c`. It covers the first samples,
+    /// up to an error of [`MAX_ERROR_LIMIT_RATIO`] times the limit. `None` if it covers no sample or a value overflows.
     pub(crate) fn fit(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -288,7 +307,8 @@ impl LinearizedVectors {
         })
     }
 
-    /// Products of t₀ and of the v_m with target, output columns and input columns.
+    /// Compute the products of the test vector and its corrections with the measured output, the output columns and the
+    /// input columns. The result is row-major with one row per vector.
     fn products(
         &self,
         parts: &[RecordVectors],
@@ -309,7 +329,7 @@ impl LinearizedVectors {
         products
     }
 
-    /// Whether some vector proves that a candidate's raw score exceeds the limit.
+    /// Return true if some vector proves that the raw score (Σ|e| or Σe²) of a candidate exceeds the limit.
     #[inline(always)]
     pub(crate) fn excludes_candidate(
         &self,
@@ -336,7 +356,8 @@ impl LinearizedVectors {
         false
     }
 
-    /// Whether this vector proves that the raw score exceeds the limit, for a candidate with the same output columns.
+    /// Return true if this vector proves that the raw score (Σ|e| or Σe²) of a candidate exceeds the limit. The
+    /// candidate must have the output columns for which the vector was built.
     #[inline(always)]
     pub(crate) fn vector_excludes(
         &self,
@@ -357,7 +378,7 @@ impl LinearizedVectors {
                 filled += 1;
             }
         }
-        // Coordinates with respect to the G_m.
+        // Coordinates of the coefficient differences in the basis of the G_m.
         let mut x = [0.0; MAX_OWN_TERMS];
         for i in 0..k {
             let off = mine[i] - linearized.center[i];
@@ -394,19 +415,21 @@ impl LinearizedVectors {
     }
 }
 
-/// Intermediate vectors on one record, stored in reversed time.
+/// Intermediate vectors on one record, stored in reversed time. t₀ is the test vector, D₀ the denominator, and G_m are
+/// orthogonalized kernels of the output terms.
 struct RecordVectors {
+    /// Denominator of the candidate as a series.
     divisor: Vec<f64>,
-    /// Vectors t₀, v_1, v_2, ….
+    /// Test vector, followed by its first-order corrections, one per output term.
     vectors: Vec<Vec<f64>>,
-    /// Vectors G_mᵀt₀.
+    /// Product of the test vector with each transposed kernel matrix, orthogonalized.
     first_order_terms: Vec<Vec<f64>>,
-    /// Series of G_m.
+    /// Orthogonalized kernels of the output terms as series.
     series: Vec<Vec<f64>>,
 }
 
 impl RecordVectors {
-    /// Compute the corrections v_m, and accumulate the norms that the bound needs.
+    /// Compute the first-order corrections of the test vector, and add to the norms that the bound needs.
     fn add_corrections(&mut self, accumulator: &mut NormAccumulator, buffers: &mut Buffers) {
         let (m, k) = (self.divisor.len(), self.first_order_terms.len());
         let (divisor, inverse) = (Kernel::new(&self.divisor), Kernel::new(&reciprocal(&self.divisor)));
@@ -440,7 +463,8 @@ impl RecordVectors {
     }
 }
 
-/// Norms over all records: the largest modulus, or sums of squares until the root is taken.
+/// Norms over all records: the largest modulus for [`Norm::L1`]. For [`Norm::L2`] they are sums of squares until
+/// [`Self::final_norms`] takes the roots.
 struct NormAccumulator {
     of: Norm,
     norm: f64,
@@ -453,6 +477,8 @@ impl NormAccumulator {
         Self { of, norm: 0.0, solution_residuals: vec![0.0; k], second_order_norms: vec![0.0; k * (k + 1) / 2] }
     }
 
+    /// Return the accumulated norm `so_far` with these values included. Infinite for [`Norm::L1`] if a value is not
+    /// finite.
     fn accumulate(&self, so_far: f64, values: &[f64]) -> f64 {
         // NaN must propagate.
         match self.of {
@@ -462,6 +488,7 @@ impl NormAccumulator {
         }
     }
 
+    /// Take the square roots of the sums of squares for [`Norm::L2`].
     fn final_norms(mut self) -> Self {
         if self.of == Norm::L2 {
             let all = self
@@ -475,7 +502,8 @@ impl NormAccumulator {
     }
 }
 
-/// SIMD task that adds inner products of vectors with columns to `out`, one row per vector.
+/// Task that adds inner products of vectors with columns to `out`, row-major with one row per vector. It is compiled
+/// for the widest vector instructions available.
 struct Products<'a> {
     vectors: &'a [Vec<f64>],
     columns: &'a [&'a [f64]],
@@ -495,10 +523,12 @@ impl simd::SimdKernel for Products<'_> {
     }
 }
 
+/// Return the values in reversed order.
 fn backwards(x: &[f64]) -> Vec<f64> {
     x.iter().rev().copied().collect()
 }
 
+/// Return the largest modulus of finite values. The result is meaningless if a value is NaN.
 fn largest<'a>(values: impl IntoIterator<Item = &'a f64>) -> f64 {
     values.into_iter().fold(0.0, |top: f64, v| if v.abs() <= top { top } else { v.abs() })
 }

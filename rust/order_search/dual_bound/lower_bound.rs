@@ -1,12 +1,14 @@
 //! Dual lower bound of a candidate's output error from a few inner products.
 //!
-//! Let D = 1 − Σ c_i F_i over the terms of the output, and let w = y − Σ c x be the equation error. The output error e
-//! satisfies D e = w. For any test vector t, ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
+//! Let y be the measured output. The terms of the equation have coefficients c and columns x (integrals of the
+//! signals). F_i is the convolution matrix of output term i. Let D = 1 − Σ c_i F_i over the terms of the output, and
+//! let w = y − Σ c x over all terms be the equation error. The output error e satisfies D e = w. For any test vector t,
+//! ⟨t, w⟩ = ⟨t, D e⟩ = ⟨Dᵀt, e⟩, so by Hölder's inequality
 //!
 //!   ‖e‖ ≥ |⟨t, w⟩| / ‖Dᵀt‖ in the dual norm, and ‖Dᵀt‖ ≤ |1 − Σ c_i g_i|·‖t‖ + Σ |c_i|·‖F_iᵀt − g_i t‖
 //!
-//! for any numbers g_i. All inner products and norms are computed once. A candidate then costs about thirty
-//! operations per test vector.
+//! for any numbers g_i. Inner products and norms are computed once for all candidates. The bound of one candidate then
+//! takes about thirty operations per test vector.
 
 use crate::equation::{Equation, Structure};
 use crate::error::{check_length, Result};
@@ -18,11 +20,12 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::LANE_COUNT;
 
-/// Lower bound of an equation's output error from each fixed test vector, with zero initial conditions. The error is
-/// Σ|y − ŷ| or Σ(y − ŷ)².
+/// Return one lower bound of an equation's output error per fixed test vector, with zero initial conditions. The output
+/// error is Σ|y − ŷ| for [`Norm::L1`] and Σ(y − ŷ)² for [`Norm::L2`].
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients that are not one a term.
+/// [`crate::error::Error::OutOfRange`] or [`crate::error::Error::Structure`] for orders or signals that do not form an
+/// equation. [`crate::error::Error::Length`] for a number of coefficients that differs from the number of terms.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -51,12 +54,13 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
     Ok(each)
 }
 
-/// Whether no coefficients of this structure give an output error of at most `limit`. The error is Σ|y − ŷ| or Σ(y −
-/// ŷ)² with zero initial conditions. Fixed coefficients keep their values. `start` is the initial guess of the
-/// coefficients.
+/// Return true if it is proved that no coefficients of this structure give an output error of at most `limit`. The
+/// output error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions. Fixed coefficients keep their values. `start` is
+/// one initial guess per term.
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients that are not one a term.
+/// [`crate::error::Error::OutOfRange`] or [`crate::error::Error::Structure`] for orders or signals that do not form an
+/// equation. [`crate::error::Error::Length`] for a number of coefficients that differs from the number of terms.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -87,11 +91,12 @@ pub fn is_infeasible(
     Ok(bound.proves_infeasible(limit, &positions, fixed, &[], start, &mut InfeasibilityProof::default()))
 }
 
-/// Whether the test vector tailored to one equation proves that another equation's output error exceeds `limit`. The
-/// error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions.
+/// Return true if the test vector tailored to `made_for` proves that the output error of `equation` exceeds `limit`.
+/// The output error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions.
 ///
 /// # Errors
-/// Orders or signals that do not form an equation, or a number of coefficients unlike the number of terms.
+/// [`crate::error::Error::OutOfRange`] or [`crate::error::Error::Structure`] for orders or signals that do not form an
+/// equation. [`crate::error::Error::Length`] for a number of coefficients that differs from the number of terms.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -114,11 +119,12 @@ pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, no
     Ok(excluded_in_turn(record, made_for, std::slice::from_ref(equation), norm, limit)? == [true])
 }
 
-/// Apply [`excluded_by`] to several equations of the same output in sequence, as a search does. Norms of the vector are
-/// cached from one equation to the next.
+/// Apply [`excluded_by`] to several equations of the same output in sequence, and return one result per equation. As in
+/// a search, norms of the test vector are cached from one equation to the next.
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients that are not one a term.
+/// [`crate::error::Error::OutOfRange`] or [`crate::error::Error::Structure`] for orders or signals that do not form an
+/// equation. [`crate::error::Error::Length`] for a number of coefficients that differs from the number of terms.
 pub fn excluded_in_turn(
     record: &Record,
     made_for: &Equation,
@@ -146,8 +152,8 @@ pub fn excluded_in_turn(
         .collect())
 }
 
-/// Return the dual lower bound with all [`MAX_TEST_VECTORS`] fixed test vectors on one record, and the column index of
-/// each term of the structure in the bank of regressors.
+/// Return the dual lower bound with all [`MAX_TEST_VECTORS`] fixed test vectors on one record. Also return the column
+/// index of each term of the structure in the bank of regressors.
 fn build_pool_bound(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, Vec<usize>)> {
     structure.check(record.len(), |_| true)?;
     let mut index = Index::default();
@@ -159,20 +165,21 @@ fn build_pool_bound(record: &Record, structure: &Structure, norm: Norm) -> Resul
     Ok((Bound::new((&[bank], &[target]), norm, true, MAX_TEST_VECTORS, &Stop::default()), positions))
 }
 
-/// Dual lower bound of the error of any candidate, with test vectors that are the same for all candidates. It holds one
-/// set of test vectors per record.
+/// Dual lower bound of the error of any candidate, from test vectors that are the same for all candidates. Each record
+/// has one set of test vectors.
 pub(crate) struct Bound {
     norm: Norm,
     test_vectors: Vec<TestVectors>,
 }
 
 impl Bound {
-    /// Maximum number of test vectors.
+    /// Maximum number of test vectors per record.
     pub(crate) const MAX_TEST_VECTORS: usize = MAX_TEST_VECTORS;
 
-    /// Build `count` test vectors for these records, a multiple of [`LANE_COUNT`] and at most [`MAX_TEST_VECTORS`].
+    /// Build `count` test vectors per record. The count is a multiple of [`LANE_COUNT`] and at most
+    /// [`MAX_TEST_VECTORS`].
     ///
-    /// If `output_error`, the columns of the output enter the denominator D. For the equation error D = 1. Runs on the
+    /// The bound applies to the output error if `output_error` is true, otherwise to the equation error. Runs on the
     /// current thread pool. The result is unusable after a stop request.
     pub(crate) fn new(
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -186,24 +193,27 @@ impl Bound {
         Self { norm, test_vectors }
     }
 
-    /// Test vectors on every record.
+    /// Return the test vectors of each record.
     pub(crate) fn test_vectors(&self) -> &[TestVectors] {
         &self.test_vectors
     }
 
-    /// Number of test vectors.
+    /// Return the number of test vectors per record.
     pub(crate) fn len(&self) -> usize {
         self.test_vectors.first().map_or(0, |p| p.groups * LANE_COUNT)
     }
 
-    /// Return the bound with these test vectors only, in this order. Their number is a multiple of [`LANE_COUNT`].
+    /// Return the bound with only the test vectors `which`, in this order. Their number is a multiple of
+    /// [`LANE_COUNT`].
     pub(crate) fn select_vectors(&self, which: &[usize]) -> Self {
         Self { norm: self.norm, test_vectors: self.test_vectors.iter().map(|p| p.select_vectors(which)).collect() }
     }
 
-    /// Lower bound of a candidate's raw score (Σ|e| or Σe²), and an estimate of it that orders the evaluation.
+    /// Return a lower bound of a candidate's raw score (Σ|e| or Σe²), and an estimate of the score that determines the
+    /// evaluation order.
     ///
-    /// `columns(r)` returns positions and coefficients on record r. The sum stops once the bound exceeds the limit.
+    /// For record r, `columns(r)` returns the columns and coefficients of the terms, then of the initial terms. The sum
+    /// over records stops once the bound exceeds `limit`.
     #[inline(always)]
     pub(crate) fn evaluate<'a>(
         &self,
@@ -236,10 +246,11 @@ impl Bound {
         (bound, guess)
     }
 
-    /// True if it is proved that no coefficients of the columns `terms` give a raw score of at most `limit`.
+    /// Return true if it is proved that no coefficients of the columns `terms` give a raw score (Σ|e| or Σe²) of at
+    /// most `limit`.
     ///
-    /// The slice `fixed` holds the fixed coefficients of the terms. All others, and those of the initial terms, are
-    /// free. `start` is the initial guess: coefficients of the terms, then of the initial terms by record.
+    /// The slice `fixed` has one entry per term, `None` for a free coefficient. The coefficients of the initial terms
+    /// are free. `start` is the initial guess: coefficients of the terms, then of the initial terms by record.
     #[inline(always)]
     pub(crate) fn proves_infeasible(
         &self,
@@ -258,7 +269,8 @@ impl Bound {
         scratch.find_multipliers()
     }
 
-    /// Bound of each test vector separately, summed over records.
+    /// Compute the lower bound of the raw score (Σ|e| or Σe²) from each test vector separately, summed over records.
+    /// Nonpositive or overflowing bounds count as 0.
     pub(crate) fn bound_per_vector<'a>(
         &self,
         columns: impl Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
@@ -279,6 +291,7 @@ impl Bound {
         }
     }
 
+    /// Convert a norm of the error to a raw score: Σ|e| for [`Norm::L1`], Σe² for [`Norm::L2`].
     #[inline(always)]
     fn raw(&self, norm: f64) -> f64 {
         match self.norm {

@@ -1,9 +1,10 @@
-//! Test vectors tailored to single candidates, and rounding-error bounds of their products.
+//! Test vectors that are each tailored to one candidate, and rounding-error bounds of their products.
 //!
-//! A candidate with divisor D and output error e has the vector t = D⁻ᵀ sign(e). For this candidate ⟨t, w⟩/‖Dᵀt‖ equals
-//! its score. For any other candidate it is a lower bound, as for every test vector. Dᵀt is computed exactly, so the
-//! bound is tight also for large coefficients of opposite sign and for noise common to all candidates. The records are
-//! concatenated, so one bound covers the error on all of them.
+//! A candidate has the denominator D = 1 − Σ c F over its output terms, with coefficients c and convolution matrices F.
+//! Its test vector is t = D⁻ᵀ sign(e) for the output error e. For the equation error w of this candidate, ⟨t, w⟩/‖Dᵀt‖
+//! equals its score. For any other candidate it is a lower bound, as for every test vector. Dᵀt is computed exactly, so
+//! the bound is also tight for large coefficients of opposite sign and for noise common to all candidates. The records
+//! are concatenated, so one bound covers the error on all of them.
 
 use rayon::prelude::*;
 
@@ -15,56 +16,64 @@ use crate::regressors::Bank;
 use crate::series::{divide, Buffers, Kernel};
 use crate::simd::{self, LANE_COUNT};
 
-/// Number of samples after which the partial sum of a norm is compared with the limit.
+/// Number of samples after which the partial sum of a norm is compared with its limit.
 const NORM_CHECK_SAMPLES: usize = 8 * LANE_COUNT;
 /// Magnitude below which products and sums do not overflow.
 const MAX_SAFE_MAGNITUDE: f64 = 1e100;
 
-/// Maximum number of output terms of a candidate whose norm is cached.
+/// Maximum number of output terms of a candidate for which norms are cached.
 const MAX_CACHED_OWN_TERMS: usize = 2;
+/// Number of entries of the cache of norms of one thread.
 const NORM_CACHE_ENTRIES: usize = 256;
 
-/// Row of an output column in the transposed products, and its coefficient.
+/// Index of an output column among all output columns, and its coefficient.
 type Weighted = (usize, f64);
 
-/// Test vector over all records and its products with every column.
+/// Test vector t over all records, and its products with every column.
 pub(crate) struct TailoredVector {
     /// Values of the vector, at most 1 in modulus, zero-padded to a multiple of [`NORM_CHECK_SAMPLES`].
     vector: Vec<f64>,
-    /// Products ⟨t, x⟩ with every column x.
+    /// Products of the test vector with every regressor column.
     products: Vec<f64>,
+    /// Product of the test vector with the measured output.
     target: f64,
-    /// Vectors Fᵀt of all output columns, one after another, each as long as the test vector.
+    /// Products Fᵀt with the convolution matrices F of all output columns, one after another. Each is as long as the
+    /// test vector.
     transposed_products: Vec<f64>,
 }
 
-/// Norm ‖Dᵀt‖ of one vector for one candidate. Candidates with the same output columns and similar coefficients have
-/// nearly the same norm.
+/// Dual norm ‖Dᵀt‖ of one test vector t for one candidate with denominator D = 1 − Σ c F over its output terms. F are
+/// convolution matrices. Candidates with the same output columns and similar coefficients c have nearly the same norm.
 #[derive(Clone, Copy)]
 struct CachedNorm {
+    /// Index of the test vector.
     vector: usize,
+    /// Output columns of the candidate (integrals of the output) and their coefficients.
     own: [Weighted; MAX_CACHED_OWN_TERMS],
-    /// Norm ‖Dᵀt‖ plus its rounding-error bound.
+    /// Dual norm ‖Dᵀt‖ plus its rounding-error bound, with the denominator D of the candidate and the test vector t.
     norm: f64,
-    /// Factor in a₂ = share·a₁ + g, where a₁ and a₂ are the vectors Fᵀt of the two output columns.
+    /// Factor in a₂ = share·a₁ + r. Here a₁ and a₂ are the products Fᵀt of the test vector t with the convolution
+    /// matrices F of the two output columns. The rest r is orthogonal to a₁.
     share: f64,
+    /// Dual norms of a₁ and a₂ − share·a₁ as defined for `share`, NaN until they are computed.
     deviation_norms: [f64; MAX_CACHED_OWN_TERMS],
-    /// Rounding-error bound per unit change of a coefficient.
+    /// Rounding-error bound of the norm per unit change of each coefficient.
     slack: [f64; MAX_CACHED_OWN_TERMS],
 }
 
-/// Cache of one thread, reused from candidate to candidate.
+/// Cache of norms of one thread, reused for all candidates.
 #[derive(Default)]
 pub(crate) struct NormCache {
+    /// Output columns of the current candidate (integrals of the output) and their coefficients.
     own: Vec<Weighted>,
-    /// Index of the vector that excluded the previous candidate.
+    /// Index of the test vector that excluded the most recent candidate.
     last_vector: usize,
-    /// Norms by output columns. `None` disables the cache.
+    /// Cached norms for the test vectors, found by the output columns of a candidate. `None` disables the cache.
     norms: Option<Vec<Option<CachedNorm>>>,
 }
 
 impl NormCache {
-    /// Return a cache for candidates visited in index order.
+    /// Return a cache of norms for candidates that are visited in index order.
     pub(crate) fn for_adjacent_candidates() -> Self {
         Self { norms: Some(Vec::new()), ..Self::default() }
     }
@@ -73,13 +82,13 @@ impl NormCache {
 /// Test vectors tailored to candidates, and their rounding-error bounds.
 pub(crate) struct TailoredVectors {
     rounding_bounds: RoundingBounds,
-    /// Row of an output column, [`NO_INDEX`] for any other column.
+    /// Index of each column among the output columns, [`NO_INDEX`] for any other column.
     rows: Vec<usize>,
     pub(crate) vectors: Vec<TailoredVector>,
 }
 
 impl TailoredVectors {
-    /// Memory of one vector \[bytes\].
+    /// Return the memory of one test vector for these banks \[bytes\].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         let samples: usize = banks.iter().map(samples).sum();
         let own = banks.first().map_or(0, |bank| own_columns(bank).len());
@@ -87,7 +96,7 @@ impl TailoredVectors {
             + banks.first().map_or(0, Bank::len) as u64)
     }
 
-    /// Return an empty set for these records.
+    /// Return an empty set of tailored test vectors for these records.
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let mut rows = vec![NO_INDEX; banks.first().map_or(0, Bank::len)];
         if let Some(bank) = banks.first() {
@@ -96,8 +105,8 @@ impl TailoredVectors {
         Self { rounding_bounds: RoundingBounds::new(banks, targets, norm), rows, vectors: Vec::new() }
     }
 
-    /// Build the test vector of the candidate with these columns and coefficients. `None` if its simulation or the
-    /// vector overflows. Runs on the current thread pool.
+    /// Build the test vector of the candidate with columns `terms` and coefficients `c`. `None` if its simulation or
+    /// the vector overflows. Runs on the current thread pool.
     pub(crate) fn fit(
         &self,
         banks: &[Bank],
@@ -157,8 +166,8 @@ impl TailoredVectors {
         sound.then_some(TailoredVector { vector, products, target, transposed_products: acted })
     }
 
-    /// Whether some vector proves that a candidate's raw score exceeds the limit. The vector that excluded the previous
-    /// candidate is tried first.
+    /// Return true if some vector proves that the raw score (Σ|e| or Σe²) of a candidate exceeds the limit. The vector
+    /// that excluded the most recent candidate is tried first.
     #[inline(always)]
     pub(crate) fn excludes_candidate(
         &self,
@@ -235,7 +244,8 @@ impl TailoredVectors {
         false
     }
 
-    /// Upper bound of ‖Dᵀt‖ of a candidate with the same output columns.
+    /// Return an upper bound of ‖Dᵀt‖ for a candidate with the same output columns as the cached norm. D is its
+    /// denominator and t the test vector.
     #[inline(always)]
     fn norm_upper_bound(&self, cached: &CachedNorm, own: &[Weighted; MAX_CACHED_OWN_TERMS]) -> f64 {
         let off = [own[0].1 - cached.own[0].1, own[1].1 - cached.own[1].1];
@@ -245,7 +255,8 @@ impl TailoredVectors {
         (cached.norm + along + self.rounding_bounds.unit * rounding) * (1.0 + self.rounding_bounds.unit)
     }
 
-    /// Compute how much ‖Dᵀt‖ changes per unit change of the coefficients.
+    /// Compute how much ‖Dᵀt‖ changes per unit change of the coefficients, and store it in the cached norm. D is the
+    /// denominator and t the test vector.
     #[inline(always)]
     fn compute_deviation_norms(&self, cached: &mut CachedNorm) {
         let fitted = &self.vectors[cached.vector];
@@ -263,7 +274,7 @@ impl TailoredVectors {
         cached.slack[1] += share.abs() * cached.slack[0];
     }
 
-    /// Dual norm ‖a − share·b‖ of rows whose length is a multiple of [`NORM_CHECK_SAMPLES`].
+    /// Return the dual norm ‖a − share·b‖ of vectors whose length is a multiple of [`NORM_CHECK_SAMPLES`].
     #[inline(always)]
     fn difference_norm(&self, a: &[f64], b: &[f64], share: f64) -> f64 {
         let mut all = [0.0_f64; LANE_COUNT];
@@ -283,7 +294,7 @@ impl TailoredVectors {
         }
     }
 
-    /// Largest possible ‖t‖ in the dual norm.
+    /// Return an upper bound of the dual norm of a test vector, whose values are at most 1 in modulus.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
     fn max_vector_norm(&self) -> f64 {
@@ -293,10 +304,11 @@ impl TailoredVectors {
         }
     }
 
-    /// Dual norm ‖t − Σ c Fᵀt‖ if it is at most `most`. `None` if it is larger or cannot be computed safely.
+    /// Return the dual norm ‖t − Σ c Fᵀt‖ of a test vector t over output columns with convolution matrix F and
+    /// coefficient c. `None` if it exceeds `most` or cannot be computed safely.
     #[inline(always)]
     fn norm_up_to_limit(&self, fitted: &TailoredVector, own: &[Weighted], most: f64) -> Option<f64> {
-        // A NaN limit proves nothing, and the coefficients below cannot overflow.
+        // A NaN limit proves nothing. Products with coefficients below [`MAX_SAFE_MAGNITUDE`] do not overflow.
         if most.is_nan() || most <= 0.0 || !own.iter().all(|(_, c)| c.abs() < MAX_SAFE_MAGNITUDE) {
             return None;
         }
@@ -337,6 +349,7 @@ impl TailoredVectors {
     }
 }
 
+/// Return the number of samples of a bank.
 fn samples(bank: &Bank) -> usize {
     if bank.is_empty() {
         0
@@ -345,17 +358,21 @@ fn samples(bank: &Bank) -> usize {
     }
 }
 
+/// Return the columns that are integrals of the output.
 fn own_columns(bank: &Bank) -> Vec<usize> {
     (0..bank.len()).filter(|&p| !bank.kernel(p).is_empty()).collect()
 }
 
-/// Rounding-error bounds over all records.
+/// Rounding-error bounds of products with test vectors t, |t| ≤ 1, over all records.
 pub(super) struct RoundingBounds {
     pub(super) norm: Norm,
-    /// Rounding-error bound of |⟨t, w⟩| per unit of the coefficient of each column, if |t| ≤ 1.
+    /// Rounding-error bound of the product of a test vector with the equation error, per unit of the coefficient of
+    /// each column.
     pub(super) rounding: Vec<f64>,
+    /// Rounding-error bound of the product of a test vector with the equation error, from the measured output alone.
     pub(super) target_rounding: f64,
-    /// For each output column, the sum of its kernel's moduli times the largest dual norm. Zero for other columns.
+    /// For each output column, the sum of its kernel's moduli times the largest dual norm of a test vector. Zero for
+    /// other columns.
     pub(super) kernel_norms: Vec<f64>,
     /// Largest dual norm of a vector whose values are at most 1 in modulus.
     pub(super) max_dual_norm: f64,
@@ -364,6 +381,7 @@ pub(super) struct RoundingBounds {
 }
 
 impl RoundingBounds {
+    /// Compute the bounds for these records. `targets` is the measured output of each record.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let width = banks.first().map_or(0, Bank::len);
@@ -386,7 +404,8 @@ impl RoundingBounds {
         Self { norm, rounding, target_rounding, kernel_norms, max_dual_norm, unit }
     }
 
-    /// Norm above which the raw score exceeds this limit, with a margin for the rounding of the score.
+    /// Return the norm of the error above which the raw score (Σ|e| or Σe²) exceeds `raw`, with a margin for the
+    /// rounding of the score.
     #[inline(always)]
     pub(super) fn norm_threshold(&self, raw: f64) -> f64 {
         (1.0 + self.unit)
@@ -397,7 +416,7 @@ impl RoundingBounds {
     }
 }
 
-/// Σ |x|.
+/// Return Σ|x|.
 pub(super) fn sum_of_moduli(x: &[f64]) -> f64 {
     x.iter().map(|v| v.abs()).sum()
 }

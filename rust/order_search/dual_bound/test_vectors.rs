@@ -1,7 +1,7 @@
 //! Set of fixed test vectors, and their inner products with the regressors.
 //!
-//! The vectors are complex exponentials with windows that end smoothly. For such a vector t, F_iᵀt is nearly a multiple
-//! of t.
+//! The vectors t are complex exponentials multiplied by windows that end smoothly. For the convolution matrix F of an
+//! output column, Fᵀt is then nearly a multiple of t.
 
 use rayon::prelude::*;
 
@@ -15,23 +15,26 @@ use crate::simd::LANE_COUNT;
 /// One value for each of [`LANE_COUNT`] test vectors.
 pub(super) type Wide = [f64; LANE_COUNT];
 
-/// Minimum frequency of a test vector [cycles per record].
+/// Minimum frequency of a test vector \[cycles per record\].
 const MIN_CYCLES_PER_RECORD: f64 = 0.3;
 
-/// Memory of the spectra of test vectors per batch \[bytes\].
+/// Maximum memory of the spectra of one batch of test vectors \[bytes\].
 const VECTOR_SPECTRA_BYTES: usize = 64 << 20;
+/// Maximum memory of the spectra of one block of output columns \[bytes\].
 const COLUMN_SPECTRA_BYTES: usize = 192 << 20;
 
-/// Window of a test vector. An abrupt end would change all its integrals.
+/// Window by which the complex exponential of a test vector is multiplied. It ends smoothly, because only then does the
+/// transposed convolution with a kernel give nearly a multiple of the test vector.
 #[derive(Debug, Clone, Copy)]
 enum Window {
-    /// Constant 1 up to this fraction of the record, then a half cosine down to 0.
+    /// Window that is 1 up to this fraction of the record, then a half cosine down to 0.
     Taper(f64),
-    /// Exponential decay to e^{−rate} at the end of the record.
+    /// Exponential decay from 1 to e^{−rate} at the end of the record.
     Decay(f64),
 }
 
 impl Window {
+    /// Return the value of the window at time `x`, as a fraction of the record length.
     fn at(self, x: f64) -> f64 {
         match self {
             Self::Taper(flat) if x <= flat => 1.0,
@@ -41,18 +44,19 @@ impl Window {
     }
 }
 
-/// Windows and their number of frequencies. They were chosen by measurements at three noise levels: the late taper
-/// excludes most candidates, the decays exclude those with an early error.
+/// Windows and the number of frequencies for each. They were chosen by measurements at three noise levels. The late
+/// taper excludes most candidates. The decays exclude candidates with an error early in the record.
 const WINDOW_FREQUENCY_COUNTS: [(Window, usize); 3] =
     [(Window::Taper(0.5), 24), (Window::Taper(0.0), 12), (Window::Decay(5.0), 12)];
 
-/// Number of test vectors from which a search selects.
+/// Total number of fixed test vectors. A search selects some of them.
 pub(super) const MAX_TEST_VECTORS: usize = 48;
 
-/// Window and number of cycles per record.
+/// Window and frequency \[cycles per record\] of a test vector.
 type Shape = (Window, f64);
 
-/// Shapes of the first `count` test vectors. The frequencies of every window span the whole range.
+/// Return windows and frequencies of the first `count` test vectors for a record of `m` samples. The frequencies of
+/// every window span the whole range.
 #[allow(clippy::cast_precision_loss)]
 fn vector_shapes(count: usize, m: usize) -> Vec<Shape> {
     let highest = (m as f64 / 32.0).max(4.0);
@@ -70,7 +74,7 @@ fn vector_shapes(count: usize, m: usize) -> Vec<Shape> {
         .collect()
 }
 
-/// Write the real and imaginary part of a test vector to `halves`.
+/// Write the real and the imaginary part of a test vector to `halves`, one vector each.
 #[allow(clippy::cast_precision_loss)]
 fn write_vector((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
     let m = halves[0].len();
@@ -83,7 +87,8 @@ fn write_vector((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
     }
 }
 
-/// The first `count` test vectors, real and imaginary parts. The result is unusable after a stop request.
+/// Return the real and imaginary parts of the first `count` test vectors for a record of `m` samples. The result is
+/// unusable after a stop request.
 pub(super) fn build_vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64>; 2]> {
     vector_shapes(count, m)
         .par_iter()
@@ -97,31 +102,36 @@ pub(super) fn build_vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64
         .collect()
 }
 
-/// Workspace in which one test vector is multiplied by the kernels of the output columns in sequence.
+/// Workspace in which one test vector t is multiplied in sequence by the transposed convolution matrices F of the
+/// output columns.
 struct Vector {
+    /// Real and imaginary part of the test vector.
     halves: [Vec<f64>; 2],
     /// Index of the test vector.
     number: usize,
+    /// Dual norm of the test vector.
     size: f64,
-    /// Spectra of the time-reversed real and imaginary part. Fᵀt is the time reversal of F applied to the time-reversed
-    /// t.
+    /// Spectra of the time-reversed real and imaginary part of the test vector t. For a convolution matrix F, the
+    /// product Fᵀt is the time reversal of F applied to the time-reversed t.
     spectra: [Kernel; 2],
-    /// Vector Fᵀt of the current column, in reversed time.
+    /// Product Fᵀt of the test vector t with the convolution matrix F of the current column, in reversed time.
     here: [Vec<f64>; 2],
+    /// Product Fᵀt of the test vector t with the convolution matrix F of the previous column, in reversed time.
     before: [Vec<f64>; 2],
-    /// Projection g of Fᵀt on t for the current column (real and imaginary part), and the bound of its rounding error.
+    /// Projection of Fᵀt on t for the most recent column (real and imaginary part), and a bound of the rounding error
+    /// of Fᵀt. Here t is the test vector, and F is the convolution matrix of the column.
     last: Option<[f64; 3]>,
 }
 
 impl Vector {
-    /// Return a workspace for this many samples.
+    /// Return a workspace for test vectors on a record of `m` samples.
     fn with_samples(m: usize) -> Self {
         let none = || [0, 1].map(|_| vec![0.0; m]);
         let spectra = [0, 1].map(|_| Kernel::noughts(m));
         Self { halves: none(), number: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
     }
 
-    /// Compute the spectra of the test vector stored as real and imaginary part.
+    /// Compute the spectra of the test vector stored in `halves`. `which` is its index, and `size` its dual norm.
     fn load_spectra(&mut self, which: usize, size: f64, buffers: &mut Buffers) {
         for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
             spectrum.read(half.iter().rev().copied(), buffers);
@@ -130,7 +140,7 @@ impl Vector {
     }
 
     /// Return the entries of [`divisor_effects`] for the next output column, with the distance from the previous column
-    /// in place of the path length. `length` is the sum of the moduli of the column.
+    /// in place of the path length. `length` is the sum of the moduli of the column's kernel.
     fn apply_column(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
         std::mem::swap(&mut self.here, &mut self.before);
         for (spectrum, product) in self.spectra.iter().zip(&mut self.here) {
@@ -144,8 +154,9 @@ impl Vector {
     }
 }
 
-/// Compute g·‖t‖, ‖Fᵀt − g t‖ and the path length of Fᵀt − g t from the first output column, for every output column
-/// and test vector, columns first. The result is unusable after a stop request.
+/// Compute g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖ and a path length for every output column and group of test vectors t.
+/// Here F is the convolution matrix of the column, and g the projection of Fᵀt on t. The path length is the sum of the
+/// distances of Fᵀt − g t between consecutive columns, from the first column on.
 pub(super) fn divisor_effects(
     bank: &Bank,
     own: &[usize],
@@ -157,7 +168,7 @@ pub(super) fn divisor_effects(
     let (m, count) = (vectors.first().map_or(0, |v| v[0].len()), vectors.len());
     let groups = count / LANE_COUNT;
     let mut out = vec![[[0.0; LANE_COUNT]; 4]; own.len() * groups];
-    // Each thread needs its own vector, with two spectra of as many bins as samples.
+    // Each thread needs its own vector, whose two spectra have as many bins as the record has samples.
     let threads = rayon::current_num_threads();
     let batch = (VECTOR_SPECTRA_BYTES / (32 * m.max(1))).max(threads).min(count.max(1));
     // As few blocks of columns as possible, of nearly equal size.
@@ -226,8 +237,9 @@ pub(super) fn divisor_effects(
     out
 }
 
-/// Compute g, ‖u − g t‖, its rounding-error bound and the distance from the previous vector. u and the previous u are
-/// in reversed time. g is the projection of u on t, which is optimal for the L2 norm.
+/// Compute g (real, imaginary), ‖u − g t‖, its rounding-error bound and the distance of u − g t from its value for the
+/// previous vector. Here t is `[a, b]`, u is `[re, im]` in reversed time, and `before` is the previous u, g and
+/// rounding-error bound. The projection g of u on t minimizes the L2 norm of u − g t.
 #[allow(clippy::cast_precision_loss)]
 fn column_effect(
     [a, b]: &[Vec<f64>; 2],
@@ -250,7 +262,7 @@ fn column_effect(
         p * p + q * q
     };
     let count = (a.len() as f64).sqrt();
-    // One pass for both, since a long record does not fit into any cache.
+    // Both sums are computed in one pass, because a long record does not fit into any cache.
     let add = |sum: f64, x: f64| match norm {
         Norm::L1 => sum.max(x),
         Norm::L2 => sum + x,
@@ -273,35 +285,44 @@ fn column_effect(
     [g, h, f64::sqrt(rest) + rounding_error, rounding_error, step]
 }
 
-/// Index of a column that does not enter the denominator.
+/// Index of a column that does not belong to the output and therefore does not enter the denominator.
 pub(crate) const NO_INDEX: usize = usize::MAX;
 
-/// Set of fixed test vectors on one record: products with every column and norms.
+/// Set of fixed test vectors t on one record: products with every column, and norms. A group has [`LANE_COUNT`] test
+/// vectors.
 pub(crate) struct TestVectors {
-    /// Number of [`Wide`] groups of test vectors.
+    /// Number of groups of [`LANE_COUNT`] test vectors.
     pub(crate) groups: usize,
-    /// Products ⟨t, x⟩ of column p and group g at index p·groups + g, real and imaginary part.
+    /// Products of the test vectors of group g with column p, at index p·groups + g. Each is given as real and
+    /// imaginary part.
     pub(crate) products: Vec<[Wide; 2]>,
-    /// Products ⟨t, y⟩ with the target, by group.
+    /// Products of the test vectors with the measured output, by group. Each is given as real and imaginary part.
     pub(crate) target: Vec<[Wide; 2]>,
-    /// Row of a column in `effects`, [`NO_INDEX`] if it is not an output column.
+    /// Row of each column in `effects`, [`NO_INDEX`] if it is not an output column.
     pub(crate) rows: Vec<usize>,
-    /// Values g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and path length of Fᵀt − g t from the first row. The distance of
-    /// two rows is at most the path length between them.
+    /// Values g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖ and path length, by output column, then by group of test vectors t.
+    /// F is the convolution matrix of the column, and g the projection of Fᵀt on t. The path length is the sum of the
+    /// distances of Fᵀt − g t between consecutive columns, from the first column on. The distance between two columns
+    /// is at most the difference of their path lengths.
     pub(crate) effects: Vec<[Wide; 4]>,
-    /// Dual norm ‖t‖, by group.
+    /// Dual norms of the test vectors, by group of [`LANE_COUNT`] vectors.
     pub(crate) size: Vec<Wide>,
-    /// Rounding-error bound of |⟨t, w⟩| per unit of the coefficient of each column.
+    /// Rounding-error bound of the product of a test vector with the equation error, per unit of the coefficient of
+    /// each column.
     pub(crate) rounding: Vec<f64>,
+    /// Rounding-error bound of the product of a test vector with the equation error, from the measured output alone.
     pub(crate) target_rounding: f64,
-    /// Relative rounding-error bound of a sum of m terms.
+    /// Relative rounding-error bound of a sum over all samples of the record.
     pub(crate) unit: f64,
 }
 
-/// Maximum number of output columns whose slack is bounded jointly.
+/// Maximum number of output columns of a candidate whose contributions to the denominator of the bound are bounded
+/// jointly.
 const MAX_JOINT_OWN_COLUMNS: usize = 4;
 
 impl TestVectors {
+    /// Build `count` test vectors on one record, and compute their products. If `output_error` is false, no column
+    /// enters the denominator.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(
         bank: &Bank,
@@ -364,6 +385,7 @@ impl TestVectors {
         }
     }
 
+    /// Return the set with only the test vectors `which`, in this order. Their number is a multiple of [`LANE_COUNT`].
     pub(super) fn select_vectors(&self, which: &[usize]) -> Self {
         let groups = which.len() / LANE_COUNT;
         let pick = |source: &[Wide], g: usize| -> Wide {
@@ -391,6 +413,8 @@ impl TestVectors {
         }
     }
 
+    /// Return the rounding-error bound of the product of a test vector with the equation error, for a candidate with
+    /// these columns and coefficients.
     #[inline(always)]
     pub(super) fn rounding_bound(
         &self,
@@ -403,7 +427,9 @@ impl TestVectors {
         pairs.fold(self.target_rounding, |sum, (&p, c)| sum + c.abs() * self.rounding[p])
     }
 
-    /// Bounds and score estimates of one group of test vectors.
+    /// Return the lower bound of the norm of the error and an estimate of this norm, for each test vector of a group.
+    /// The arguments are columns and coefficients of the terms, then of the initial terms, and the rounding-error bound
+    /// of the products.
     #[inline(always)]
     pub(super) fn group_bounds(
         &self,
@@ -462,10 +488,12 @@ impl TestVectors {
         (bounds, guesses)
     }
 
-    /// Upper bound of ‖Σ c (Fᵀt − g t)‖ over the output columns of a group, whose coefficients c may cancel.
+    /// Return an upper bound of ‖Σ c (Fᵀt − g t)‖ for each test vector t of a group. The sum is over output columns
+    /// with convolution matrix F and coefficient c, and g is the projection of Fᵀt on t. `own` lists row and
+    /// coefficient of each column. The coefficients may cancel.
     ///
-    /// By summation by parts, the sum of all coefficients multiplies the norm of the first column, and each partial sum
-    /// multiplies the length of the path to the next column.
+    /// By summation by parts, the sum of all coefficients multiplies the norm of the first column. Each partial sum
+    /// multiplies the path length to the next column.
     #[inline(always)]
     fn joint_slack(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {
         for i in 1..own.len() {

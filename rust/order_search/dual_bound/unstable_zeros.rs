@@ -1,11 +1,12 @@
-//! Unstable zeros of the denominator of a candidate, which prove without simulation that its simulated output diverges.
+//! Unstable zeros of the denominator of a candidate. They prove without simulation that its simulated output diverges.
 //!
-//! The simulated output obeys D ŷ = N. As polynomials, D(z) ŷ(z) = N(z) + τ(z), where τ contains the terms beyond the
-//! record, which are negligible inside the unit circle. If ‖e‖ ≤ L, then Σ|ŷ| ≤ Σ|y| + L, so |τ| < |N| can be proved on
-//! a closed path inside the unit circle. By Rouché's theorem D ŷ and N have the same number of zeros inside the path,
-//! at least as many as D. A candidate whose D has more zeros than its N therefore exceeds the limit. The zeros are
-//! counted by the winding number along the path, from values at nodes, chords between them, and bounds of the second
-//! derivative.
+//! Let y be the measured output, ŷ the simulated output and e = y − ŷ. The simulation solves D ŷ = N with the
+//! denominator series D and the input part N. As polynomials in the delay z, D(z) ŷ(z) = N(z) + τ(z). The terms τ
+//! beyond the record are negligible inside the unit circle. If ‖e‖ ≤ L for a limit L, then Σ|ŷ| ≤ Σ|y| + L. Therefore
+//! |τ| < |N| can be proved on a closed path inside the unit circle. By Rouché's theorem, D ŷ and N then have the same
+//! number of zeros inside the path, and D has no more zeros than N. A candidate whose D has more zeros than its N
+//! therefore exceeds the limit. The zeros are counted by the winding number along the path. It is computed from values
+//! at nodes, chords between the nodes, and bounds of the second derivative.
 
 use rayon::prelude::*;
 
@@ -18,25 +19,29 @@ use crate::parallel::Stop;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::simd::LANE_COUNT;
 
-/// Decay rates of the paths, per record length. A path encloses the half disc to the right of its rate, with three
-/// times the rate as radius. Slower growth hardly increases the simulated output. Faster growth ends the simulation
-/// early.
+/// Growth rates at which the paths run, per record length. In the plane of growth rate and angular frequency, a path
+/// encloses the part of a disc about 0 to the right of its rate. The radius of the disc is three times the rate. Modes
+/// that grow more slowly hardly increase the simulated output. If they grow faster, the simulation ends early.
 const PATH_DECAY_RATES: [f64; 6] = [20.0, 28.0, 14.0, 40.0, 56.0, 80.0];
-/// Ratio of the radius of a path to its rate.
+/// Ratio of the radius of a path in the complex plane to its growth rate.
 const PATH_RADIUS_RATIO: f64 = 3.0;
+/// Number of chords along the arc and along the straight line of the upper half of a path in the complex plane.
 const PATH_CHORD_COUNTS: [usize; 2] = [25, 39];
+/// Number of chords of the upper half of a path in the complex plane.
 const PATH_SEGMENT_COUNT: usize = PATH_CHORD_COUNTS[0] + PATH_CHORD_COUNTS[1];
-/// Number of nodes of a path in the tables, padded to whole SIMD lanes.
+/// Number of nodes of the upper half of a path in the tables, padded to whole SIMD lanes.
 const PADDED_NODE_COUNT: usize = PATH_SEGMENT_COUNT + LANE_COUNT;
-/// Number of samples that are processed per block.
+/// Number of samples that are processed at a time.
 const SAMPLES_PER_BLOCK: usize = 4096;
+/// Maximum number of samples of a record for which the test for unstable zeros is used.
 const MAX_RECORD_SAMPLES: usize = 1 << 14;
 
-/// Whether zeros of an equation's divisor prove that its output error exceeds `limit`. The error is Σ|y − ŷ| or Σ(y −
-/// ŷ)² with zero initial conditions.
+/// Return true if unstable zeros of an equation's denominator prove that its output error exceeds `limit`. The output
+/// error is Σ|y − ŷ| or Σ(y − ŷ)² with zero initial conditions.
 ///
 /// # Errors
-/// Orders or signals that make no equation, coefficients that are not one a term.
+/// [`crate::error::Error::OutOfRange`] or [`crate::error::Error::Structure`] for orders or signals that do not form an
+/// equation. [`crate::error::Error::Length`] for a number of coefficients that differs from the number of terms.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -68,30 +73,37 @@ pub fn has_unstable_zeros(record: &Record, equation: &Equation, norm: Norm, limi
     Ok(roots.excludes_candidate(&columns, coefficients, limit, &mut 0))
 }
 
-/// Values of every column along the paths, on every record.
+/// Test for unstable zeros of the denominator: values of every regressor column along closed paths in the complex
+/// plane, on every record.
 pub(crate) struct UnstableZeros {
     norm: Norm,
+    /// True for the regressor columns that are integrals of the output.
     own: Vec<bool>,
     records: Vec<PathSums>,
 }
 
-/// Values of every column along the paths, on one record.
+/// Values of the z-transform of every regressor column along closed paths in the complex plane, on one record. For an
+/// output column the kernel is transformed.
 struct PathSums {
+    /// Number of paths in the complex plane.
     paths: usize,
+    /// Number of samples of the record.
     samples: f64,
-    /// Real and imaginary part by column and node, and by segment a bound from the second derivative and rounding.
+    /// Values of the z-transform of each column, ordered by path, then by column: real part and imaginary part at each
+    /// node. The third entry bounds, for each segment, the second-derivative term and the rounding error.
     values: Vec<[[f64; PADDED_NODE_COUNT]; 3]>,
-    /// Maximum of |z^M| on each segment, where M is the number of samples.
+    /// Maximum of |z^M| on each segment of a path, by path. z is the delay variable, and M is the number of samples.
     tails: Vec<[f64; PATH_SEGMENT_COUNT]>,
-    /// Sum of the moduli of each column; for an output column, of its kernel.
+    /// Sum of the moduli of each column. For an output column, sum of the moduli of its kernel.
     sums: Vec<f64>,
     /// Sum of moduli Σ|y| of the output.
     output_modulus: f64,
-    /// Relative rounding-error bound of a sum of M terms.
+    /// Relative rounding-error bound of a sum over all samples.
     unit: f64,
 }
 
-/// Nodes of a half path of this rate: from the real axis along the arc, then down the line to the real axis.
+/// Return the nodes (growth rate, angular frequency) of the upper half of a path with this rate, per record length.
+/// They run from the real axis along the arc, then down the straight line to the real axis.
 #[allow(clippy::cast_precision_loss)]
 fn path_nodes(rate: f64) -> Vec<(f64, f64)> {
     let radius = PATH_RADIUS_RATIO * rate;
@@ -106,7 +118,8 @@ fn path_nodes(rate: f64) -> Vec<(f64, f64)> {
     arc.chain(line).collect()
 }
 
-/// Values of series along a path, and its largest |z^M| by segment. Samples are read block by block.
+/// Compute the values of several series along a path, and the largest |z^M| by segment. M is the number of samples, and
+/// `moduli` are the moduli of the series. The samples are read block by block.
 #[allow(clippy::cast_precision_loss)]
 fn path_sums(
     rate: f64,
@@ -164,6 +177,7 @@ fn path_sums(
 }
 
 impl PathSums {
+    /// Compute the values of all columns of a bank along all paths.
     #[allow(clippy::cast_precision_loss)]
     fn new(bank: &Bank, target: &[f64]) -> Self {
         let (m, width) = (target.len(), bank.len());
@@ -174,7 +188,7 @@ impl PathSums {
         let moduli: Vec<Vec<f64>> = series.iter().map(|x| x.iter().map(|v| v.abs()).collect()).collect();
         let moduli: Vec<&[f64]> = moduli.iter().map(Vec::as_slice).collect();
         let sums = series.iter().map(|x| sum_of_moduli(x)).collect();
-        // Above this limit the powers of a pulse alias.
+        // A larger radius would alias at the sampling interval.
         let rates: Vec<f64> = PATH_DECAY_RATES.into_iter().filter(|rate| PATH_RADIUS_RATIO * rate <= samples).collect();
         let paths: Vec<_> = rates.par_iter().map(|&rate| path_sums(rate, &series, &moduli, unit)).collect();
         let (values, tails): (Vec<_>, Vec<_>) = paths.into_iter().unzip();
@@ -189,8 +203,9 @@ impl PathSums {
         }
     }
 
-    /// Return the number of zeros of D, or of N, inside a path. It is the winding number of the values along the path.
-    /// `None` if a value, or |N| minus its truncation bound, may be 0 on the path.
+    /// Return the number of zeros inside a path of a weighted sum of columns plus the constant `one`. It is the winding
+    /// number of the values along the path. `left_out` bounds the omitted part: a constant, and a multiple of |z^M| for
+    /// M samples. `None` if the sum may be 0 on the path.
     #[inline(always)]
     fn count_zeros(
         &self,
@@ -221,10 +236,10 @@ impl PathSums {
                 let (a, b, c, d) = (re[j + n], im[j + n], re[j + n + 1], im[j + n + 1]);
                 let middle = ((a + c) * (a + c) + (b + d) * (b + d)).sqrt();
                 let half = ((c - a) * (c - a) + (d - b) * (d - b)).sqrt();
-                // NaN counts as near.
+                // NaN counts as a value that may be 0.
                 near[n] |= !(middle - half > 2.0 * slack[j + n] && middle < f64::MAX);
-                // A half path that crosses the imaginary axis contributes one turn, because its mirror image adds the
-                // other half.
+                // A crossing of the imaginary axis by the half path counts as one turn, because the mirrored half adds
+                // a second half turn.
                 let crossed = i32::from((a < 0.0) != (c < 0.0));
                 turns[n] += crossed * if a * d > b * c { 1 } else { -1 };
             }
@@ -234,12 +249,12 @@ impl PathSums {
 }
 
 impl UnstableZeros {
-    /// Whether all records are short enough for the tables.
+    /// Return true if all records are short enough for the tables of the test.
     pub(crate) fn is_affordable(targets: &[Vec<f64>]) -> bool {
         targets.iter().all(|target| target.len() <= MAX_RECORD_SAMPLES)
     }
 
-    /// Memory of the tables for these banks \[bytes\].
+    /// Return the memory of the tables of the test for these banks \[bytes\].
     pub(crate) fn bytes(banks: &[Bank]) -> u64 {
         banks
             .iter()
@@ -247,6 +262,7 @@ impl UnstableZeros {
             .sum()
     }
 
+    /// Compute the tables of all records. `targets` is the measured output of each record.
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
         let own =
             banks.first().map_or(Vec::new(), |bank| (0..bank.len()).map(|p| !bank.kernel(p).is_empty()).collect());
@@ -254,8 +270,8 @@ impl UnstableZeros {
         Self { norm, own, records }
     }
 
-    /// Whether some path proves that a candidate's raw score exceeds the limit. The path that excluded the previous
-    /// candidate is tried first.
+    /// Return true if some path proves that the raw score (Σ|e| or Σe²) of a candidate exceeds the limit. The path
+    /// `last`, which excluded the most recent candidate, is tried first.
     #[inline(always)]
     pub(crate) fn excludes_candidate(
         &self,

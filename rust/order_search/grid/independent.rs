@@ -1,48 +1,56 @@
-//! Order grid with independent orders: α from a list, the order of each term from its own axis.
+//! Order grid with independent orders: the order α of the equation from a list, the order of each term from its own
+//! axis.
 //!
-//! The tuples of orders of one signal are counted, and found by their rank, without being stored.
+//! The combinations of orders of one signal are counted, and found by rank, without being stored.
 
 use crate::equation::{tidy, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
 use crate::fractional::kernels::{MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
 
-/// Maximum number of candidates of one search, which takes about one hour with dual bounds and pruning.
+/// Maximum number of candidates of one search. Such a search takes about one hour with dual bounds and pruning.
 pub const MAX_CANDIDATES: u128 = 10_000_000_000;
-/// Maximum number of prefixes of tuples whose completions are counted when a grid is built, which takes a few seconds.
+/// Maximum number of combinations of all orders of a signal but the last. For each of them, the allowed values of the
+/// last order are counted when a grid is built, which takes a few seconds at most.
 const MAX_PREFIXES: u128 = 1 << 28;
-/// Maximum number of terms of one signal. The number of their permutations fits into 128 bits.
+/// Maximum number of terms of one signal. The factorial of this number fits into 128 bits.
 const MAX_TERMS: usize = 34;
 
-/// Candidate orders of one term.
+/// Candidate orders of one term of an equation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TermAxis {
-    /// Signal of the term.
+    /// Signal index of the term.
     pub signal: usize,
-    /// Orders in any sequence. Those outside the range of an α are excluded for that α.
+    /// Orders ν in any sequence. Orders outside the range for an α are excluded for that α.
     pub values: Vec<f64>,
-    /// Whether this term may be interchanged with another of the same signal (both coefficients free).
+    /// True if this term may be interchanged with another interchangeable term of the same signal, because both
+    /// coefficients are free.
     pub interchangeable: bool,
 }
 
-/// Grid of all orders of one equation: α from a list, each term's order from its own axis.
+/// Grid of all orders of one equation: α from a list, the order ν of each term from its own axis.
 ///
-/// Orders of output terms satisfy 0 ≤ ν < α, other orders 0 ≤ ν ≤ α. Inputs may have a negative order. Orders of one
-/// signal are distinct. Orders of interchangeable terms are sorted, the larger first. Indices ascend with α. For the
-/// same α the tuple of the last signal varies fastest, and within a tuple its last order. Both descend.
+/// Orders of output terms satisfy 0 ≤ ν < α, other orders 0 ≤ ν ≤ α. A fixed order with a single α may exceed it by
+/// less than 1. Terms on inputs may have a negative order. The orders of one signal are distinct. Of interchangeable
+/// terms, the first has the larger order. Candidates are indexed in ascending order of α. For the same α, the last
+/// signal varies fastest, and the last of its orders fastest of all. Within an axis, orders descend.
 #[derive(Debug, Clone)]
 pub struct OrderGrid {
     output: usize,
+    /// Number of terms.
     width: usize,
     pub(super) groups: Vec<Group>,
     pub(super) blocks: Vec<Block>,
     pub(super) count: u64,
 }
 
-/// Candidates of one α: the product of the tuples of all groups.
+/// Candidates with one order α of the equation: all combinations of the orders of the signals.
 #[derive(Debug, Clone)]
 pub(crate) struct Block {
+    /// Order α of the equation.
     pub(crate) alpha: f64,
+    /// Index of the first candidate with this α.
     pub(crate) start: u64,
+    /// Allowed combinations of orders for each signal.
     pub(crate) tuples: Vec<GroupTuples>,
 }
 
@@ -50,9 +58,9 @@ impl OrderGrid {
     /// Build the grid from its axes. `is_input` selects the signals that may have a negative order.
     ///
     /// # Errors
-    /// [`Error::EmptyOrderGrid`], [`Error::OrderGridTooLarge`] before anything of that size is enumerated, an α outside
-    /// (0, 10], [`Error::NotFinite`] for an order that is not finite, [`Error::Structure`] for more than 34 terms of
-    /// one signal.
+    /// [`Error::EmptyOrderGrid`] if no orders are in range. [`Error::OrderGridTooLarge`] for too many candidates,
+    /// before a grid of that size is enumerated. [`Error::OutOfRange`] for an α outside (0, 10]. [`Error::NotFinite`]
+    /// for an order that is not finite. [`Error::Structure`] for more than 34 terms of one signal.
     ///
     /// ```
     /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
@@ -96,7 +104,7 @@ impl OrderGrid {
             })
             .collect();
         let only = alphas.len() == 1;
-        // First position in range of every axis, per α and signal.
+        // First axis position in range, per α, signal and term.
         let firsts: Vec<Vec<Vec<usize>>> = alphas
             .iter()
             .map(|&alpha| {
@@ -153,34 +161,37 @@ impl OrderGrid {
         Ok(Self { output, width: terms.len(), groups, blocks, count: count as u64 })
     }
 
-    /// Number of candidates.
+    /// Return the number of candidates.
     #[must_use]
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// Output of the equation.
+    /// Return the signal index of the output.
     #[must_use]
     pub fn output(&self) -> usize {
         self.output
     }
 
-    /// Number of terms of the equation.
+    /// Return the number of terms of the equation.
     #[must_use]
     pub fn width(&self) -> usize {
         self.width
     }
 
+    /// Return the terms of the equation, grouped by signal.
     pub(crate) fn groups(&self) -> &[Group] {
         &self.groups
     }
 
+    /// Return the candidates, grouped by the order α of the equation.
     pub(crate) fn blocks(&self) -> &[Block] {
         &self.blocks
     }
 }
 
-/// Return an error for a grid whose axes are too long, before it is enumerated.
+/// Return [`Error::OrderGridTooLarge`] for a grid whose axes are too long, before it is enumerated. `axes` lists the
+/// values by signal and term, and `firsts` the first position in range by α, signal and term.
 fn check_size(axes: &[Vec<Vec<f64>>], firsts: &[Vec<Vec<usize>>]) -> Result<()> {
     let lengths = |axes: &[Vec<f64>], first: &[usize]| -> Vec<u128> {
         axes.iter().zip(first).map(|(a, f)| (a.len() - f) as u128).collect()
@@ -200,7 +211,7 @@ fn check_size(axes: &[Vec<Vec<f64>>], firsts: &[Vec<Vec<usize>>]) -> Result<()> 
     Ok(())
 }
 
-/// Distinct values of an axis from the largest down.
+/// Return the distinct orders of an axis that are at least `lowest`, in descending order.
 fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
     let mut values: Vec<f64> = term.values.iter().map(|&v| tidy(v)).filter(|&v| v >= lowest - ORDER_GRAIN).collect();
     values.sort_by(|a, b| b.total_cmp(a));
@@ -208,49 +219,53 @@ fn values(term: &TermAxis, lowest: f64) -> Vec<f64> {
     values
 }
 
-/// Number of prefixes per stored count. Other counts are computed when needed.
+/// Number of combinations of all orders of a signal but the last per stored count of allowed combinations. Counts in
+/// between are computed when needed.
 pub(super) const PREFIX_STRIDE: usize = 64;
 
-/// Terms of one signal, their axes, and the pairs of values that exclude each other.
+/// Terms of one signal, their axes, and the pairs of orders that exclude each other.
 #[derive(Debug, Clone)]
 pub(crate) struct Group {
     pub(crate) signal: usize,
-    /// Terms, by position in the equation.
+    /// Index of each term in the equation.
     pub(crate) terms: Vec<usize>,
-    /// Values of each term, from the largest down.
+    /// Candidate orders of each term, descending.
     pub(crate) axes: Vec<Vec<f64>>,
-    /// Values of term b that are compatible with value i of term a, a < b, as `allowed[b][a][i]`.
+    /// Orders of term b that are allowed with order number i of term a, a < b, as the set `allowed[b][a][i]`.
     allowed: Vec<Vec<Vec<Bits>>>,
 }
 
-/// Tuples of a group that are admissible for one α.
+/// Combinations of the orders of one signal that are allowed for one order α of the equation.
 #[derive(Debug, Clone)]
 pub(crate) struct GroupTuples {
-    /// First value of each axis within the range.
+    /// First axis position whose order is in range, for each term.
     pub(crate) first: Vec<usize>,
-    /// Number of prefixes. A prefix is a tuple without its last order.
+    /// Number of combinations of all orders but the last. Such a combination is called a prefix.
     pub(super) prefixes: usize,
+    /// Number of allowed combinations of all orders of the signal.
     pub(super) count: u64,
-    /// Number of tuples before prefix 0, [`PREFIX_STRIDE`], 2·[`PREFIX_STRIDE`], …
+    /// Number of allowed combinations before the prefixes 0, [`PREFIX_STRIDE`], 2·[`PREFIX_STRIDE`], …
     pub(super) before: Vec<u64>,
 }
 
-/// A set of positions in an axis.
+/// Set of positions in an axis (list of orders), as a bit set of 64-bit words.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Bits(pub(super) Vec<u64>);
 
 impl Bits {
+    /// Return the set of positions below `len` for which `member` is true.
     fn from(len: usize, member: impl Fn(usize) -> bool) -> Self {
         let mut words = vec![0u64; len.div_ceil(64)];
         (0..len).filter(|&i| member(i)).for_each(|i| words[i / 64] |= 1 << (i % 64));
         Self(words)
     }
 
+    /// Return true if the position is in the set.
     pub(super) fn has(&self, i: usize) -> bool {
         self.0[i / 64] >> (i % 64) & 1 == 1
     }
 
-    /// Smallest position in the set that is at least `from`.
+    /// Return the smallest position in the set that is at least `from`. `None` if there is none.
     pub(super) fn next(&self, from: usize) -> Option<usize> {
         let mut word = from / 64;
         let mut bits = *self.0.get(word)? & (!0 << (from % 64));
@@ -263,7 +278,7 @@ impl Bits {
         }
     }
 
-    /// Number of consecutive members from this position on.
+    /// Return the number of consecutive positions in the set from `from` on.
     pub(super) fn run(&self, from: usize) -> usize {
         let mut at = from;
         while let Some(&word) = self.0.get(at / 64) {
@@ -277,7 +292,7 @@ impl Bits {
         at - from
     }
 
-    /// Position in the set that has `rank` positions of the set before it.
+    /// Return the position in the set with `rank` smaller positions in the set. `None` if there is none.
     pub(super) fn select(&self, mut rank: u64) -> Option<usize> {
         for (word, &bits) in self.0.iter().enumerate() {
             let bit_count = u64::from(bits.count_ones());
@@ -295,8 +310,10 @@ impl Bits {
 }
 
 impl Group {
+    /// Build the terms of one signal. `axes` lists the orders of each term in descending order, and `swappable` is true
+    /// for interchangeable terms.
     pub(super) fn new(signal: usize, terms: Vec<usize>, axes: Vec<Vec<f64>>, swappable: &[bool]) -> Self {
-        // Axes run from the largest down.
+        // Orders descend within an axis.
         let holds = |axis: &[f64], value: f64| axis.binary_search_by(|v| value.total_cmp(v)).is_ok();
         let allowed = (0..terms.len())
             .map(|b| {
@@ -306,8 +323,8 @@ impl Group {
                         let twins: Vec<bool> = axes[b].iter().map(|&y| swappable && holds(&axes[a], y)).collect();
                         let completions = |&x: &f64| {
                             let twin = holds(&axes[b], x);
-                            // Of two tuples that differ by an interchange, only the one with the larger order first is
-                            // a candidate.
+                            // Of two combinations that differ by an interchange, only the one with the larger order
+                            // first is a candidate.
                             Bits::from(axes[b].len(), |j| {
                                 let y = axes[b][j];
                                 (x - y).abs() > ORDER_GRAIN && !(twin && twins[j] && x < y)
@@ -321,12 +338,13 @@ impl Group {
         Self { signal, terms, axes, allowed }
     }
 
+    /// Return the index of the last term of this signal.
     pub(super) fn last(&self) -> usize {
         self.terms.len() - 1
     }
 
-    /// Write the axis positions of all orders but the last to `digits`. `prefix` is the number of their combination,
-    /// and `first` the first permitted axis position of each order.
+    /// Write the axis positions of all orders but the last to `digits`, for combination number `prefix`. `first` gives
+    /// the first axis position in range for each order.
     pub(super) fn decode(&self, first: &[usize], prefix: usize, digits: &mut [usize]) {
         let mut rest = prefix;
         for a in (0..self.last()).rev() {
@@ -336,10 +354,9 @@ impl Group {
         }
     }
 
-    /// Enumerate the values of the last order that are allowed with the axis positions `digits` of the other orders.
-    /// The set of these values is a bit set over the axis: `take` receives the index and the bits of each 64-bit word.
-    /// `first` holds the first permitted axis position of each order. `take` is not called if the other orders exclude
-    /// each other.
+    /// Enumerate the axis positions of the last order that are allowed with the axis positions `digits` of the other
+    /// orders. Their set is a bit set: `take` receives the index and the bits of each 64-bit word. `first` gives the
+    /// first axis position in range for each order. `take` is not called if the other orders exclude each other.
     #[inline]
     pub(super) fn completions(&self, first: &[usize], digits: &[usize], mut take: impl FnMut(usize, u64)) {
         let last = self.last();
@@ -360,14 +377,15 @@ impl Group {
         }
     }
 
+    /// Return the number of allowed values of the last order, with the arguments of [`Self::completions`].
     pub(super) fn count_completions(&self, first: &[usize], digits: &[usize]) -> u64 {
         let mut count = 0;
         self.completions(first, digits, |_, bits| count += u64::from(bits.count_ones()));
         count
     }
 
-    /// Tuples of this group whose orders are allowed for an α. `first` holds the first permitted axis position of each
-    /// order. Values of the last order are counted, not stored.
+    /// Count the combinations of orders of this signal that are allowed for one order α. `first` gives the first axis
+    /// position in range for each order.
     pub(super) fn tuples_below(&self, first: Vec<usize>) -> GroupTuples {
         let prefixes: usize = (0..self.last()).map(|a| self.axes[a].len() - first[a]).product();
         let mut digits = vec![0; self.terms.len()];

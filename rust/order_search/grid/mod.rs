@@ -1,7 +1,7 @@
 //! Order grids of a search, enumerated by index.
 //!
-//! Orders are independent ([`independent`]) or depend on a few free orders by a law ([`order_law`]). Only the axes are
-//! stored, not their product.
+//! The orders of the terms are independent ([`independent`]), or they depend on a few free orders by a law
+//! ([`order_law`]). Only the axes are stored, not their product.
 
 pub mod independent;
 pub mod order_law;

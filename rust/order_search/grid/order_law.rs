@@ -4,38 +4,43 @@ use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term
 use crate::error::{check_finite, Error, Result};
 use crate::fractional::kernels::MAX_EXCESS;
 
-/// Maximum number of tuples of free orders. The cost of a search depends on the distinct orders of its equations.
+/// Maximum number of combinations of values of the free orders. The cost of a search depends on the distinct orders of
+/// its equations.
 pub const MAX_TUPLES: u128 = 5_000_000_000;
 
-/// Equation under an order law. α and the orders of its terms are affine functions of the free orders.
+/// Equation under an order law. Its highest order α and the orders of its terms are affine functions of the free
+/// orders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LawEquation {
-    /// Output of the equation.
+    /// Signal index of the output.
     pub output: usize,
-    /// Highest order α.
+    /// Order law of the highest order α.
     pub order: AffineOrder,
-    /// Signal and order of each term.
+    /// Signal index and order law of each term.
     pub terms: Vec<(usize, AffineOrder)>,
 }
 
-/// Grid of free orders under an order law. Tuples that give an invalid equation are excluded.
+/// Grid of free orders under an order law. Combinations of free orders that give an invalid equation are excluded.
 #[derive(Debug, Clone)]
 pub struct OrderLawGrid {
+    /// Values of each free order, ascending.
     axes: Vec<Vec<f64>>,
     equations: Vec<LawEquation>,
+    /// True for each signal that is an input.
     inputs: Vec<bool>,
+    /// Number of combinations of values of the free orders.
     product: u64,
-    /// Output and position of terms with a fixed coefficient.
+    /// Output and term index of each term with a fixed coefficient.
     known: Vec<(usize, usize)>,
 }
 
 impl OrderLawGrid {
-    /// Build the grid from the values of each free order and the equations. `inputs[s]` marks signal s as an input.
+    /// Build the grid from the values of each free order and the equations. `inputs\[s\]` marks signal s as an input.
     ///
     /// # Errors
-    /// [`Error::EmptyOrderGrid`] for an empty axis, [`Error::OrderGridTooLarge`] for the product of the axes,
-    /// [`Error::NotFinite`] for an order or a law that is not finite, [`Error::Structure`] without an equation, or for
-    /// a signal or free order that does not exist.
+    /// [`Error::EmptyOrderGrid`] for a free order without values. [`Error::OrderGridTooLarge`] for more than
+    /// [`MAX_TUPLES`] combinations. [`Error::NotFinite`] for an order or a law that is not finite. [`Error::Structure`]
+    /// without an equation, or for a signal or free order that does not exist.
     ///
     /// ```
     /// # use ftlm::equation::AffineOrder;
@@ -84,10 +89,10 @@ impl OrderLawGrid {
         }
     }
 
-    /// Set the fixed coefficients, `fixed[e]` by term of equation e. Terms with a fixed coefficient may have an order
-    /// above the α of their equation.
+    /// Return the grid with fixed coefficients: `fixed[e]` has one entry per term of equation e, `None` for a free
+    /// coefficient. A term of another output with a fixed coefficient may have an order above the α of its equation.
     ///
-    /// A term above α with a free coefficient is excluded because it nearly equates an output with itself.
+    /// A term above α with a free coefficient is excluded, because it would nearly equate an output with itself.
     #[must_use]
     pub fn with_fixed_coefficients(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
         let terms = self.equations.iter().zip(fixed).flat_map(|(equation, fixed)| {
@@ -98,24 +103,26 @@ impl OrderLawGrid {
         self
     }
 
-    /// Raise an error if an equation refers to a signal that the records lack.
+    /// Return [`Error::Structure`] if an equation refers to a signal that does not exist among `signals` signals.
     pub(crate) fn check_signals(&self, signals: usize) -> Result<()> {
         self.equations.iter().try_for_each(|equation| equation.check(self.axes.len(), signals))
     }
 
-    /// Size of the product of the axes. Candidates are the indices that have structures.
+    /// Return the number of combinations of values of the free orders. Candidates are those for which
+    /// [`Self::structures`] is not `None`.
     #[must_use]
     pub fn product(&self) -> u64 {
         self.product
     }
 
-    /// The equations.
+    /// Return the coupled equations.
     #[must_use]
     pub fn equations(&self) -> &[LawEquation] {
         &self.equations
     }
 
-    /// Free orders at an index of the product, the first one varying slowest. Indices beyond the end wrap around.
+    /// Return the free orders at an index of the grid. The first free order varies slowest. An index beyond the end
+    /// wraps around.
     #[must_use]
     pub fn free(&self, index: u64) -> Vec<f64> {
         let mut rest = index;
@@ -135,7 +142,8 @@ impl OrderLawGrid {
         free
     }
 
-    /// Structures at an index. `None` if an order is out of range or two orders of a signal coincide.
+    /// Return the structure of each equation at an index of the grid. `None` if an order is out of range or two orders
+    /// of a signal coincide.
     #[must_use]
     pub fn structures(&self, index: u64) -> Option<Vec<Structure>> {
         let free = self.free(index);
@@ -152,12 +160,13 @@ impl OrderLawGrid {
             .collect()
     }
 
-    /// Values of each free order.
+    /// Return the values of each free order, ascending.
     pub(crate) fn axes(&self) -> &[Vec<f64>] {
         &self.axes
     }
 
-    /// True if α and the orders of the terms are valid, and the orders of each signal distinct.
+    /// Return true if α and the orders of the terms are valid, and the orders of each signal are distinct. `orders`
+    /// contains α, then one order per term.
     pub(crate) fn fits(&self, equation: &LawEquation, orders: &[f64]) -> bool {
         let alpha = orders[0];
         let input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
@@ -180,7 +189,8 @@ impl OrderLawGrid {
 }
 
 impl LawEquation {
-    /// Return an error if the equation refers to a signal or free order that does not exist.
+    /// Return an error if the equation refers to a signal or free order that does not exist, or if a law is not finite.
+    /// `free` and `signals` are the numbers of free orders and signals.
     fn check(&self, free: usize, signals: usize) -> Result<()> {
         for signal in std::iter::once(self.output).chain(self.terms.iter().map(|term| term.0)) {
             if signal >= signals {
@@ -203,7 +213,7 @@ impl LawEquation {
         Ok(())
     }
 
-    /// Law of α, then the laws of the terms.
+    /// Iterate over the order laws: of α, then of each term.
     pub(crate) fn laws(&self) -> impl Iterator<Item = &AffineOrder> {
         std::iter::once(&self.order).chain(self.terms.iter().map(|t| &t.1))
     }

@@ -1,13 +1,13 @@
 //! Traversal of an order grid: in index order, by two-dimensional slices, or in a low-discrepancy order.
 //!
-//! A slice is a contiguous range of indices over which only two orders vary, each through all of its values. In a
-//! low-discrepancy order, the first candidates, whatever their number, are evenly distributed over the grid.
+//! A slice is a contiguous range of candidate indices over which only two orders vary, each through all of its values.
+//! In a low-discrepancy order, any number of first candidates is evenly distributed over the grid.
 
 use crate::equation::{Structure, Term};
 use crate::order_search::grid::independent::{Bits, OrderGrid, PREFIX_STRIDE};
 
 impl OrderGrid {
-    /// Structure of a candidate. An index beyond the end yields the last candidate.
+    /// Return the structure of a candidate. An index beyond the end gives the last candidate.
     ///
     /// ```
     /// # use ftlm::order_search::grid::{OrderGrid, TermAxis};
@@ -23,20 +23,23 @@ impl OrderGrid {
     }
 }
 
-/// Position of a traversal of an order grid.
+/// Position in a traversal of an order grid. The terms of one signal form a group. A block has one order α of the
+/// equation.
 #[derive(Debug, Clone)]
 pub(crate) struct Cursor<'a> {
     lattice: &'a OrderGrid,
+    /// Index of the block, which has one order α of the equation.
     block: usize,
-    /// Prefix of each group, and the values that complete it.
+    /// For each group, the number of the combination of all its orders but the last.
     prefixes: Vec<usize>,
+    /// For each group, the axis positions of its last order that are allowed with its other orders.
     completions: Vec<Bits>,
-    /// Position of each term's order in its axis.
+    /// Axis position of the order of each term, by group.
     digits: Vec<Vec<usize>>,
 }
 
 impl<'a> Cursor<'a> {
-    /// Return a cursor at a candidate. An index beyond the end yields the last candidate.
+    /// Return a cursor at a candidate. An index beyond the end gives the last candidate.
     pub(crate) fn at(lattice: &'a OrderGrid, index: u64) -> Self {
         let index = index.min(lattice.count - 1);
         let block = lattice.blocks.partition_point(|b| b.start <= index).saturating_sub(1);
@@ -57,8 +60,8 @@ impl<'a> Cursor<'a> {
         cursor
     }
 
-    /// Index of the candidate of a block with these positions in the axes, one per term. `None` if there is no such
-    /// candidate.
+    /// Return the index of the candidate in a block whose orders have these axis positions, one per term. `None` if
+    /// there is no such candidate.
     pub(crate) fn find(lattice: &'a OrderGrid, block: usize, digits: &[usize]) -> Option<u64> {
         let mut cursor = Self::at(lattice, lattice.blocks.get(block)?.start);
         let mut index = 0;
@@ -87,7 +90,7 @@ impl<'a> Cursor<'a> {
         Some(lattice.blocks[block].start + index)
     }
 
-    /// Move a group to the tuple with this rank.
+    /// Move a group (the terms of one signal) to its combination of orders with this rank.
     fn seek(&mut self, g: usize, rank: u64) {
         let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].tuples[g]);
         let stretch = slice.before.partition_point(|&b| b <= rank).saturating_sub(1);
@@ -104,7 +107,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Move a group to a prefix; return true if any value completes it.
+    /// Set all orders of a group (the terms of one signal) but the last to combination number `prefix`. Return true if
+    /// any value of the last order is allowed with them.
     fn enter(&mut self, g: usize, prefix: usize) -> bool {
         let group = &self.lattice.groups[g];
         let first = &self.lattice.blocks[self.block].tuples[g].first;
@@ -121,8 +125,8 @@ impl<'a> Cursor<'a> {
         any != 0
     }
 
-    /// Advance to the next candidate, if there is one. Return the index of the first group that has changed, or 0 after
-    /// a change of block.
+    /// Advance to the next candidate, if there is one. Return the index of the first group (terms of one signal) that
+    /// has changed. Return 0 after a change of α.
     pub(crate) fn advance(&mut self) -> usize {
         let groups = self.lattice.groups.len();
         for g in (0..groups).rev() {
@@ -141,8 +145,8 @@ impl<'a> Cursor<'a> {
         0
     }
 
-    /// Term and axis position, if only this term changes over this and the next `len` − 1 candidates, by one position
-    /// each. `None` if another term changes, too.
+    /// Return term and axis position if only the order of this term changes over this and the next `len` − 1
+    /// candidates, by one axis position each. `None` otherwise.
     #[inline]
     pub(crate) fn adjacent_block(&self, len: usize) -> Option<(usize, usize)> {
         let slices = &self.lattice.blocks[self.block].tuples;
@@ -153,8 +157,8 @@ impl<'a> Cursor<'a> {
         (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
     }
 
-    /// Term, axis position and number of the next candidates over which only this term changes, by one position each.
-    /// `None` if no order varies.
+    /// Return term, axis position and number of candidates, from this one on, over which only the order of this term
+    /// changes, by one axis position each. `None` if no order varies.
     #[inline]
     pub(crate) fn adjacent_run(&self) -> Option<(usize, usize, usize)> {
         let slices = &self.lattice.blocks[self.block].tuples;
@@ -164,7 +168,7 @@ impl<'a> Cursor<'a> {
         Some((group.terms[group.last()], digit, self.completions[g].run(digit)))
     }
 
-    /// Advance by this many candidates of a contiguous block.
+    /// Advance by `count` candidates, within the run of candidates over which only one term changes.
     #[inline]
     pub(crate) fn skip(&mut self, count: usize) {
         let slices = &self.lattice.blocks[self.block].tuples;
@@ -173,7 +177,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Advance a group to its next tuple. Return true if there is one.
+    /// Advance a group (the terms of one signal) to its next combination of orders. Return true if there is one.
     fn step(&mut self, g: usize) -> bool {
         let last = self.lattice.groups[g].last();
         if let Some(next) = self.completions[g].next(self.digits[g][last] + 1) {
@@ -188,18 +192,20 @@ impl<'a> Cursor<'a> {
         true
     }
 
-    /// Positions of the orders that complete a group's prefix.
+    /// Return the axis positions of the last order of a group (the terms of one signal) that are allowed with its other
+    /// orders.
     pub(crate) fn completions(&self, group: usize) -> Vec<usize> {
         let set = &self.completions[group];
         std::iter::successors(set.next(0), |&digit| set.next(digit + 1)).collect()
     }
 
-    /// Number of the block.
+    /// Return the index of the block, which has one order α of the equation.
     pub(crate) fn block(&self) -> usize {
         self.block
     }
 
-    /// Call `take` with the term and the axis position of each order of this group and all later ones.
+    /// Call `take(term, axis position)` for each order of group `from` and all later groups. The terms of one signal
+    /// form a group.
     #[inline(always)]
     pub(crate) fn each(&self, from: usize, mut take: impl FnMut(usize, usize)) {
         for (group, digits) in self.lattice.groups[from..].iter().zip(&self.digits[from..]) {
@@ -207,7 +213,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Structure of the current candidate.
+    /// Return the structure of the current candidate.
     pub(crate) fn structure(&self) -> Structure {
         let mut terms = vec![Term { signal: 0, order: 0.0 }; self.lattice.width()];
         for (group, digits) in self.lattice.groups.iter().zip(&self.digits) {
@@ -219,32 +225,37 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// Slice of candidates `lo … hi − 1`: one row for each order of one term, with consecutive orders of another term.
+/// Slice of candidates `lo … hi − 1` in which the orders of two terms vary. Each row has one order of the outer term
+/// and consecutive orders of the inner term.
 #[derive(Debug, Clone)]
 pub(crate) struct GridSlice {
     pub(crate) lo: u64,
     pub(crate) hi: u64,
-    /// Number of the block.
+    /// Index of the block, which has one order α of the equation.
     pub(crate) block: usize,
+    /// Axis position of each term at the first candidate.
     pub(crate) digits: Vec<usize>,
-    /// Term whose order changes from row to row.
+    /// Index of the term whose order changes from row to row.
     pub(crate) outer: usize,
+    /// Axis position of the outer term in each row.
     pub(crate) rows: Vec<usize>,
-    /// Term whose order varies along a row.
+    /// Index of the term whose order varies along a row.
     pub(crate) inner: usize,
+    /// First axis position of the inner term.
     pub(crate) first: usize,
+    /// Number of candidates in a row.
     pub(crate) len: usize,
 }
 
 impl OrderGrid {
-    /// First value of a term's axis within the range of a block.
+    /// Return the first axis position of a term whose order is in range for the order α of a block.
     pub(crate) fn first_in_range(&self, block: usize, term: usize) -> usize {
         let place = self.groups.iter().zip(&self.blocks[block].tuples);
         let mut all = place.flat_map(|(group, slice)| group.terms.iter().zip(&slice.first));
         all.find(|(t, _)| **t == term).map_or(0, |(_, first)| *first)
     }
 
-    /// Maximum number of candidates of a slice of the same block.
+    /// Return an upper bound of the number of candidates of a slice in the same block, which has one order α.
     pub(crate) fn max_slice_candidates(&self, slab: &GridSlice) -> u64 {
         let whole = self.groups.iter().find(|group| group.terms.contains(&slab.outer));
         let axis =
@@ -252,8 +263,8 @@ impl OrderGrid {
         (axis * slab.len) as u64
     }
 
-    /// Slice that contains a candidate. `None` if the fastest signal has several terms, or no other signal has a
-    /// varying order.
+    /// Return the slice that contains a candidate. `None` if the fastest varying signal has several terms, or if the
+    /// order of no other signal varies.
     pub(crate) fn slice_at(&self, index: u64) -> Option<GridSlice> {
         let cursor = Cursor::at(self, index);
         let block = &self.blocks[cursor.block()];
@@ -280,15 +291,15 @@ impl OrderGrid {
 /// Fractional part of the golden ratio. Its multiples modulo 1 are evenly distributed.
 const GOLDEN_FRACTION: f64 = 0.618_033_988_75;
 
-/// Position of an index in [0, 1). Consecutive indices are far apart.
+/// Return a position in [0, 1) for an index. The positions of any number of consecutive indices are evenly distributed.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn low_discrepancy_position(index: u64) -> f64 {
     (index as f64 * GOLDEN_FRACTION).fract()
 }
 
-/// Permutation of 0 … count − 1 whose initial parts are evenly distributed.
+/// Return a permutation of 0 … count − 1. Its first values, whatever their number, are evenly distributed.
 pub(crate) fn low_discrepancy_order(count: u64) -> impl Fn(u64) -> u64 {
-    // Multiples of the golden ratio are evenly distributed. The next stride that is coprime with the count visits all
+    // Multiples of the golden ratio modulo 1 are evenly distributed. A stride that is coprime with the count visits all
     // indices.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     let mut stride = ((count as f64 * GOLDEN_FRACTION) as u64).max(1);
@@ -302,6 +313,7 @@ pub(crate) fn low_discrepancy_order(count: u64) -> impl Fn(u64) -> u64 {
     }
 }
 
+/// Return the greatest common divisor.
 fn gcd(a: u64, b: u64) -> u64 {
     if b == 0 {
         a

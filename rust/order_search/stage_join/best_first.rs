@@ -1,8 +1,9 @@
-//! Best-first evaluation of a coupled search.
+//! Order search over coupled equations with best-first evaluation. A tuple is a combination of values of the free
+//! orders.
 //!
-//! Each distinct combination of orders of an equation is evaluated once. Scores are first lower bounds, because
-//! simulations stop early. They are refined until every tuple of free orders that may enter the result table is exact.
-//! The result equals that of a full enumeration, ties by index.
+//! Each distinct combination of orders of an equation is evaluated once. At first, scores are only lower bounds,
+//! because simulations stop early. They are refined until the score of every tuple that may enter the result table is
+//! exact. The result equals that of a full enumeration, and tuples of equal score are ordered by index.
 
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
@@ -24,49 +25,53 @@ use crate::order_search::stage_join::join::{
 use crate::parallel::{pool, PerThread};
 use crate::regressors::Record;
 
-/// Ratio to the best score up to which the candidates of an equation are evaluated in the first pass.
+/// Ratio of the score limit to the best score of an equation in the first pass. This pass evaluates the candidates of
+/// one equation after the other.
 const FIRST_LIMIT: f64 = 4.0;
-/// Minimum number of candidates of one equation between two updates of its best score.
+/// Minimum number of candidates of one equation that are evaluated between two updates of its best score, except for
+/// the first 256.
 const CANDIDATES_PER_UPDATE: usize = 4096;
 
-/// Row of the result table: one tuple of free orders.
+/// Row of the result table: one combination of values of the free orders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageRow {
-    /// Index in the product of the axes.
+    /// Index of the combination of free orders in the order grid.
     pub index: u64,
-    /// Free orders.
+    /// Values of the free orders.
     pub free: Vec<f64>,
     /// Sum of the scores of the equations, each divided by its scale.
     pub score: f64,
-    /// The structure of each equation.
+    /// Structure of each equation.
     pub structures: Vec<Structure>,
-    /// Row of each equation (its index is not used).
+    /// Score and coefficients of each equation. The `index` of these rows is not used.
     pub rows: Vec<Row>,
 }
 
 /// Result of a search over coupled equations.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageOutcome {
-    /// Best rows in ascending order of the score, ties by index.
+    /// Best rows in ascending order of the score. Rows of equal score are ordered by index.
     pub rows: Vec<StageRow>,
-    /// Number of tuples by outcome.
+    /// Number of combinations of free orders by outcome.
     pub counts: Counts,
-    /// First tuples without a score by index, at most 100.
+    /// Index and reason of combinations of free orders without a score: the first ones by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
     /// Number of distinct candidates of each equation.
     pub distinct: Vec<u64>,
 }
 
-/// Candidates of one equation and their shared data.
+/// Candidates of one equation and the data that they share.
 struct Table {
     problem: Problem,
     candidates: Candidates,
-    /// Candidates that occur in a tuple of the grid.
+    /// Candidates that occur for some combination of free orders, ascending.
     used: Vec<usize>,
+    /// Divisor of the score of this equation.
     scale: f64,
 }
 
 impl Table {
+    /// Return the score entry of a candidate with this outcome, with the score divided by the scale of the equation.
     fn entry(&self, verdict: Verdict) -> ScoreEntry {
         let score = |raw: f64| self.problem.score(raw) / self.scale;
         match verdict {
@@ -78,39 +83,49 @@ impl Table {
     }
 }
 
-/// A stage of coupled equations, prepared for a search, with the data shared by their candidates.
+/// Coupled equations of an order search, with the data that their candidates share.
 pub struct Stage<'a> {
     lattice: Cow<'a, OrderLawGrid>,
     options: Options,
+    /// Candidates of each equation.
     tables: Vec<Table>,
+    /// Total number of samples of all records.
     samples: f64,
 }
 
-/// State of a coupled search: scores of every candidate, and the candidates to evaluate next.
+/// State of a search over coupled equations: scores of all candidates, and the candidates to evaluate next.
 ///
-/// The next candidates depend only on the outcomes of earlier ones. They may therefore be evaluated on any machine and
+/// The next candidates depend only on the outcomes of earlier ones, so candidates may be evaluated on any machine and
 /// in any order.
 pub struct SearchState {
     join: Join,
     entries: ScoreTables,
-    /// State of the first pass: current equation, number of its candidates already requested, best score up to now.
+    /// State of the first pass, which finds the best score of each equation: current equation, number of its candidates
+    /// already requested, and smallest score / scale so far.
     pass: (usize, usize, f64),
+    /// Factor from the lower bound of a score to the limit of its next evaluation, used while the result table is not
+    /// full.
     limit_factor: f64,
+    /// Candidates to evaluate next.
     pending_spans: Vec<Span>,
+    /// Total number of candidates to evaluate, as far as known.
     total: u64,
-    /// Best exact tuples, after the first pass.
+    /// Score (sum of score / scale over the equations) and index of the best combinations of free orders that are
+    /// evaluated completely. Empty during the first pass.
     best_rows: Vec<(f64, u64)>,
 }
 
 impl<'a> Stage<'a> {
-    /// Build the join and the data shared by the candidates of each equation.
+    /// Build the join of the equations under their order law, and the data that the candidates of each equation share.
     ///
-    /// The entry `fixed[e]` holds the fixed coefficients of equation e, and `scales[e]` divides its score. For the L1
-    /// norm, σ(y)·M gives all outputs equal weight.
+    /// `fixed[e]` has one entry per term of equation e, `None` for a free coefficient. `scales[e]` divides the score of
+    /// equation e. For the L1 norm, the scale σ(y)·M gives all outputs equal weight, with the standard deviation σ(y)
+    /// of the output and the number M of samples.
     ///
     /// # Errors
-    /// As [`crate::order_search::batches::search`]; [`Error::EmptyOrderGrid`] if no tuple satisfies the law,
-    /// [`Error::OutOfRange`] for a scale that is not positive.
+    /// The errors of [`crate::order_search::batches::search`]: an option out of range, signals that the records lack, a
+    /// wrong number of fixed coefficients, too little memory, or a stop request. [`Error::EmptyOrderGrid`] if no
+    /// combination of free orders gives valid orders. [`Error::OutOfRange`] for a scale that is not positive.
     pub fn new(
         records: &[Record],
         lattice: Cow<'a, OrderLawGrid>,
@@ -182,26 +197,27 @@ impl<'a> Stage<'a> {
         Ok((stage, course))
     }
 
-    /// Raw sum that corresponds to a scaled score of an equation.
+    /// Return the raw score (Σ|e| or Σe²) of an equation for its score divided by the scale of the equation, with a
+    /// margin for rounding.
     fn raw_limit(&self, equation: usize, score: f64) -> f64 {
         let scaled = score * self.tables[equation].scale;
         let raw = match self.options.norm {
             Norm::L1 => scaled,
             Norm::L2 => scaled * scaled * self.samples,
         };
-        // Margin, so that a tie in the scaled sum is evaluated completely.
+        // The margin ensures that a candidate whose scaled sum equals the limit is evaluated completely.
         raw * (1.0 + 1e-12)
     }
 
-    /// Evaluate these candidates. Return their outcomes with raw sums.
+    /// Evaluate these candidates. Return their outcomes in the sequence of the spans, with raw scores (Σ|e| or Σe²).
     ///
     /// # Errors
-    /// Candidates of another search, or [`Error::Interrupted`].
+    /// [`Error::Structure`] for candidates of another search, [`Error::Interrupted`] after a stop request.
     pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
         let mut requests = Vec::new();
         for &Span { equation, first, last, limit } in spans {
             let used = self.tables.get(equation).map_or(&[][..], |table| &table.used);
-            // Candidates that occur in no tuple have no regressors.
+            // Candidates that occur for no combination of free orders have no regressors.
             let is_evaluated =
                 first < last && last - first <= used.len() && (first..last).all(|id| used.binary_search(&id).is_ok());
             if !is_evaluated || limit.is_nan() {
@@ -231,10 +247,11 @@ impl<'a> Stage<'a> {
         Ok(verdicts)
     }
 
-    /// Result of a completed search.
+    /// Return the result of a completed search.
     ///
     /// # Errors
-    /// Candidates that are not evaluated yet, or an internal fault.
+    /// [`Error::Structure`] if candidates are still to be evaluated or the state belongs to another search.
+    /// [`Error::Internal`] for an internal fault.
     pub fn outcome(&self, course: &SearchState, control: &Control) -> Result<StageOutcome> {
         if !course.pending_spans.is_empty() {
             let what = "the search has no result yet, because candidates are still to be evaluated".into();
@@ -266,7 +283,7 @@ impl<'a> Stage<'a> {
         Ok(StageOutcome { rows, counts, failures, distinct })
     }
 
-    /// Order grid of the stage.
+    /// Return the order grid of the coupled equations.
     #[must_use]
     pub fn lattice(&self) -> &OrderLawGrid {
         &self.lattice
@@ -274,26 +291,27 @@ impl<'a> Stage<'a> {
 }
 
 impl SearchState {
-    /// Candidates to evaluate next. Empty at the end.
+    /// Return the candidates to evaluate next. Empty at the end of the search.
     #[must_use]
     pub fn pending_spans(&self) -> &[Span] {
         &self.pending_spans
     }
 
-    /// Total number of candidates to evaluate, as known up to now. A candidate whose simulation stopped early may be
-    /// evaluated again.
+    /// Return the total number of candidates to evaluate, as far as known. A candidate whose simulation stopped early
+    /// may be evaluated again and is then counted again.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.total
     }
 
-    /// Best score of a tuple, if there is one.
+    /// Return the smallest sum of score / scale over the equations for any combination of free orders. `None` if no
+    /// such sum is known.
     #[must_use]
     pub fn best(&self) -> Option<f64> {
         self.best_rows.first().map(|incumbent| incumbent.0)
     }
 
-    /// Return an error if the state belongs to another search.
+    /// Return [`Error::Structure`] if the state belongs to another search.
     fn check(&self, stage: &Stage<'_>) -> Result<()> {
         let candidates = stage.tables.iter().map(|table| table.candidates.len());
         if candidates.eq(self.entries.iter().map(Vec::len)) {
@@ -303,14 +321,17 @@ impl SearchState {
         }
     }
 
+    /// Return the sum of scores and the class of every combination of candidates, for each half of the join of the
+    /// equations.
     fn states(&self) -> [Vec<ScoreEntry>; 2] {
         std::array::from_fn(|h| self.join.halves[h].states(&self.entries))
     }
 
-    /// Record the outcomes of the pending candidates, in their order, and select the next ones.
+    /// Record the outcomes of the pending candidates, in their sequence, and select the next candidates.
     ///
     /// # Errors
-    /// Outcomes that do not match, or [`Error::Interrupted`].
+    /// [`Error::Structure`] for outcomes that do not match the pending candidates or belong to another search.
+    /// [`Error::Interrupted`] after a stop request.
     pub fn record_verdicts(
         &mut self,
         stage: &Stage<'_>,
@@ -341,9 +362,10 @@ impl SearchState {
         self.plan_next(stage, pool, control)
     }
 
+    /// Select the candidates to evaluate next, and update the best combinations of free orders after the first pass.
     fn plan_next(&mut self, stage: &Stage<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
         control.total.store(self.total, Ordering::Relaxed);
-        // First pass: find each equation's best score. Evaluations stop at a multiple of it.
+        // The first pass finds the best score of each equation. Evaluations stop at a multiple of it.
         while let Some(Table { used, .. }) = stage.tables.get(self.pass.0) {
             let (equation, start, best) = self.pass;
             if start < used.len() {
@@ -367,10 +389,10 @@ impl SearchState {
     }
 }
 
-/// Search the free orders that minimize the sum of score / scale over the equations.
+/// Search for the free orders that minimize the sum of score / scale over the equations.
 ///
 /// # Errors
-/// An invalid option, scale or record, or no tuple of orders that satisfies the law ([`Stage::new`]).
+/// An invalid option, scale or record, or no combination of free orders that gives valid orders ([`Stage::new`]).
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;

@@ -1,13 +1,14 @@
-//! Join of the score tables of coupled equations: compatible orders of the equations under the order law.
+//! Join of the score tables of coupled equations, over orders that are compatible under the order law.
 //!
-//! The order law makes all orders functions of a few free orders x, so many tuples x give the same orders of one
-//! equation.
+//! The order law makes all orders affine functions of a few free orders x. Many values of x give the same orders of one
+//! equation. A combination of values of all free orders is called a tuple.
 //!
-//! The free orders are divided into two halves, x = (a, b), one for the first equation and one for the others. The
-//! orders of an equation are a contribution of its own half plus an addend from the other half, which has few distinct
-//! values. A row of a half is (a, addend from b) or (b, addend from a). Two rows are compatible if each has the addend
-//! that the other one contributes. Compatible rows are stored in the same bucket. Every pair in a bucket is a tuple,
-//! and every tuple is one pair of one bucket. The product of the axes is never enumerated.
+//! The free orders are divided into two halves, x = (a, b). The first half of the join contains the first equation, the
+//! second half the other equations. The orders of the equations of one half are the contribution of the own free orders
+//! plus an addend from the free orders of the other half. This addend has few distinct values. A row of the first half
+//! is (a, addend from b), a row of the second half (b, addend from a). Two rows are compatible if each contains the
+//! addend that the free orders of the other contribute. Compatible rows are stored in the same bucket. Every pair of
+//! rows in a bucket is a tuple, and every tuple occurs once. The product of the axes is never enumerated.
 
 use std::collections::hash_map::Entry as Slot;
 use std::collections::HashMap;
@@ -21,28 +22,31 @@ use crate::order_search::control::Control;
 use crate::order_search::grid::order_law::{LawEquation, OrderLawGrid};
 use crate::order_search::result::Failure;
 
-/// Row of one half of the join: values of this half's free orders, and the addend that the other half contributes.
+/// Row of one half of the join of coupled equations. It combines values of the free orders of this half with an addend.
+/// The free orders of the other half contribute this addend to the orders of the equations of this half.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct HalfRow {
-    /// Number of the hash bucket. It is computed from the two addends that the row has in common with matching rows of
-    /// the other half.
+    /// Number of the bucket. Rows of both halves in the same bucket are compatible. It is computed from the two addends
+    /// that compatible rows have in common.
     bucket: u64,
-    /// Contribution of this half's free orders to the index of a tuple.
+    /// Contribution of the free orders of this half to the index of a combination of all free orders.
     pub(super) index: u64,
-    /// Index of the combination of candidates of this half's equations.
+    /// Index of the combination of candidates in [`Half`], with one candidate per equation of this half.
     pub(super) combination: u32,
 }
 
-/// One half of the join.
+/// One half of the join of coupled equations: some of the equations and some of the free orders.
 pub(super) struct Half {
+    /// Equations of this half.
     pub(super) equations: Range<usize>,
-    /// Candidate index of each equation, one combination after another.
+    /// Candidate index for each equation of this half, one combination after another.
     combinations: Vec<u32>,
+    /// Rows of this half, sorted by bucket, then by index.
     pub(super) rows: Vec<HalfRow>,
 }
 
 impl Half {
-    /// Sum of scores and class of every combination.
+    /// Return the sum of the scores and the class of every combination of candidates of this half.
     pub(super) fn states(&self, scores: &ScoreTables) -> Vec<ScoreEntry> {
         let width = self.equations.len();
         if width == 0 {
@@ -60,32 +64,37 @@ impl Half {
             .collect()
     }
 
+    /// Return the candidate index of each equation of this half in a combination.
     pub(super) fn ids(&self, combination: u32) -> &[u32] {
         let width = self.equations.len();
         &self.combinations[combination as usize * width..][..width]
     }
 }
 
-/// Rows of both halves of which every pair is compatible.
+/// Row ranges of both halves of the join. A row of the first range and a row of the second range together give values
+/// of all free orders that are compatible under the order law.
 pub(super) struct Bucket {
     pub(super) rows: [Range<usize>; 2],
 }
 
-/// Join of two halves of the free orders.
+/// Join of the two halves of coupled equations under their order law.
 pub(super) struct Join {
     pub(super) halves: [Half; 2],
+    /// Buckets that contain rows of both halves of the join.
     pub(super) buckets: Vec<Bucket>,
 }
 
-/// Maximum number of rows of both halves, about 1 GB.
+/// Maximum number of rows of both halves of the join of coupled equations together, about 1 GB.
 const MAX_HALF_ROWS: u128 = 40_000_000;
-/// Memory per row \[bytes\], twice the size of a row because a growing list is copied.
+/// Memory per row of the join of coupled equations \[bytes\]. It is twice the size of a row, because a growing list is
+/// copied.
 const BYTES_PER_HALF_ROW: u128 = 2 * size_of::<HalfRow>() as u128;
-/// Maximum number of free orders for which all divisions into halves are tried. Further free orders belong to the
-/// second half.
+/// Maximum number of free orders with several values for which all divisions into two halves of the join are tried.
+/// Further free orders belong to the second half.
 const MAX_SPLIT_ORDERS: usize = 10;
 
-/// Select the free orders of the first half such that the number of rows is smallest.
+/// Return the free orders of the first half of the join for which the total number of rows is smallest. Return an error
+/// if the rows are too many or need more than `memory` bytes.
 fn split_free_orders(
     lattice: &OrderLawGrid,
     rows: &[OrderLawSums; 2],
@@ -130,8 +139,9 @@ fn split_free_orders(
 }
 
 impl Join {
-    /// Build the join and the distinct candidates of every equation, and mark the candidates that occur in a tuple.
-    /// Return an error if the rows need more than `memory` bytes.
+    /// Build the join and the distinct candidates of every equation. Also return the candidates of each equation that
+    /// occur for some values of the free orders. Return [`Error::Memory`] if the rows need more than `memory` bytes,
+    /// [`Error::OrderGridTooLarge`] for more than [`MAX_HALF_ROWS`] rows.
     pub(super) fn new(
         lattice: &OrderLawGrid,
         candidates: &mut [Candidates],
@@ -199,7 +209,8 @@ impl Join {
         Ok((join, used))
     }
 
-    /// Find the buckets with rows of both halves.
+    /// Find the buckets that contain rows of both halves of the join. Any two such rows in a bucket are compatible
+    /// under the order law.
     fn match_buckets(&mut self, control: &Control) -> Result<()> {
         let [a, b] = [&self.halves[0].rows, &self.halves[1].rows];
         let end = |parts: &[HalfRow], start: usize| {
@@ -226,18 +237,19 @@ impl Join {
         Ok(())
     }
 
-    /// Memory of the rows \[bytes\].
+    /// Return the memory of the rows of both halves of the join \[bytes\].
     pub(super) fn bytes(&self) -> u128 {
         self.halves.iter().map(|half| (half.rows.capacity() * size_of::<HalfRow>()) as u128).sum()
     }
 
-    /// Number of tuples.
+    /// Return the number of valid combinations of values of the free orders.
     pub(super) fn tuples(&self) -> u64 {
         self.buckets.iter().map(|b| b.rows[0].len() as u64 * b.rows[1].len() as u64).sum()
     }
 }
 
-/// Number of the combination of candidates with these orders, appended if it is new.
+/// Return the number of the combination of candidates with these orders of the equations of one half of the join. A new
+/// combination is appended. `key` and `ids` are workspace.
 fn combination(
     lattice: &OrderLawGrid,
     candidates: &mut [Candidates],
@@ -265,29 +277,34 @@ fn combination(
     }
 }
 
-/// Score of one equation's candidate divided by its scale, or a lower bound of it.
+/// Score of one equation's candidate divided by the scale of the equation, or a lower bound of it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ScoreEntry {
+    /// Score divided by the scale of the equation, or a lower bound of it according to `class`. Infinite for a failure.
     pub(super) value: f64,
     pub(super) class: Class,
 }
 
-/// Class of a score entry. The class of a sum is the first failure, else the largest class.
+/// Class of a score entry: how reliable its value is. The class of a sum is the first failure, else the largest class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Class {
+    /// The score is exact.
     Exact,
-    /// Only a lower bound is known; the candidate was not simulated.
+    /// Only a lower bound is known. The candidate was not simulated.
     Bounded,
-    /// The simulation stopped early at a partial sum, or has not been run yet.
+    /// The simulation was stopped early at a partial sum, or has not been run.
     Open,
+    /// The candidate has no score, for this reason.
     Failed(Failure),
 }
 
 impl Class {
+    /// Return true for a candidate without a score.
     pub(super) fn is_failed(self) -> bool {
         matches!(self, Self::Failed(_))
     }
 
+    /// Return the class of a sum of two entries.
     pub(super) fn combine(self, later: Self) -> Self {
         if self.is_failed() {
             self
@@ -297,26 +314,27 @@ impl Class {
     }
 }
 
-/// Entry of a candidate that has not been evaluated.
+/// Score entry of a candidate that has not been evaluated.
 pub(super) const UNEVALUATED_ENTRY: ScoreEntry = ScoreEntry { value: 0.0, class: Class::Open };
 
-/// Entries of every candidate of every equation.
+/// Score entries by equation, then by candidate.
 pub(super) type ScoreTables = Vec<Vec<ScoreEntry>>;
 
-/// Candidates `first … last − 1` of one equation. Their evaluation stops at a limit of the scaled score.
+/// Candidates `first … last − 1` of one equation, to be evaluated up to a limit of their score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Span {
     /// Number of the equation.
     pub equation: usize,
     /// First candidate.
     pub first: usize,
-    /// Candidate after the last one.
+    /// Candidate after the last one of the span.
     pub last: usize,
-    /// Limit of the scaled score.
+    /// Limit of the score, divided by the scale of the equation, at which an evaluation stops.
     pub limit: f64,
 }
 
-/// Group the candidates of an equation into spans with the same limit.
+/// Group candidates of an equation, given as (candidate, limit) in ascending order, into spans of consecutive
+/// candidates with the same limit.
 pub(super) fn spans(equation: usize, requests: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
     let mut spans: Vec<Span> = Vec::new();
     for (id, limit) in requests {
@@ -328,12 +346,13 @@ pub(super) fn spans(equation: usize, requests: impl Iterator<Item = (usize, f64)
     spans
 }
 
-/// Distinct orders of one equation.
+/// Distinct candidates of one equation: its orders α and ν.
 pub(super) struct Candidates {
     output: usize,
     signals: Vec<usize>,
-    /// Orders α and ν of the terms, one candidate after another.
+    /// Order α and the orders ν of the terms, one candidate after another.
     orders: Vec<f64>,
+    /// Candidate number by rounded orders.
     ids: HashMap<Box<[i64]>, u32>,
 }
 
@@ -347,7 +366,8 @@ impl Candidates {
         self.ids.len()
     }
 
-    /// Number of the candidate with these orders, appended if it is new.
+    /// Return the number of the candidate with these orders (α, then the terms). A new candidate is appended. `key` is
+    /// workspace.
     pub(super) fn id(&mut self, orders: &[f64], key: &mut Vec<i64>) -> Result<u32> {
         key.clear();
         key.extend(orders.iter().map(|&v| grains(v)));
@@ -360,6 +380,7 @@ impl Candidates {
         Ok(id)
     }
 
+    /// Return the structure of a candidate.
     pub(super) fn structure(&self, id: usize) -> Structure {
         let width = self.signals.len() + 1;
         let orders = &self.orders[id * width..(id + 1) * width];
@@ -368,7 +389,7 @@ impl Candidates {
     }
 }
 
-/// Convert a count to the 32-bit type of the tables.
+/// Convert a count to the 32-bit type of the tables. Return [`Error::Internal`] if it is too large.
 pub(super) fn to_u32(count: usize) -> Result<u32> {
     u32::try_from(count).map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })
 }
@@ -376,17 +397,22 @@ pub(super) fn to_u32(count: usize) -> Result<u32> {
 /// Number of rows between two checks for a stop request.
 pub(super) const ROWS_PER_STOP_CHECK: usize = 4096;
 
-/// Set of distinct vectors of order-law sums, with their numbers.
+/// Set of distinct contributions of some free orders to the order laws. Each is a vector with one value per law, and
+/// has a number.
 #[derive(Debug)]
 pub(super) struct DistinctSums {
+    /// Number of order laws.
     width: usize,
     count: usize,
+    /// Vectors of contributions, one after another.
     values: Vec<f64>,
+    /// Number of each vector of contributions, by its rounded values.
     ids: HashMap<Box<[i64]>, u32>,
 }
 
 impl Drop for DistinctSums {
-    /// Deallocate millions of keys in the background, since this would delay a response to Ctrl-C.
+    /// Deallocate the keys in a background thread. There may be millions, and deallocation would delay the response to
+    /// Ctrl-C.
     fn drop(&mut self) {
         if self.count > 8 * ROWS_PER_STOP_CHECK {
             let ids = std::mem::take(&mut self.ids);
@@ -401,13 +427,14 @@ impl DistinctSums {
         Self { width, count: 0, values: Vec::new(), ids: HashMap::new() }
     }
 
-    /// Key of a vector of sums, in units of a thousandth of the order resolution. This absorbs the rounding of the
-    /// sums.
+    /// Return the key of a vector of sums, in units of 1e-12, which is a thousandth of the order resolution. This
+    /// absorbs the rounding of the sums.
     #[allow(clippy::cast_possible_truncation)]
     fn key(sums: &[f64]) -> Box<[i64]> {
         sums.iter().map(|v| (v * 1e12).round() as i64).collect()
     }
 
+    /// Insert a vector of contributions if it is new.
     fn insert(&mut self, sums: &[f64]) {
         #[allow(clippy::cast_possible_truncation)]
         let next = self.count as u32;
@@ -422,20 +449,24 @@ impl DistinctSums {
         self.count
     }
 
+    /// Return the number of a vector of contributions. `None` if it is not in the set.
     pub(super) fn find(&self, sums: &[f64]) -> Option<u32> {
         self.ids.get(&Self::key(sums)).copied()
     }
 
+    /// Iterate over the vectors of contributions in the sequence of their numbers.
     pub(super) fn each(&self) -> impl Iterator<Item = &[f64]> {
         (0..self.count).map(|i| &self.values[i * self.width..(i + 1) * self.width])
     }
 }
 
-/// Order laws of some coupled equations, with the free orders divided into two sets.
+/// Order laws of some of the coupled equations. An order law gives the order α of an equation or the order ν of a term
+/// as an affine function of the free orders.
 pub(super) struct OrderLawSums {
     equations: Range<usize>,
+    /// Constant of each order law.
     constants: Vec<f64>,
-    /// Weights of each free order.
+    /// Weight of each free order in each order law, by free order.
     weights: Vec<Vec<f64>>,
 }
 
@@ -483,9 +514,9 @@ impl OrderLawSums {
         Ok(Some(distinct))
     }
 
-    /// Call `take(index, sums, other_sums)` for every combination of values of the free orders `axes`. `index` is the
-    /// contribution to the index of a tuple. `sums` are the values of the order laws of these equations, with
-    /// constants. `other_sums` are the contributions to the order laws of `others`, without constants.
+    /// Call `take(index, sums, other_sums)` for every combination of values of the free orders `axes`. `index` is its
+    /// contribution to the index of a combination of all free orders. `sums` are the values of the order laws of these
+    /// equations, with constants. `other_sums` are the contributions to the order laws of `others`, without constants.
     ///
     /// # Errors
     /// The first error of `take`.
@@ -521,7 +552,7 @@ impl OrderLawSums {
         }
     }
 
-    /// Compute the orders of these equations as `sums` + `addend`. Return true if all orders are valid.
+    /// Write the orders `sums` + `addend` of these equations to `orders`. Return true if all orders are valid.
     pub(super) fn orders(&self, lattice: &OrderLawGrid, sums: &[f64], addend: &[f64], orders: &mut Vec<f64>) -> bool {
         orders.clear();
         orders.extend(sums.iter().zip(addend).map(|(s, a)| tidy(s + a)));

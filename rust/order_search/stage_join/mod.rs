@@ -1,4 +1,5 @@
-//! Order search over coupled equations, by joining the score tables of the equations on their order law.
+//! Order search over coupled equations. The score tables of the equations are joined: orders are combined if they are
+//! compatible under the order law.
 
 mod best_first;
 mod join;

@@ -1,6 +1,7 @@
-//! Tuples of a join: the best tuples, the tuples without an exact score, and counts by outcome.
+//! Combinations of the free orders of coupled equations (tuples): the best tuples, the tuples without an exact score,
+//! and counts by outcome.
 //!
-//! All are computed bucket by bucket.
+//! Each pair of rows in a bucket of the join is a tuple. All results are computed bucket by bucket.
 
 use rayon::prelude::*;
 
@@ -9,10 +10,12 @@ use crate::order_search::control::Control;
 use crate::order_search::result::{Counts, Failure, MAX_LISTED_FAILURES};
 use crate::order_search::stage_join::join::{spans, Bucket, Class, HalfRow, Join, ScoreEntry, ScoreTables, Span};
 
-/// Relative tolerance of sums of scores, whose terms may have been added in another order.
+/// Relative tolerance of sums of scores, which may have been added in another sequence.
 const SCORE_TOLERANCE: f64 = 1e-12;
 
 impl Join {
+    /// Return the smallest score of each half of the join among those rows of a bucket whose class satisfies `passes`.
+    /// `None` if a half has no such row with a finite score.
     fn least_scores(
         &self,
         bucket: &Bucket,
@@ -31,7 +34,8 @@ impl Join {
         least.iter().all(|v| v.is_finite()).then_some(least)
     }
 
-    /// Score of a tuple, summed over the equations in the same sequence as in an enumeration.
+    /// Return the sum of the scores of all equations, for one combination of candidates per half of the join. Scores
+    /// are added in the same sequence as in an enumeration.
     fn score(&self, scores: &ScoreTables, pair: [u32; 2]) -> f64 {
         let halves = self.halves.iter().zip(pair);
         halves
@@ -40,7 +44,8 @@ impl Join {
             .sum()
     }
 
-    /// Best exact tuples in ascending order of the score, ties by index.
+    /// Return score and index of the best `keep` combinations of free orders whose candidates are evaluated completely.
+    /// They are sorted by score, then by index.
     pub(super) fn best(
         &self,
         states: &[Vec<ScoreEntry>; 2],
@@ -109,7 +114,9 @@ impl Join {
         Ok(best_pairs)
     }
 
-    /// Candidates without an exact score that may still belong to a row of the table, with the score limit of each.
+    /// Return the candidates whose scores are only lower bounds and that may still belong to a row of the result table.
+    /// Each has a limit of the score for its next evaluation. `worst` is the score of the last row, infinite if the
+    /// table is not full. In that case the limit is `raise` times the lower bound.
     pub(super) fn unresolved_spans(
         &self,
         states: &[Vec<ScoreEntry>; 2],
@@ -138,13 +145,15 @@ impl Join {
                         if entry.class == Class::Exact {
                             continue;
                         }
-                        // Without a full table any tuple may enter, so the limit is raised by a factor.
+                        // If the table is not full, any tuple may enter it. The limit is then a multiple of the lower
+                        // bound.
                         let limit = if worst.is_finite() {
                             worst - least[1 - h] - (state.value - entry.value)
                         } else {
                             raise * entry.value
                         };
-                        // If rounding leaves no gap between bound and worst score, only a complete evaluation decides.
+                        // If the limit is not above the lower bound because of rounding, the candidate must be
+                        // evaluated completely.
                         let limit = if limit > entry.value { limit } else { f64::INFINITY };
                         let old = &mut limits[e][id as usize];
                         *old = old.max(limit);
@@ -159,7 +168,8 @@ impl Join {
         Ok(requests.collect())
     }
 
-    /// Number of tuples by outcome, and the first failures by index.
+    /// Return the number of combinations of free orders by outcome. Also return index and reason of failed
+    /// combinations: the first ones by index.
     pub(super) fn count_outcomes(&self, states: &[Vec<ScoreEntry>; 2]) -> (Counts, Vec<(u64, Failure)>) {
         let mut counts = Counts::default();
         let mut failures: Vec<(u64, Failure)> = Vec::new();
@@ -200,7 +210,8 @@ impl Join {
         (counts, failures)
     }
 
-    /// Add the failures of a bucket that may be among the first by index. Rows are sorted by index.
+    /// Append index and reason of the failed combinations of free orders in one bucket that may be among the first by
+    /// index. `parts` are the rows of both halves, sorted by index.
     fn list_failures(&self, parts: [&[HalfRow]; 2], states: &[Vec<ScoreEntry>; 2], failures: &mut Vec<(u64, Failure)>) {
         for first in parts[0] {
             for second in parts[1] {
