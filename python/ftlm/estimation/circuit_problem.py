@@ -16,9 +16,10 @@ from ftlm.estimation.response_problem import MAX_EXPONENT, MAX_STARTS, ResponseP
 from ftlm.structure.circuit import Circuit, impedance_and_derivatives
 from ftlm.utils.validation import Complex, Floats
 
-#: Points of time constants and ratios at which initial guesses are tried, and decades of ratios within a group.
+#: Number of points (time constants and impedance ratios) at which initial guesses are tried, and range of the impedance
+#: ratios within a parallel group [decades].
 START_POINTS, RATIO_DECADES = 400, 2.0
-#: Range of an exponent, of which the lower end keeps elements apart from resistors; range of exponents of the guesses.
+#: Minimum exponent, which distinguishes an element from a resistor, and range of the exponents of initial guesses.
 MIN_EXPONENT, START_EXPONENTS = 0.05, (0.6, 1.0)
 #: Minimum and maximum parameter in SI units.
 PARAMETER_RANGE = (1e-18, 1e18)
@@ -97,7 +98,7 @@ class CircuitProblem(ResponseProblem):
         return out
 
     def constraints(self) -> tuple[Floats, Floats, list[str]]:
-        """Return linear constraints ``rows @ values <= limits`` and a description of each, for messages.
+        """Return (rows, limits, descriptions) of the linear constraints ``rows @ values <= limits``.
 
         They keep every parameter within its bounds, and exponents between 0.05 and 1. `values` are the variables of the
         optimizer.
@@ -119,7 +120,8 @@ class CircuitProblem(ResponseProblem):
     def sort_groups(self, values: Floats) -> Floats:
         """Return the parameters with identical parallel groups in series ordered from the fastest to the slowest.
 
-        Two such groups can change places, and the impedance is unchanged. The peak of -Im Z gives the speed of a group.
+        An exchange of two such groups does not change the impedance. The frequency of the peak of -Im Z determines
+        which group is faster.
         """
         kind, rest = self.circuit.tree
         if kind != "series" or self.circuit.values or self.bounds:
@@ -178,10 +180,10 @@ class CircuitProblem(ResponseProblem):
             )
             for (_, names), scale in zip(shapes, sizes, strict=True):
                 for n in names:
-                    # Q and C divide an impedance; exponents and times leave its size.
+                    # An impedance is proportional to 1/Q and 1/C. Exponents and time constants do not scale it.
                     unit[n] *= 1.0 if n.endswith(("_alpha", "_tau")) else 1.0 / scale if n[0] == "C" else scale
             values = self.in_problem_units(np.array([unit[n] for n in self.names]))
-            # Each constraint is an end of one parameter: its largest value, then its smallest.
+            # The constraints of each parameter are its upper bound, then its lower bound.
             inside = np.clip(values, -limits[1::2], limits[0::2])
             residuals, _ = self.residuals(inside, jacobian=False)
             cost = float(residuals @ residuals)

@@ -22,8 +22,8 @@ from ftlm.validation.residual_tests import DEFAULT_LAGS
 #: Number of single past samples among the regressors. Older samples are averaged over blocks that grow by this factor.
 DENSE_PAST_SAMPLES = 25
 BLOCK_GROWTH_FACTOR = 1.5
-#: Numbers of reference lags with a coefficient of their own, and fewest samples of the shortest run for each. Earlier
-#: samples are averaged over blocks of growing width.
+#: Numbers of reference lags with their own coefficients that are tried, and minimum number of samples of the shortest
+#: run per lag. Earlier samples are averaged over blocks of growing width.
 DENSE_LAG_COUNTS = (3, 6, 12, 25, 50, 100)
 MIN_ROWS_PER_LAG = 15
 #: Minimum first-stage F statistic of a strong instrument (Staiger and Stock, doi:10.2307/2171753).
@@ -31,19 +31,19 @@ MIN_FIRST_STAGE_F = 10.0
 
 
 def instrument_runs(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[Finding]]:
-    """Return runs in which each input is replaced by its projection on past values of the reference, and findings.
+    """Return runs with inputs projected on past values of the reference, and findings on weak instruments.
 
     In a closed loop, a linear filter maps the reference to each input. Least squares over all runs fit this filter, as
-    in the first step of the two-stage method (Van den Hof and Schrama, An indirect method for transfer function
-    estimation from closed loop data, Automatica 29, 1993, 1523-1527). The projection contains no noise that feedback
-    carries into the input.
+    in the first step of the two-stage method. The projection contains no noise that feedback carries into the input.
+    Source: Van den Hof and Schrama, An indirect method for transfer function estimation from closed loop data,
+    Automatica 29, 1993, 1523-1527.
 
     Raises
     ------
     ModelError
         If the reference is itself a signal of the model.
     DataError
-        If a run lacks the reference, the reference is constant, or the model has no input.
+        If a run lacks the reference or has nonuniform samples, the reference is constant, or the model has no input.
     """
     if reference in structure.signals:
         raise ModelError(
@@ -119,7 +119,8 @@ def past_regressors(signal: Floats, first: int, reach: int, *, dense: int = DENS
 def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficients: int) -> float:
     """Return the F statistic of the first stage of a two-stage fit, corrected for colored residuals.
 
-    `answers` are the explained parts of an input by run, `missed` the residuals, and `coefficients` is their number.
+    `answers` are the explained parts of an input by run, `missed` the residuals, and `coefficients` is the number of
+    coefficients of the first stage. The statistic is infinite if the residuals are 0.
     """
     colour = autoregression(missed, DEFAULT_LAGS)
     errors = np.concatenate([np.convolve(e - np.mean(e), colour, "valid") for e in missed])
@@ -129,7 +130,10 @@ def first_stage_f(answers: Sequence[Floats], missed: Sequence[Floats], coefficie
 
 
 def _columns(moves: Sequence[Floats], shortest: int, dense: int) -> Floats:
-    """Return a regressor matrix for all runs: lagged reference samples, then one constant column per run."""
+    """Return a regressor matrix for all runs: past reference samples, then one constant column per run.
+
+    Lags reach to half the length `shortest` of the shortest run, and up to `dense` each has its own column.
+    """
     parts = [np.stack(past_regressors(r, 0, shortest // 2, dense=dense), axis=1) for r in moves]
     levels = np.repeat(np.eye(len(moves)), [r.size for r in moves], axis=0)
     return np.hstack([np.concatenate(parts), levels])
@@ -154,7 +158,10 @@ def run_with_inputs(run: Run, values: Mapping[str, Floats]) -> Run:
 
 
 def mark_reference_fit(fit: Fit, reference: str, findings: Sequence[Finding]) -> Fit:
-    """Return a fit whose settings and findings name the reference signal that it used."""
+    """Return a fit whose settings name the reference signal that it used, with `findings` on this signal.
+
+    The finding on colored residuals is removed.
+    """
     # Noise in a closed loop is colored even if the model is complete. Intervals take the color into account.
     own = [f for f in fit.findings if f.code != "residuals_not_white"]
     return replace(fit, findings=[*own, *findings], settings={**fit.settings, "reference": reference})

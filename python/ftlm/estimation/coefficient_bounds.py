@@ -22,7 +22,7 @@ FitType = TypeVar("FitType")
 
 
 def check_intervals(bounds: object, *, finite: bool = False) -> None:
-    """Raise ModelError unless bounds are pairs lower < upper by name; with `finite` they must be finite."""
+    """Raise ModelError unless `bounds` maps names to pairs lower < upper, which must be finite with `finite`."""
     if not isinstance(bounds, Mapping):
         raise ModelError(f"bounds = {bounds!r} is not a mapping; write {{name: (low, high)}}")
     for name, pair in bounds.items():

@@ -1,7 +1,8 @@
 """Confidence intervals of a joint fit: Wald and profile likelihood.
 
-At each value of one parameter all others are refitted. The interval holds the values at which the cost rises by no more
-than the noise explains (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al., doi:10.1093/bioinformatics/btp358).
+At each value of one parameter all others are refitted. The interval contains the values at which the cost rises by at
+most the threshold of the likelihood-ratio test (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al.,
+doi:10.1093/bioinformatics/btp358).
 """
 
 from __future__ import annotations
@@ -26,15 +27,16 @@ from ftlm.utils.validation import Floats, real_number
 Intervals = Literal["auto", "quadratic", "profile"]
 #: Confidence level of the printed intervals.
 DEFAULT_INTERVAL_LEVEL = 0.95
-#: A lower optimum is reported if the residuals of an output fall by this fraction.
+#: Minimum relative decrease of the RMS residual of an output at which a lower optimum is reported.
 MIN_NOISE_REDUCTION = 1e-3
 #: Maximum number of restarts from a lower optimum found by the interval search.
 MAX_RESTARTS = 2
-#: Budget of block pulses for profiles under intervals="auto", and fewest simulations with which a bound is started.
-#: With free orders a pulse costs FREE_ORDER_COST_FACTOR times as much.
+#: Maximum number of simulated block pulses for profiles with intervals="auto", and minimum number of remaining
+#: simulations with which the search for a further bound starts. With free orders a pulse costs FREE_ORDER_COST_FACTOR
+#: times as much.
 MAX_AUTO_PULSES, MIN_INITIAL_BUDGET_PER_BOUND = 6_000_000, 20
 FREE_ORDER_COST_FACTOR = 3
-#: Maximum number of evaluations of the descent to the optimum around which intervals are searched.
+#: Maximum number of evaluations of the minimization that precedes the search for intervals.
 MAX_DESCENT_EVALUATIONS = 120
 
 
@@ -79,7 +81,7 @@ def with_intervals(
         if profile.lower_optimum is None or turn == MAX_RESTARTS:
             break
         if not profile.lower_on_finer_grid:
-            # An optimum on this grid only is a mode of the scheme, so its cost is no evidence about the parameters.
+            # An optimum on this grid only is an artifact of the discretization, so its cost is no evidence.
             return joint, findings
         start = dict(zip(problem.names, profile.lower_optimum.tolist(), strict=True))
         start_count, level = len(joint.starts), joint.noise
@@ -138,7 +140,7 @@ def profile_intervals(
     budget: tuple[int, int] | None = None,
     evaluations: int = MAX_DESCENT_EVALUATIONS,
 ) -> ProfileResult:
-    """Compute profile-likelihood intervals of some parameters of a fit in the core.
+    """Return profile-likelihood intervals of some parameters of a fit.
 
     Results do not depend on the number of threads. The interval of a parameter that is not identifiable is unbounded on
     both sides.
@@ -150,7 +152,7 @@ def profile_intervals(
     names
         Parameter names; None for those whose Wald interval is inaccurate.
     level
-        Probability between 0 and 1.
+        Confidence level, between 0 and 1.
     threads, progress
         Number of threads, and a callback with (bounds found, total bounds).
     budget
@@ -189,7 +191,7 @@ def profile_intervals(
 
 
 def half_width(level: float) -> float:
-    """Return the half-width, in standard deviations, of a normal confidence interval of this probability."""
+    """Return the half-width, in standard deviations, of a normal confidence interval with confidence `level`."""
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
@@ -200,7 +202,11 @@ def result_profiles(
     threads: int,
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, ProfileInterval]:
-    """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`."""
+    """Return profile-likelihood intervals of a result; see :meth:`ftlm.Identification.profile`.
+
+    Raise ModelError if the fit has no likelihood, a name is not a free parameter or the level is invalid. Raise
+    ConvergenceError if a profile leads to an optimum of lower cost.
+    """
     if "reference" in result.settings:
         raise ModelError(
             f"a fit with {parameter('reference')} solves instrument equations and has no cost function to profile; "

@@ -31,10 +31,10 @@ from ftlm.validation.comparison import compare
 DEFAULT_SEGMENTS = 2
 #: Table entries for the comparison of two intervals.
 DISJOINT_TEXT, OVERLAP_TEXT, NOT_IDENTIFIABLE_TEXT = "disjoint", "overlap", "not identifiable"
-#: Maximum ratio of an interval bound to the Wald bound for which the covariance is used.
+#: Maximum ratio between the half-widths of an interval and of the Wald interval for which the covariance is used.
 MAX_ASYMMETRY_RATIO = 2.0
-#: Runs differ by a delay if inputs shifted by at most so many rows leave less than this share of the residuals of
-#: another run's model, and little more than the run's own model leaves.
+#: Two runs differ by a delay if the model of one run fits the other run once its inputs are shifted. Maximum shift
+#: [samples], maximum residual relative to that without a shift, and relative to that of the other run's own model.
 MAX_SHIFT_ROWS, MAX_SHIFTED_SHARE, MAX_OWN_RATIO = 2, 0.5, 1.1
 
 
@@ -49,8 +49,8 @@ class ParameterDifference:
     parts
         Indices of the two segments.
     difference_in_errors
-        Difference divided by its standard error. With profile-likelihood intervals, the bounds that face each other
-        give the standard error. NaN if the parameter is not identifiable from one segment.
+        Absolute difference divided by its standard error, which follows from the interval bounds that face each other.
+        NaN if the parameter is not identifiable from one segment.
     disjoint
         Whether the 95 % intervals do not overlap.
     """
@@ -72,12 +72,12 @@ class Consistency(ReportMixin):
     results
         Identification of each segment.
     differences
-        Difference of each parameter between each two segments, largest first.
+        Difference of each parameter between any two segments, largest first.
     distance, degrees
         Chi-squared statistic of all parameters about their common weighted mean, and its degrees of freedom under one
         common model. None for a method without covariance.
     cross_validation
-        Fit in percent of each segment's model (first) on each segment (second), by output.
+        ``cross_validation[k][j]`` is the fit in percent, by output, of the model of segment k on segment j.
     delays
         Findings on runs that the model of another run explains once their inputs are shifted by some samples.
     """
@@ -99,7 +99,7 @@ class Consistency(ReportMixin):
 
     @property
     def limit(self) -> float:
-        """99 % quantile of the distance under one common model."""
+        """99 % quantile of ``distance`` if all segments share one model; infinite without degrees of freedom."""
         return chi_squared_99(self.degrees) if self.degrees else math.inf
 
     @property
@@ -108,7 +108,7 @@ class Consistency(ReportMixin):
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
-        """Parameters not identifiable from some segment; they cannot contradict the others."""
+        """Names of the parameters that at least one segment does not identify, in the order of `differences`."""
         return tuple(dict.fromkeys(d.name for d in self.differences if math.isnan(d.difference_in_errors)))
 
     @property
@@ -121,7 +121,7 @@ class Consistency(ReportMixin):
         return values_of(self.results[part])
 
     def describe_difference(self, difference: ParameterDifference) -> str:
-        """Describe one parameter in two segments: values, intervals and difference in standard errors."""
+        """Return text on one parameter in two segments: values, intervals and difference in standard errors."""
         ends = []
         for part in difference.parts:
             low, high = self.results[part].intervals[difference.name]
@@ -292,9 +292,9 @@ def consistency(
 ) -> Consistency:
     """Identify segments of a run separately and test whether they share one model.
 
-    If the structure is right, every segment gives the same parameters within their errors. Segments are inconsistent if
-    the 95 % intervals of one parameter do not overlap, or if a chi-squared test of all parameters rejects a common
-    value at 99 %. Then the plant changed, or the structure lacks an effect that only some segments excite.
+    If the structure is right, every segment gives the same parameters within their errors. Segments are inconsistent
+    in two cases. The 95 % intervals of one parameter do not overlap, or a chi-squared test of all parameters rejects
+    common values at 99 %. Then the plant changed, or the structure lacks an effect that only some segments excite.
 
     Parameters
     ----------
@@ -395,7 +395,7 @@ def _shift_rows(samples: Floats, rows: int) -> Floats:
 
 
 def split_run(run: Run, parts: int) -> list[Run]:
-    """Split a run into consecutive segments whose lengths differ by at most one sample."""
+    """Return consecutive segments of a run of nearly equal length; raise DataError if the run is too short."""
     if parts * MIN_RUN_SAMPLES > run.length:
         raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer")
     ends = [k * run.length // parts for k in range(parts + 1)]
@@ -406,7 +406,7 @@ def split_run(run: Run, parts: int) -> list[Run]:
 
 
 def _segment_names(pieces: Sequence[Run]) -> list[str]:
-    """Return segment names: the run names if they differ, otherwise the time intervals."""
+    """Return segment names: the run names if they differ, otherwise run names with time intervals or numbers."""
     names = [p.name for p in pieces]
     if len(set(names)) == len(names):
         return names
@@ -431,13 +431,13 @@ def _cross_validated_fit(result: Identification, piece: Run, own: Identification
 
 
 def differences(results: Sequence[Identification]) -> list[ParameterDifference]:
-    """Return the differences of each parameter between each two segments, largest first, NaN last."""
+    """Return the differences of each parameter between any two segments, largest first, NaN last."""
     out = []
     for places in itertools.combinations(range(len(results)), 2):
         pair = [results[k] for k in places]
         for name in pair[0].standard_errors:
             (first, low), (second, high) = sorted((values_of(r)[name], r.intervals[name]) for r in pair)
-            # Of each interval the end that faces the other part: those by profile likelihood are not symmetric.
+            # Profile-likelihood intervals are asymmetric. The bounds that face each other determine the standard error.
             width = (low[1] - first, second - high[0])
             error = math.hypot(*width) / NORMAL_95
             is_determined = 0.0 < error < math.inf and all(is_identifiable(r, name) for r in pair)
@@ -474,8 +474,8 @@ def joint_distance(results: Sequence[Identification]) -> tuple[float | None, int
     """Return the chi-squared statistic of all parameters about their weighted mean, and its degrees of freedom.
 
     Parameters whose interval in some segment is not close to the Wald interval are omitted, because their covariance is
-    inaccurate. Parameters are scaled by their standard errors, so that units do not affect the numerical rank. The
-    statistic is None without a covariance.
+    inaccurate. Parameters are scaled by their standard errors, so that units do not affect the numerical rank. Without
+    a covariance or such parameters, the result is (None, 0).
     """
     joints = [r.joint for r in results if r.joint is not None]
     if len(joints) < len(results):

@@ -17,7 +17,7 @@ from ftlm.svg.charts import Landscape
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.resources import stop_flag
 
-#: Points on each axis of the cost surface, and its half-width in standard errors.
+#: Number of points on each axis of the cost surface, and half-width of the axes in standard errors.
 POINTS_PER_AXIS, HALF_WIDTH_ERRORS = 11, 4.0
 #: Maximum number of evaluations that find the optimum on the finest grid.
 OPTIMUM_EVALUATIONS = 20

@@ -46,13 +46,14 @@ from ftlm.validation.comparison import compare_means
 #: Maximum number of Gauss-Newton steps, and of halvings of one step.
 MAX_GAUSS_NEWTON_STEPS = 40
 MAX_STEP_HALVINGS = 6
-#: Maximum step of a converged fit, in standard errors of each parameter.
+#: Maximum step of a converged fit, for every parameter [standard errors].
 STEP_TOLERANCE_ERRORS = 1e-3
-#: Relative size below which a singular direction of the instruments is rounding.
+#: Singular value of the instruments, relative to the largest one, below which it counts as a rounding error.
 INSTRUMENT_RANK_TOLERANCE = 1e-12
-#: Score of the best candidate under a prior, relative to that of a zero output, that is not reported.
+#: Minimum score of the best candidate, relative to the score of a zero output, for a finding on a small prior
+#: covariance.
 MAX_PRIOR_SCORE_RATIO = 0.5
-#: Minimum number of pulses per sampling interval. The step is not refined.
+#: Minimum number of block pulses per sampling interval in a fit with instruments, whose step is not refined.
 MIN_PULSES_PER_SAMPLE = 2
 
 
@@ -154,9 +155,10 @@ def _moment_norm(moment: tuple[Iterate, Floats, Floats]) -> float:
 
 
 def _covariance(grid: Objective, attempt: Iterate, influence: Floats) -> Floats:
-    """Return the heteroskedasticity and autocorrelation consistent covariance (Newey and West, doi:10.2307/1913610).
+    """Return the parameter covariance, consistent under heteroskedasticity and autocorrelation of residuals.
 
-    ``influence`` is the derivative of each parameter with respect to each residual.
+    The estimator is that of Newey and West (doi:10.2307/1913610). ``influence`` is the derivative of each parameter
+    with respect to each residual, of shape (parameters, residuals).
     """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
     return _core.long_run_covariance(influence, series)
@@ -186,11 +188,11 @@ def estimate_output_error(
 ) -> Fit:
     """Estimate orders and coefficients together by joint output error.
 
-    `answers` are runs with the part of each input that a reference explains; they serve as instruments. `begin` is an
-    additional initial guess, completed by the values in `more`. With `alone` it is the only guess. `joint_fit` is a
-    joint fit of the same task, if one was computed before.
+    `answers` are the runs with each input replaced by the part that a reference explains. They serve as instruments.
+    `begin` is an additional initial guess, completed by the values in `more`. With `alone` it is the only guess.
+    `joint_fit` is a joint fit of the same task, if one was computed before.
     """
-    # An order with one value is known.
+    # An order with a single grid value is fixed.
     order_values = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     request = task.structure.with_orders(order_values)
     structure = resolve_start(task.runs, request)
@@ -227,7 +229,7 @@ def estimate_output_error(
     if answers is None:
         findings += multistart_findings(joint, problem, task.runs)
     if start == "rest" and joint.initial != "rest":
-        # A comparison would otherwise assume rest from the first value alone.
+        # Otherwise a comparison of the model would assume rest because of the first samples.
         structure = request = replace(structure, initial="history")
         findings.append(make_finding("rest_rejected", run=", ".join(r.name for r in task.runs)))
     coefficients = problem.coefficients_by_name(list(joint.coefficients.values()))
@@ -331,7 +333,7 @@ def fit_at_best_orders(
 def prior_findings(
     task: Task, settings: SearchSettings, m: int | None, searches: Mapping[str, SearchResult]
 ) -> list[Finding]:
-    """Return a finding on each order search in which a small prior covariance makes the best simulation near zero."""
+    """Return a finding on each order search in which a small prior covariance shrinks the best simulation to near 0."""
     if settings.coefficients != "multi-innovation" or settings.prior_covariance is None:
         return []
     if settings.criterion != "output-error":
@@ -402,7 +404,7 @@ def coupled_rank(task: Task, settings: SearchSettings, m: int | None, search: Se
             fit = estimate_coefficients(task.runs, at_orders, settings, m)
             comparison = compare_means(Model(at_orders.with_coefficients(fit.values), m=fit.m), task.runs, m=fit.m)
         except FtlmError:
-            # It has a score in the table, but no model.
+            # This row has a score, but its model cannot be estimated or simulated.
             continue
         cost = sum(math.log(max(f.nr, 1e-300)) for f in comparison.output_error.values())
         if cost < best:

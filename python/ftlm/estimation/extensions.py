@@ -50,51 +50,53 @@ from ftlm.validation.residual_tests import (
     sign_tanh_slope,
 )
 
-#: Minimum decrease of the Schwarz criterion that is reported. A decrease of 10 is very strong evidence (Kass and
-#: Raftery, doi:10.1080/01621459.1995.10476572). The threshold is three times that, because the best of several
-#: extensions is chosen.
+#: Minimum decrease of the Schwarz criterion (BIC) for a reported extension. A decrease of 10 is very strong evidence
+#: (Kass and Raftery, doi:10.1080/01621459.1995.10476572). The threshold is three times that, because the best of
+#: several extensions is chosen.
 MIN_CRITERION_DECREASE = 30.0
-#: Minimum further decrease of the criterion at which an extension replaces one above it in the list. Some are nearly
-#: equivalent on sampled data, for example feedthrough of a first-order plant and an input that was logged one row late.
+#: Minimum further decrease of the criterion at which an extension replaces one that precedes it in the list. Some are
+#: nearly equivalent on sampled data: feedthrough of a first-order plant, and an input that was logged one sample late.
 MIN_CRITERION_GAP = 10.0
-#: Total number of samples to which extensions are fitted, from the start of each run.
+#: Maximum number of samples, over all runs, to which extensions are fitted. Each run contributes its first samples.
 MAX_EXTENSION_SAMPLES = 6000
-#: Minimum share of a run before and after a load step.
+#: Fraction of the samples at each end of a run in which no load step is sought.
 MIN_LOAD_SHARE = 0.05
-#: Maximum number of searches of the row of a load step from one fit.
+#: Maximum number of iterations in the search for the time of a load step from one fit.
 MAX_LOAD_SEARCHES = 4
-#: Share of the power of a load step that the parameters do not explain, below which it is collinear with them.
+#: Fraction of the power of a load response that sensitivities to the parameters do not explain. Below this value, the
+#: load is collinear with the parameters.
 LOAD_COLLINEARITY_TOLERANCE = 1e-6
-#: Minimum saturation limit that is tried, as a share of the largest value of an input.
+#: Lower bound of an estimated saturation limit, relative to the largest magnitude of the input.
 MIN_SATURATION_SHARE = 0.05
-#: Maximum dead zone that is tried, as a share of the largest value of an input.
+#: Upper bound of an estimated dead zone, relative to the largest magnitude of the input.
 MAX_DEAD_ZONE_SHARE = 0.9
-#: Initial guesses of a saturation or dead zone, as shares of the largest value of an input.
+#: Initial guesses of a saturation limit or dead zone, relative to the largest magnitude of the input.
 LIMIT_GUESS_SHARES = (0.25, 0.6)
-#: Friction of a local start, as a share of the largest term of an input.
+#: Initial guess of a friction coefficient, relative to the largest magnitude of an input term in the equation.
 LOCAL_FRICTION_SHARE = 0.02
-#: Least share of rows in which an input changes, so that its intersample behavior is in doubt.
+#: Fraction of sampling intervals over which an input must change for its other intersample behavior to be tested.
 MIN_CHANGING_SHARE = 0.5
-#: Intersample behavior as text.
+#: Words for the intersample behavior of an input in messages.
 INTERSAMPLE_NAMES: dict[Intersample, str] = {"zoh": "constant", "foh": "linear"}
-#: Minimum difference of an estimated delay from that of the structure that is reported, in standard errors.
+#: Minimum reported difference between an estimated delay and the delay in the structure [standard errors].
 MIN_DELAY_CHANGE_SIGMAS = 3.0
-#: Initial conditions and offsets of the fits with which a fit is compared.
+#: Pairs (initial conditions, offset) of the alternative fits with which a fit is compared.
 ALTERNATIVE_INITIAL_CONDITIONS: tuple[tuple[Initial, Offset], ...] = (
     ("rest", "none"),
     ("rest", "level"),
     ("caputo", "none"),
     ("caputo", "level"),
 )
-#: Maximum ratio of the sum of squares under other initial conditions to that of the fit at which both explain a run.
+#: Residual variance under other initial conditions, relative to that of the fit, up to which both fit equally well.
 MAX_SQUARES_RATIO = 1.05
-#: Difference of two gains, in joint standard errors and relative to the larger one, beyond which they contradict.
+#: Two gains contradict each other if their difference exceeds both limits. The first is in standard errors of the
+#: difference, the second is relative to the larger gain.
 MIN_GAIN_CHANGE_SIGMAS, MIN_GAIN_CHANGE = 3.0, 0.05
 
 
 @dataclass(frozen=True)
 class Extension:
-    """Structure with an additional effect, which is compared with the fitted structure.
+    """Structure with an additional effect, whose fit is compared with the fit of the original structure.
 
     Parameters
     ----------
@@ -105,22 +107,23 @@ class Extension:
     parameter_count
         Number of additional parameters.
     inputs
-        Inputs that the extension concerns.
+        Names of the inputs that the extension concerns.
     starts
-        Initial guesses; None stands for the automatic ones.
+        Initial guesses by parameter name; None stands for automatic initial guesses.
     near
-        Fit with the same free parameters. The extension is fitted from its optimum and on its grid, not from `starts`.
+        Fit with the same free parameters. If given, the extension is fitted from the optimum of this fit and on its
+        grid, not from `starts`.
     local_start
         Parameter values at which the extended model nearly equals the fitted one. If a local fit from these values does
         not lower the criterion, the slower multistart from `starts` is skipped.
     term_text
         Additional terms as text, for the message.
     runs
-        Runs with a load as an additional input, or with another intersample behavior; None for the given ones.
+        Runs with a load as an additional input, or with another intersample behavior; None for the measured runs.
     load_time
         Time of the load step [s].
     positive_coefficient
-        Name of a coefficient that must be positive, if there is one: negative friction would drive the motion.
+        Name of the friction coefficient, which is physical only if positive; empty without friction.
     """
 
     code: str
@@ -138,7 +141,7 @@ class Extension:
 
 @dataclass(frozen=True)
 class FittedExtension:
-    """Extension with its fit and its score, the Schwarz criterion of one-step predictions of the residuals."""
+    """Extension with its fit and the Schwarz criterion of one-step predictions of its residuals; lower is better."""
 
     extension: Extension
     fit: JointFit
@@ -146,7 +149,7 @@ class FittedExtension:
 
     @property
     def is_physical(self) -> bool:
-        """Whether the sign of the coefficient is possible: negative friction would drive the motion."""
+        """Whether the friction coefficient is positive; True without friction. Negative friction adds energy."""
         name = self.extension.positive_coefficient
         return not name or self.fit.coefficients[name] > 0.0
 
@@ -160,7 +163,7 @@ class ExtensionTests:
 
 
 def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
-    """Fit extended structures if residuals are colored; report the best one if it clearly predicts better.
+    """Fit extended structures if residuals are colored, and report the best one if it predicts clearly better.
 
     Residuals are colored by noise, or by a response that the structure lacks. An autoregression of the residuals
     separates the two: its innovation variance does not depend on the structure for pure noise, but a missing response
@@ -197,7 +200,7 @@ def run_extension_tests(fit: Fit, tests: Residuals) -> ExtensionTests:
         best = _best_extension([f for f in fits if f.is_physical], own) or _best_extension(fits, own)
         findings = _extension_findings(best, structure, joint, runs, names, about) if best else []
     except FtlmError:
-        # The fit to the first samples failed, with which extensions are compared.
+        # The fit to the first samples, with which extensions are compared, has failed.
         return ExtensionTests([])
     return ExtensionTests(findings, any(f.extension.code == "friction_fits" for f in fits))
 
@@ -212,7 +215,8 @@ def _extension_findings(
 ) -> list[Finding]:
     """Return the finding on the best extension, or ``dynamics_missing`` if it fails a residual test or is not physical.
 
-    An extension by another intersample behavior is reported only if it changes a parameter by over one standard error.
+    ``dynamics_missing`` is omitted if `names`, the inputs of a linear structure of one equation, is empty. An extension
+    by another intersample behavior is reported only if it changes a parameter by over one standard error.
     """
     missing = [make_finding("dynamics_missing", input=enumerate_names(names), **about)] if names else []
     extension, refit = best.extension, best.fit
@@ -258,10 +262,10 @@ def _inputs_of_single_equation(structure: Structure, runs: Runs) -> tuple[str, .
 
 
 def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_poor: bool) -> list[Extension]:
-    """Return extensions by a constant, if the structure has no level, and by a drift; [] for non-linear structures.
+    """Return extensions by a constant and by a drift; [] for non-linear structures and for other offsets than a level.
 
-    If the fit explains little (`is_poor`), the optimum with a constant may be far away. It is then also sought from
-    automatic initial guesses.
+    The constant is omitted if the structure has a level. If the fit explains little (`is_poor`), the optimum with a
+    constant may be far from the fit. It is then also sought from automatic initial guesses.
     """
     if structure.offset not in ("none", "level") or not structure.is_linear:
         return []
@@ -278,7 +282,7 @@ def _offset_extensions(structure: Structure, joint: JointFit, runs: Runs, *, is_
 
 
 def _intersample_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return one extension for each input that changes in most samples: its other intersample behavior.
+    """Return an extension with the other intersample behavior for each input that changes in most samples.
 
     Samples alone do not distinguish a staircase from a smooth signal. The wrong assumption acts like a delay of half a
     sample, which biases the parameters.
@@ -306,9 +310,11 @@ def _intersample_findings(
 
 
 def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
-    """Return the residual variance of a refit relative to a fit, and the parameter that changed most.
+    """Return the parameter that changes most from a fit to a refit, and the ratio of residual variances.
 
-    The ratio is the smallest over outputs. Changes are measured in standard errors of the first fit.
+    Keys of the result are ``parameter``, ``value`` and its standard error ``error`` in the fit, ``other_value`` in the
+    refit, and ``ratio``. The ratio is the residual variance of the refit divided by that of the fit, smallest over
+    outputs. Changes are compared in standard errors.
     """
     ratio = min((refit.noise[o] / noise) ** 2 for o, noise in joint.noise.items() if noise > 0.0)
     values, errors, others = joint.values_by_name, joint.standard_errors, refit.values_by_name
@@ -319,7 +325,10 @@ def _largest_change(joint: JointFit, refit: JointFit) -> dict[str, Any]:
 
 
 def _first_samples(joint: JointFit, structure: Structure, runs: Runs) -> tuple[JointFit, Runs]:
-    """Return a fit and runs cut to a maximum number of samples; short runs and their fit are returned unchanged."""
+    """Return the fit to the first samples of each run, and these parts of the runs.
+
+    They have at most `MAX_EXTENSION_SAMPLES` samples in all. Short runs and their fit are returned unchanged.
+    """
     length = MAX_EXTENSION_SAMPLES // len(runs)
     if all(run.length <= length for run in runs):
         return joint, runs
@@ -343,8 +352,8 @@ def _fit_extensions(extensions: Sequence[Extension], *, runs: Runs, own_criterio
 def _fit_extension(extension: Extension, runs: Runs, own_criterion: float) -> FittedExtension | None:
     """Return the fit of an extension from its best initial guess; None if every fit fails.
 
-    ``own_criterion`` is the criterion without the extension. If the local fit does not lower it, no other initial guess
-    is tried.
+    ``own_criterion`` is the criterion without the extension. If the fit from ``local_start`` does not lower it, no
+    other initial guess is tried.
     """
     extension_runs = extension.runs or runs
 
@@ -369,6 +378,7 @@ def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> Fi
     """Return the extension with the lowest criterion; None if the decrease is below `MIN_CRITERION_DECREASE`.
 
     Extensions are listed by preference. A later one must be better than an earlier one by `MIN_CRITERION_GAP`.
+    Extensions with an unstable optimum are skipped.
     """
     best: FittedExtension | None = None
     for item in fits:
@@ -382,7 +392,7 @@ def _best_extension(fits: Sequence[FittedExtension], own_criterion: float) -> Fi
 def _delay_findings(
     extension: Extension, refit: JointFit, structure: Structure, step: float, about: Mapping[str, str]
 ) -> list[Finding]:
-    """Return a finding on each significant delay or lead of an input."""
+    """Return a finding for each input with a significant delay or lead; `step` is the sampling step [s]."""
     findings = []
     for name in extension.inputs:
         key = input_name("delay", name)
@@ -395,7 +405,10 @@ def _delay_findings(
 
 
 def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: Sequence[str]) -> list[Extension]:
-    """Return the extensions of the input dynamics of a one-equation structure, preferred ones first."""
+    """Return the extensions of the input dynamics of a one-equation structure, preferred ones first.
+
+    They are a lag, delays, zeros, a lag with zeros, and a saturation, a dead zone and a square of each input.
+    """
     (equation,) = structure.equations
     longest, step = min(longest_delay(r.length, r.step) for r in runs), min(r.step for r in runs)
     delays = {n: structure.delay.get(n, 0.0) for n in names}
@@ -404,7 +417,8 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
     extensions: list[Extension] = []
 
     def add(code: str, make: Callable[[], Structure], count: int, inputs: Sequence[str], **more: Any) -> None:
-        # What the structure cannot be extended by, such as orders that no input may have beside a square, is left out.
+        # Extensions that the structure does not allow are omitted, such as orders that no input may have beside a
+        # square.
         with contextlib.suppress(FtlmError):
             extensions.append(Extension(code, make(), count, inputs, **more))
 
@@ -424,7 +438,7 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
     unchanged = joint.values_by_name | dict.fromkeys(coefficients, 0.0)
     fast = None
     if set(structure.coefficient_names) == {t.coefficient for t in equation.terms}:
-        # A lag of two samples multiplies all coefficients by its rate.
+        # A lag with a time constant of two samples multiplies all coefficients by its rate.
         rate = 0.5 / step
         rates = dict.fromkeys(structure.coefficient_names, rate)
         fast = {lag_name: -rate} | {n: v * rates.get(n, 1.0) for n, v in unchanged.items()}
@@ -460,9 +474,9 @@ def _input_extensions(structure: Structure, joint: JointFit, runs: Runs, names: 
 
 
 def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> list[Extension]:
-    """Return the structure with Coulomb friction: -fc sign(D y) if y is a position, -fc tanh(s y) if y is a speed.
+    """Return extensions by Coulomb friction: -fc sign(D y) if the output y is a position, -fc tanh(s y) if a speed.
 
-    The second form is omitted if y never changes sign, because the friction is then nearly constant.
+    The second one is omitted if y never changes sign, because its friction is then nearly constant.
     """
     (item,) = structure.equations
     (name,) = _unused_names("fc", 1, structure, runs[0])
@@ -495,10 +509,10 @@ def _friction_extensions(structure: Structure, joint: JointFit, runs: Runs) -> l
 
 
 def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs: Runs) -> list[Extension]:
-    """Return the structure with a constant load that starts at an unknown time; [] for several or irregular runs.
+    """Return the extension by a constant load that starts at an unknown time; [] for several or nonuniform runs.
 
     The search starts from the parameters of each fit in `starts`. It places the step at the time at which a load and
-    changes of the parameters explain most of the residuals, and fits the model again, until the time does not change.
+    parameter changes explain most of the residuals. It then fits the model again, until the time does not change.
     """
     (item,), (run, *others) = structure.equations, runs
     if others or run.sample_times is not None:
@@ -512,7 +526,7 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
     def search(values: Mapping[str, float]) -> tuple[float, int, Mapping[str, float]]:
         best: tuple[float, int, Mapping[str, float]] = (math.inf, 0, {})
         for _ in range(MAX_LOAD_SEARCHES):
-            # Without the load, its size is that which the residuals require.
+            # The load is excluded here, so that the residuals alone determine its size.
             values = {n: values[n] for n in starts[0].names}
             row = _load_row(*_residuals_at(values, structure, run), _load_response(item, structure, values, run))
             if row is None or row == best[1]:
@@ -536,13 +550,19 @@ def _load_step_extensions(structure: Structure, starts: Sequence[JointFit], runs
 
 
 def _residuals_at(values: Mapping[str, float], structure: Structure, run: Run) -> tuple[Floats, Floats]:
-    """Return residuals and their sensitivities (parameters, samples) at given parameters, up to a common factor."""
+    """Return the residuals at given parameters, and their sensitivities of shape (parameters, samples).
+
+    Both are multiplied by the same factor, which makes the root mean square of the residuals 1.
+    """
     _, point = evaluate_at_point([run], structure, values, 1)
     return np.asarray(point.outcome["residuals"]), np.asarray(point.outcome["jacobian"])
 
 
 def _load_response(item: Equation, structure: Structure, values: Mapping[str, float], run: Run) -> Floats:
-    """Return the response of a model with given parameters to a unit load from sample 0 on, at samples 1 to N - 1."""
+    """Return the response of the output to a unit load that starts at sample 0, at samples 1 to N - 1 of the run.
+
+    The load is added to the right-hand side of the equation, and `values` are the parameters by name.
+    """
     own = (t for t in item.terms if t.signal == item.output)
     alone = replace(item, terms=(*own, Term("load", Order(0.0), 1.0)))
     single = replace(structure, equations=(alone,), delay={}, free_delays={}, initial="rest", offset="none")
@@ -554,11 +574,11 @@ def _load_response(item: Equation, structure: Structure, values: Mapping[str, fl
 
 
 def _load_row(residuals: Floats, sensitivities: Floats, response: Floats) -> int | None:
-    """Return the sample index from which a constant load explains most of the residuals; None if not computable.
+    """Return the sample index from which a constant load explains most of the residuals.
 
-    `residuals`, the `sensitivities` to the parameters, an array (parameters, samples), and the `response` to a load
-    from the first sample on cover samples 1 to N - 2. What the parameters can explain is projected out of residuals and
-    loads.
+    None if the response overflows or no load explains a part of the residuals. The first element of all arrays is
+    sample 1. `sensitivities` to the parameters have shape (parameters, samples), and `response` is the response to a
+    load from sample 0 on. The part that the parameters can explain is projected out of residuals and load responses.
     """
     series, load = residuals, response[: residuals.size]
     edge = max(int(MIN_LOAD_SHARE * series.size), 1)
@@ -566,7 +586,7 @@ def _load_row(residuals: Floats, sensitivities: Floats, response: Floats) -> int
         return None
     basis = orthonormal(sensitivities.T, 1e-12)
     series = series - basis @ (basis.T @ series)
-    # Products with the load from each row on, by FFTs that are padded so that they are not circular.
+    # Dot products with the response to a load from each sample on. Padding prevents circular correlation by the FFT.
     padded = 2 * series.size
     spectra = np.fft.rfft(np.column_stack([basis, series]), padded, axis=0)
     products = np.fft.irfft(spectra * np.conj(np.fft.rfft(load, padded))[:, None], axis=0)[: series.size]
@@ -574,7 +594,7 @@ def _load_row(residuals: Floats, sensitivities: Floats, response: Floats) -> int
     free_power = power - np.sum(products[:, :-1] ** 2, axis=1)
     is_free = free_power > LOAD_COLLINEARITY_TOLERANCE * power
     explained = np.where(is_free, products[:, -1] ** 2 / np.where(is_free, free_power, 1.0), 0.0)[edge:-edge]
-    # A load of row k acts on row k + 1 first, which is number k of the inner rows.
+    # A load from sample k on first affects sample k + 1, which is element k of these arrays.
     return edge + int(np.argmax(explained)) if np.any(explained > 0.0) else None
 
 
@@ -592,7 +612,7 @@ def _with_terms(item: Equation, terms: Sequence[Term]) -> Equation:
 
 
 def _next_derivative(item: Equation, name: str, coefficient: str) -> Term:
-    """Return a new term of an input, of an order 1 above the input's highest order in the equation."""
+    """Return a term of the input `name` whose order is 1 above the highest order of that input in the equation."""
     highest = max((t.order for t in item.terms if t.signal == name), key=lambda order: order.constant)
     return Term(name, highest + Order(1.0), coefficient)
 
@@ -602,7 +622,7 @@ def _prediction_criterion(joint: JointFit, structure: Structure, runs: Runs, add
 
     The fit minimizes squared residuals and ignores their color. One generalized least-squares step therefore first
     removes the part of the residuals that parameter errors explain. The penalty counts the coefficients of the
-    autoregressions and ``added_parameters``.
+    autoregressions and ``added_parameters``. The criterion is infinite if an innovation variance is not positive.
     """
     total, samples = 0.0, 0
     sensitivities = output_sensitivities(joint, structure, runs)
@@ -646,7 +666,7 @@ def _passes_residual_tests(extension_fit: FittedExtension, default_runs: Runs) -
 def undetermined_start_findings(fit: Fit, known: Mapping[tuple[Initial, Offset], JointFit]) -> list[Finding]:
     """Return a finding if other initial conditions fit the runs equally well but give another steady-state gain.
 
-    `known` are fits that exist already, by initial conditions and offset; the others are fitted.
+    `known` has the fits that exist already, by (initial conditions, offset). Other alternatives are fitted here.
     """
     joint, structure, runs = fit.joint, fit.task.structure, fit.task.runs
     if joint is None or not structure.is_linear or structure.limits or structure.offset not in ("none", "level"):
@@ -699,7 +719,10 @@ def _name_start(initial: Initial, offset: Offset) -> str:
 
 
 def _gains(joint: JointFit, structure: Structure) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return (gain, standard error) at steady state by output and input; entries that are not finite are omitted."""
+    """Return the (steady-state gain, standard error) of each (output, input); gains that are not finite are omitted.
+
+    The result is {} if steady states cannot be computed.
+    """
     try:
         states = steady_states(fitted_model(joint, structure))
     except FtlmError:

@@ -37,8 +37,8 @@ class Fit:
     findings
         Findings of the estimator itself.
     searches, errors, joint, covariance
-        Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
-        model parameters, if the estimator gives them.
+        Order searches, standard errors of the coefficients at the best orders, joint fit, and covariance of the model
+        parameters, each if the estimator gives it.
     at_optimum
         Whether the parameters minimize a criterion of the residuals. The offset test requires it.
     """

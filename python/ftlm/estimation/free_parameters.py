@@ -89,7 +89,10 @@ class FreeProblem:
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:
-        """Bounds of all free parameters: infinite for coefficients, except that friction must dissipate energy."""
+        """Bounds (low, high) of all free parameters; only coefficients of friction are bounded, to dissipate energy.
+
+        Other coefficients have infinite bounds.
+        """
         return self.core.bounds
 
     def feasible_point(self, at: Floats, towards: Floats) -> Floats:
@@ -108,8 +111,8 @@ class FreeProblem:
     def model_parameter_jacobian(self, coefficients: Sequence[float]) -> Floats:
         """Return the Jacobian of the model's orders and coefficients (rows) by the free parameters (columns).
 
-        Rows are, for each equation, alpha, then order and coefficient of each term, then the friction coefficient if
-        present (followed by fs and vs of a Stribeck term). Input parameters have no rows.
+        Rows are, for each equation: its order, then order and coefficient of each term, then the friction coefficient
+        if present, followed by coefficient and speed of a Stribeck term. Input parameters have no rows.
         """
         free = dict(zip(self.coefficients, coefficients, strict=True))
         count, idle = len(self.orders), len(self.inputs)
@@ -158,7 +161,7 @@ def core_arguments(structure: Structure) -> Any:
         (
             signals.index(e.output),
             order(e.order),
-            # Rounding, and with it the optimum of a difficult fit, does not depend on how the equation is written.
+            # Terms are sorted, so that rounding errors do not depend on the order in which the terms are written.
             sorted(
                 ((signals.index(t.column), order(t.order), t.coefficient, t.factor) for t in e.terms),
                 key=lambda term: (term[0] != signals.index(e.output), term[0], -term[1][0], repr(term)),
@@ -188,7 +191,7 @@ def core_arguments(structure: Structure) -> Any:
     }
 
 
-#: Integer orders at which a term starts that the known values lack, and the largest number of warm starts.
+#: Integer initial values of an order for which no value is given, and maximum number of warm starts.
 DEFAULT_START_ORDERS = (0.0, 1.0, 2.0)
 MAX_WARM_STARTS = 9
 
@@ -197,7 +200,7 @@ def warm_starts(problem: FreeProblem, guess: Mapping[str, float]) -> list[dict[s
     """Return complete initial guesses from values of some free parameters by name.
 
     A coefficient without a value is 0 in each guess, so its term has no effect at first. An order without a value takes
-    each integer within its bounds, and every combination gives one guess.
+    each integer within its bounds, and every combination gives one guess, up to nine.
 
     Raises
     ------
@@ -257,7 +260,7 @@ def values_of_model(problem: FreeProblem, model: Model, more: Mapping[str, float
     return {n: v for n, v in values.items() if n in problem.names}
 
 
-#: Relative difference up to which two signals are multiples of each other: rounding of files.
+#: Relative difference, as by rounding in files, up to which two signals count as multiples of each other.
 COLLINEARITY_TOLERANCE = 1e-9
 
 

@@ -41,17 +41,17 @@ from ftlm.utils.validation import Floats, as_floats, check_known, real_number
 from ftlm.validation.information_criteria import InformationCriteria, criteria_of_likelihood
 
 Weights = Literal["auto", "relative", "uniform", "deviation"]
-#: Maximum relative difference of the sums of squares of one and the same optimum.
+#: Relative difference of two sums of squares below which both fits have ended at the same optimum.
 SAME_OPTIMUM_TOLERANCE = 1e-6
-#: Relative size of the residuals below which they are rounding.
+#: RMS residual relative to the RMS response below which residuals are rounding errors.
 RESIDUAL_FLOOR_RATIO = 1e-13
-#: Maximum number of frequencies of a record in the multistart.
+#: Maximum number of frequencies of a record that the multistart uses.
 MAX_MULTISTART_FREQUENCIES = 800
 #: Fractions of the progress at which the initial guesses are found, and at which the multistart ends.
 STARTS_END_FRACTION, MULTISTART_END_FRACTION = 0.25, 0.85
-#: Range of the measured durations, relative to the time estimate.
+#: Lowest and highest measured duration of a fit, relative to the time estimate.
 DURATION_FACTOR_RANGE = (0.4, 4.0)
-#: Number of lags of the whiteness test, from one frequency to the next.
+#: Maximum lag of the whiteness test over frequency; neighboring frequencies are one lag apart.
 WHITENESS_LAGS = 8
 
 
@@ -80,8 +80,8 @@ def identify_frequency(
     data
         One measured response, or several of different signals or frequency bands.
     structure
-        Structure to identify; see :func:`ftlm.equation`. Several outputs are simulated together from the inputs.
-        Or the circuit of an impedance, such as ``"R0-p(R1,CPE1)-W1"``; see :class:`ftlm.Circuit`.
+        Structure to identify; see :func:`ftlm.equation`. Several outputs are simulated together from the inputs. For
+        an impedance, it may also be a circuit such as ``"R0-p(R1,CPE1)-W1"``; see :class:`ftlm.Circuit`.
     weights
         Scale by which residuals are divided. ``"deviation"``: the standard deviations of the records. ``"relative"``:
         the magnitude of the response at each frequency, for noise proportional to it. ``"uniform"``: 1. ``"auto"``
@@ -91,12 +91,13 @@ def identify_frequency(
         See :func:`ftlm.equation`. A grid of orders also gives their bounds, and a delay (low, high) in seconds is
         estimated. A circuit takes only `fixed`.
     start
-        Additional initial guess by name; missing values are 1, and 0 for a delay.
+        Additional initial guess by name. Missing orders and coefficients start at 1 (orders within their bounds),
+        missing delays at 0, and missing values of a circuit at automatic guesses.
     bounds
-        (lower, upper) of coefficients and orders by name; infinite for an open side. A coefficient that ends on a bound
-        is fixed at the bound, has no confidence interval, and is named by a finding.
+        (lower, upper) of coefficients and orders by name; infinite without a bound on that side. A coefficient that
+        ends on a bound is fixed at the bound, has no confidence interval, and is named by a finding.
     progress
-        Callback with (parts of the fit done, total parts).
+        Callback with (work done, total work).
 
     Returns
     -------
@@ -159,7 +160,11 @@ def _identify_circuit(
     progress: Callable[[int, int], None] | None,
     *others: object,
 ) -> FrequencyIdentification:
-    """Identify the parameters of a circuit from measured impedances."""
+    """Identify the parameters of a circuit from measured impedances.
+
+    Raise ModelError if a name is unknown, a bound is invalid, no parameter is free, or one of `others` is given: the
+    options `orders` and `delay`, which apply to equations.
+    """
     if any(others):
         raise ModelError(
             f"{parameter('orders')} and {parameter('delay')} apply to equations; give exponents of a circuit with "
@@ -187,7 +192,11 @@ def _fit_response(
     *,
     alone: bool,
 ) -> FrequencyIdentification:
-    """Fit a response problem from automatic guesses and the user's guess; with `alone`, only from the user's guess."""
+    """Fit a response problem from automatic guesses and the user's guess; with `alone`, only from the user's guess.
+
+    Raise DataError if there are no more measured values than parameters. Raise ConvergenceError if no initial guess has
+    a finite response.
+    """
     count, numbers = 2 * sum(r.frequency.size for r in records), len(problem.names)
     if count <= numbers:
         raise DataError(
@@ -203,7 +212,7 @@ def _fit_response(
     words = problem.constraints()[2]
     PACKAGE_LOGGER.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
-    # Starts race on no more frequencies than tell them apart; the best goes on with all.
+    # The multistart uses a subset of the frequencies. Only its best candidate is fitted to all of them.
     few, light = zip(*(_subsample_data(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
     racing = problem if count <= 2 * MAX_MULTISTART_FREQUENCIES else problem.with_records(few, light)
     guesses = _user_start(racing, start)
@@ -225,7 +234,7 @@ def _fit_response(
     reached = sum(
         f.cost <= first.cost * (1 + SAME_OPTIMUM_TOLERANCE) + 1e4 * RESIDUAL_FLOOR_RATIO**2 * total for f in fits
     )
-    # A last fit from the best end point continues steps that a bound had shortened.
+    # Another fit from the best optimum continues steps that a bound has shortened.
     best = _fit_again(problem, racing, first)
     if racing is problem and first.cost < best.cost:
         best = first
@@ -336,7 +345,11 @@ def _match_records(records: Sequence[FrequencyData], structure: Structure) -> li
 
 
 def _weights(records: Sequence[FrequencyData], weights: object) -> tuple[str, list[Floats]]:
-    """Return the kind of weights, and for each record an array of factors by which its residuals are multiplied."""
+    """Return the name of the weighting, and for each record an array of factors by which its residuals are multiplied.
+
+    Raise ModelError if the weighting is unknown, or an array is given for several records. Raise DataError if a record
+    states no standard deviation or, for relative weights, has a response of 0.
+    """
     if not isinstance(weights, str):
         if len(records) > 1:
             raise ModelError(
@@ -393,7 +406,9 @@ def _subsample_data(record: FrequencyData, weight: Floats) -> tuple[FrequencyDat
 
 
 def _user_start(problem: ResponseProblem, start: Mapping[str, float] | None) -> list[Floats]:
-    """Return a list of the user's initial guess, completed by defaults; empty if there is none.
+    """Return a list with the user's initial guess in the variables of the optimizer; [] if there is none.
+
+    Default values complete the guess.
 
     Raises
     ------
@@ -417,7 +432,11 @@ def _user_start(problem: ResponseProblem, start: Mapping[str, float] | None) -> 
 
 @dataclass(frozen=True)
 class ResponseFit:
-    """Optimum of a response problem: parameters, sum of squares, convergence and active constraints."""
+    """Optimum of a response problem.
+
+    ``values`` are the variables of the optimizer, ``cost`` is the weighted sum of squared residuals, and
+    ``active_constraints`` are the indices of the active linear constraints.
+    """
 
     values: Floats
     cost: float
@@ -446,14 +465,17 @@ def _fit_again(problem: ResponseProblem, other: ResponseProblem, end: ResponseFi
 
 
 def _log_likelihood_difference(cost: float, best: float, kind: str, count: int) -> float:
-    """Return the decrease of the log likelihood when the sum of squares rises from `best` to `cost`."""
+    """Return the decrease of the log likelihood when the sum of `count` squared residuals rises from `best` to `cost`.
+
+    The noise level is known for weights of the `kind` ``"deviation"``, and otherwise estimated.
+    """
     if kind == "deviation":
         return (cost - best) / 2.0
     return 0.5 * count * math.log(max(cost, 1e-300) / max(best, 1e-300))
 
 
 def _near_optima(fits: Sequence[ResponseFit], problem: ResponseProblem, kind: str) -> list[ResponseFit]:
-    """Return other optima of the multistart that are nearly as likely as the best one and have other responses."""
+    """Return other optima of the multistart that are nearly as likely as the best one but have different responses."""
     ranked = sorted(fits, key=lambda f: f.cost)
     optima, series = [], [problem.residuals(ranked[0].values, jacobian=False)[0]]
     for fit in ranked[1:]:
@@ -611,7 +633,7 @@ def _model(
     standard: Mapping[str, float],
     findings: Sequence[Finding],
 ) -> Model:
-    """Return the identified model with its estimate (covariance, standard errors, findings), as its file stores it."""
+    """Return the identified model with the estimate that a model file stores (covariance, errors, findings)."""
     orders = {n: round(values_by_name[n], 9) for n in problem.orders}
     late = {free.signal: values_by_name[free.name] for free in problem.structure.free_inputs}
     structure = problem.structure.with_delays(late).with_orders(orders)
@@ -647,7 +669,7 @@ def _model(
 
 
 def _student(degrees: int) -> float:
-    """Return the 97.5 % quantile of Student's t distribution by a series, within 1 % from 4 degrees of freedom on."""
+    """Return the 97.5 % quantile of Student's t distribution by a series, accurate to 1 % from 4 degrees on."""
     z, n = NormalDist().inv_cdf(0.975), float(degrees)
     terms = [(z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384]
     return z + sum(t / n ** (k + 1) for k, t in enumerate(terms))

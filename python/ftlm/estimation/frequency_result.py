@@ -38,7 +38,7 @@ from ftlm.utils.validation import Complex, Floats
 from ftlm.validation.information_criteria import InformationCriteria, information_table
 
 DECIBELS_PER_NEPER = 20.0 / np.log(10.0)
-#: Points of a smooth curve over the measured band.
+#: Number of points of a smooth curve over the measured band.
 CURVE_POINTS = 160
 
 
@@ -161,7 +161,7 @@ def response_figures(model: Model | Circuit, record: FrequencyData) -> list[Figu
 
 
 def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> LineChart:
-    """Return the chart of residuals over frequency, in percent of the measured magnitude."""
+    """Return the chart of model minus measured response over frequency, in percent of the measured magnitude."""
     order = np.argsort(record.frequency, kind="stable")
     omega = record.frequency[order]
     response = model_response(model, record, omega)
@@ -180,9 +180,10 @@ def relative_residual_figure(model: Model | Circuit, record: FrequencyData) -> L
     )
 
 
-#: Maximum relative error of a usable model.
+#: Maximum RMS error of a usable model, relative to the measured response.
 MAX_RELATIVE_ERROR = 0.5
-#: A validation is worse if its error exceeds this multiple of the estimation error and this relative error.
+#: A model fails on a validation record if its relative RMS error there exceeds both limits. The first is a multiple of
+#: the largest estimation error, the second is absolute.
 VALIDATION_ERROR_RATIO, MIN_VALIDATION_ERROR = 3.0, 0.02
 
 
@@ -219,7 +220,7 @@ class FrequencyValidation:
     data
         Validation responses.
     errors
-        Error on each response.
+        Error of the model on each response.
     verdict
         Verdict on the model that takes this validation into account.
     """
@@ -245,22 +246,23 @@ class FrequencyIdentification:
     system
         Identified model or circuit.
     data
-        Records that it was fitted to.
+        Records to which it was fitted.
     weights
-        ``"deviation"``, ``"relative"`` or ``"uniform"``.
+        Weighting of the residuals: ``"deviation"``, ``"relative"`` or ``"uniform"``.
     values, standard_errors, intervals
-        Orders, coefficients and delays by name, their standard errors and 95 % intervals; infinite if not identifiable.
+        Estimates of orders, coefficients and delays [s], their standard errors, and their 95 % intervals (low, high),
+        by name. The standard error of a parameter that is not identifiable is infinite.
     names, covariance
-        Covariance matrix, and the names of its rows and columns.
+        Names of the parameters, and their covariance matrix in this order.
     chi_squared
         Mean square of the residuals divided by the stated standard deviations; about 1 for a correct model. None if no
         standard deviations are stated.
     converged
         Whether the fit converged.
     start_counts
-        Number of initial guesses from which this optimum was reached, and total number.
+        Number of initial guesses from which this optimum was reached, and total number of initial guesses.
     white
-        Whether a whiteness test over frequency passes at 99 %.
+        Whether the residuals pass a whiteness test over frequency at 99 %.
     findings
         Findings about the model.
     information
@@ -320,12 +322,12 @@ class FrequencyIdentification:
 
     @property
     def orders(self) -> dict[str, float]:
-        """Free orders with their estimates."""
+        """Estimates of the free orders by name; empty for a circuit."""
         return {n: v for n, v in self.values.items() if isinstance(self.system, Model) and n in self.system.orders}
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Free coefficients with their estimates."""
+        """Estimates of all free parameters by name, except orders and delays."""
         return {n: v for n, v in self.values.items() if n not in self.orders and not n.startswith("delay_")}
 
     @property
@@ -341,6 +343,11 @@ class FrequencyIdentification:
         ----------
         data
             Records of outputs and inputs of the model.
+
+        Returns
+        -------
+        FrequencyValidation
+            Error on each record, and the verdict that takes these errors into account.
 
         Raises
         ------
@@ -368,7 +375,7 @@ class FrequencyIdentification:
             squares.setdefault(error.output, []).append(error.rms**2)
         return {output: 100.0 - math.sqrt(sum(own) / len(own)) for output, own in squares.items()}
 
-    #: The same, by the name that has the unit.
+    #: Same as `fit`, under a name that states the unit.
     fit_percent = fit
 
     def to_frame(self) -> Any:
@@ -381,7 +388,7 @@ class FrequencyIdentification:
     def verdict(self) -> Verdict:
         """Verdict on the model without validation data; :meth:`validate` returns a verdict with them.
 
-        It is "do not use" if a parameter is not identifiable, the error is half of a response or more, or the model is
+        It is "do not use" if a parameter is not identifiable, the error exceeds half of a response, or the model is
         unstable. It is "with care" if residuals are not white or exceed the stated standard deviations, a parameter is
         uncertain, the fit did not converge or ended on a bound, or there is no validation. A validation error above 2 %
         and three times the estimation error also gives "with care".
@@ -478,7 +485,7 @@ class FrequencyIdentification:
     def report(
         self, path: str | os.PathLike[str], *, validation: FrequencyValidation | None = None, force: bool = False
     ) -> Path:
-        """Write an HTML page with verdict, equations, parameters, Bode and Nyquist charts; it opens offline.
+        """Write an HTML page with verdict, equations, parameters, Bode and Nyquist charts, which opens offline.
 
         Parameters
         ----------
@@ -488,6 +495,11 @@ class FrequencyIdentification:
             Result of :meth:`validate`.
         force
             Overwrite an existing file.
+
+        Returns
+        -------
+        Path
+            Path of the written file.
 
         Raises
         ------

@@ -32,22 +32,25 @@ from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import Floats, check_choice, check_threads, short_repr, whole_number
 
-#: Increment of the coded orders. It is as fine as the paper prints, so regressors are shared.
+#: Increment to which orders are rounded, as in the tables of the paper. Candidates with equal orders share regressors.
 ORDER_RESOLUTION = 0.001
 #: Bounds of a coefficient with a nominal value: plus and minus this multiple of it.
 STATED_RANGE = 2.0
-#: Bounds of any other coefficient: this multiple of the value at which its term alone is as large as the output.
+#: Bounds of any other coefficient: plus and minus this multiple of the value at which its term alone is as large as the
+#: output.
 SCALE_RANGE = 4.0
 #: Fraction of the population that survives and mates.
 PARENT_FRACTION = 0.25
 #: Distribution indices of simulated binary crossover and of polynomial mutation, and the crossover probability: the
 #: values of Deb and Agrawal (Complex Systems 1995).
 CROSSOVER_DISTRIBUTION_INDEX, MUTATION_DISTRIBUTION_INDEX, CROSSOVER_PROBABILITY = 15.0, 20.0, 0.9
-#: Copies of parents are not evaluated again. The number of generations may exceed the nominal one by this factor.
+#: Maximum number of generations relative to the nominal number. More generations than nominal may be needed, because
+#: copies of parents are not evaluated again.
 MAX_GENERATION_FACTOR = 4
 #: Maximum number of seeds of one fit.
 MAX_SEEDS = 1000
-#: Range of the time estimate, relative to the first generation: most later candidates are abandoned early.
+#: Shortest and longest expected run time, relative to the extrapolation from the first generation. Simulations of most
+#: later candidates stop early.
 DURATION_FACTOR_RANGE = (0.1, 1.5)
 #: Fitness of candidates that diverge or cannot become parents. PyGAD accepts finite numbers only.
 INFEASIBLE_FITNESS = -1e300
@@ -59,10 +62,13 @@ MAX_DEFAULT_EVALUATIONS = 1_000_000
 
 @dataclass(frozen=True)
 class GeneticRun:
-    """Result of the genetic algorithm: the best candidate, and the error and number of evaluations of each seed.
+    """Result of the genetic algorithm.
 
-    The error is the sum of absolute simulation errors (45) of the paper, or the RMSE (46) for the norm ``"l2"``. Under
-    an order law it is summed over outputs, each divided by the standard deviation of the output.
+    ``orders`` and ``coefficients`` of the best candidate, and the ``bounds`` of the search, are given by name. The best
+    ``errors`` and the numbers of ``evaluations`` are given by seed.
+
+    The error is the sum of absolute simulation errors, eq. (45) of the paper, or the RMSE, eq. (46), for the norm
+    ``"l2"``. Under an order law it is the sum over outputs, each divided by the standard deviation of the output.
     """
 
     orders: dict[str, float]
@@ -76,7 +82,8 @@ class GeneticRun:
 class _Rows:
     """Linear map from genes to candidates of one equation: ``genes @ weights + constants``.
 
-    A candidate is a row with alpha, the orders and the coefficients of the equation.
+    A candidate is a row with alpha (the order of the equation), the orders and the coefficients of the terms. ``own``
+    marks the terms of the output, ``points`` evaluates candidates, and ``scale`` divides their errors.
     """
 
     points: _core.Points
@@ -86,7 +93,7 @@ class _Rows:
     scale: float
 
     def candidates(self, genes: Floats, *, repaired: bool) -> Floats:
-        """Return the candidates for the core; with `repaired`, orders are limited to the largest that alpha allows."""
+        """Return one candidate per row of `genes`; with `repaired`, the order of the equation limits those of terms."""
         rows = genes @ self.weights + self.constants
         if repaired:
             highest = rows[:, :1] - np.where(self.own, ORDER_RESOLUTION, 0.0)
@@ -172,7 +179,7 @@ class GeneticProblem:
         return tidied
 
     def errors(self, genes: Floats, limit: float) -> Floats:
-        """Return the error of each row of genes; infinite if it exceeds the limit."""
+        """Return the simulation error of the candidate in each row of genes; infinite if it exceeds the limit."""
         tidied, total = self.round_orders(genes), np.zeros(genes.shape[0])
         for part in self.rows:
             rows = np.ascontiguousarray(part.candidates(tidied, repaired=not self.law))
@@ -198,7 +205,7 @@ class GeneticProblem:
 def default_bounds(
     name: str, records: Sequence[Record], structure: Structure, values: Mapping[str, tuple[float, ...]]
 ) -> tuple[float, float]:
-    """Return the default bounds of a coefficient; see :class:`GeneticAlgorithm`."""
+    """Return the default bounds (low, high) of a coefficient; see :class:`GeneticAlgorithm`."""
     reference = structure.reference.get(name, 0.0)
     if reference:
         return -STATED_RANGE * abs(reference), STATED_RANGE * abs(reference)
@@ -374,7 +381,8 @@ def polynomial_mutation(children: Floats, low: Floats, high: Floats, random: Any
 class _ParentThreshold:
     """Largest error with which a candidate can become a parent of the next generation.
 
-    The smallest errors up to now are stored; their number equals the number of parents.
+    The smallest errors of all generations up to now are stored, as many as there are parents. ``genes`` and ``best``
+    are the best candidate and its error, and ``count`` is the number of evaluations.
     """
 
     def __init__(self, parents: int) -> None:
@@ -389,7 +397,7 @@ class _ParentThreshold:
         return float(self._errors[-1])
 
     def add_generation(self, errors: Floats, genes: Floats) -> None:
-        """Add the errors of one generation."""
+        """Add the errors and genes of one generation, which has one row of genes per error."""
         self.count += errors.size
         first = int(np.argmin(errors))
         if errors[first] < self.best:
@@ -439,7 +447,7 @@ def differential_evolution_search(
         count += rows.shape[0]
         if progress is not None:
             progress(min(count, total), total)
-        # Only comparisons count, and the spread of errors over hundreds of decades is not a number.
+        # Differential evolution only compares errors. With logarithms, the spread of the errors stays finite.
         with np.errstate(divide="ignore"):
             return np.clip(np.log(problem.errors(rows, math.inf)), -MAX_LOG_ERROR, MAX_LOG_ERROR)
 
@@ -461,7 +469,7 @@ def differential_evolution_search(
         raise ModelError("no candidate of differential evolution had a finite error; narrow its bounds")
     orders, coefficients = problem.values_by_name(np.asarray(best.x, dtype=np.float64))
     each = {seed: math.exp(end.fun) if end.fun < MAX_LOG_ERROR else math.inf for seed, end in ends.items()}
-    # SciPy counts calls, of a generation each.
+    # SciPy counts calls, each of which evaluates one generation.
     evaluations = {seed: int(end.nfev) * generation for seed, end in ends.items()}
     return GeneticRun(orders, coefficients, each, evaluations, problem.bounds)
 
@@ -478,13 +486,15 @@ class GeneticAlgorithm:
     order_grid
         Grid whose limits bound the orders and whose size is the default of `evaluations`; see :func:`ftlm.order_grid`.
     norm
-        ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
+        Simulation error to minimize. ``"l1"``: sum of absolute errors, eq. (45) of the paper. ``"l2"``: root mean
+        square, eq. (46) of the paper.
     seeds
-        The algorithm runs once per seed; the result is the best run, with the errors of all.
+        Seeds of the random numbers. The algorithm runs once per seed, and the best run gives the result. The result
+        states the errors of all runs.
     evaluations
         Evaluations per seed, rounded up to a whole generation; by default as many as the order grid has candidates.
     population
-        Candidates of one generation, at least 8.
+        Number of candidates of one generation, at least 8.
     bounds
         (low, high) of coefficients by name. By default ±2 times the nominal value in the structure. Without a nominal
         value, ±4 times the coefficient at which the term alone would be as large as the output, at the midpoints of the

@@ -71,11 +71,11 @@ from ftlm.validation.residual_tests import (
     run_residual_tests,
 )
 
-#: Findings on residuals that known missing dynamics explain.
+#: Codes of residual findings that are omitted if a reported extension of the structure explains the residuals.
 SHOWN_BY_RESIDUALS = ("residuals_not_white", "residuals_follow_direction")
-#: Findings of extensions that have a mean, which the test of an offset finds as well.
+#: Codes of reported effects that have a nonzero mean. The test for an offset would report this mean as well.
 HAVE_MEAN_CODES = ("square_fits", "offset_missing", "drift_fits", "friction_fits")
-#: Share of the work of an identification that decides about the start of its runs.
+#: Fraction of the progress of an identification that is reached when its initial conditions are selected.
 INITIAL_CONDITIONS_SHARE = 0.7
 
 
@@ -116,12 +116,13 @@ def identify(
         control may be split into pieces with their own initial values, because a simulation of a whole run diverges.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor bias or a load.
-        ``"level"``: an unknown constant that is added to each output. ``"ramp"``: such a constant and a linear drift.
+        ``"level"``: an unknown constant that is added to each output. ``"ramp"``: c + d t with unknown c and d on the
+        right-hand side of each equation.
         ``"auto"``: a constant in the equations if it is significant at 99 %, with the statistic in
         ``.settings["offset_test"]``. Each run has its own offset, in ``.comparison.offsets``. It is not identifiable
         together with ``initial="history"``. Default: the offset of the structure. If it has none, a level or, for
-        integrating or non-linear plants, a constant is added if it improves the fit. ``"none"`` prevents this; a run
-        that rests before an input changes keeps its level.
+        integrating or non-linear plants, a constant is added if it improves the fit. ``"none"`` prevents this, but the
+        level of a run that rests before an input changes is still used.
     bounds
         (lower, upper) of parameters by name, such as ``{"a": (0, 10)}``. They replace the bounds of the method.
     m
@@ -173,7 +174,7 @@ def identify(
     duration = next((f.numbers["seconds"] for f in result.findings if f.code in SPLIT_CODES), None)
     without_reference = isinstance(estimator, OutputError) and estimator.reference is None
     if duration is not None and structure.initial == "auto" and without_reference:
-        # Where the pieces cannot be fitted, the result of whole runs says so.
+        # If the pieces cannot be fitted, the result for whole runs is returned.
         with contextlib.suppress(FtlmError):
             split = identify_pieces(several, structure, float(duration), method=estimator, m=m, threads=threads)
             result = split if any(f.code == "plant_unstable" for f in split.findings) else result
@@ -193,7 +194,10 @@ def _fit_runs(
     threads: int | None,
     progress: Callable[[int, int], None] | None,
 ) -> Fit:
-    """Return the fit of a structure by a method, after decisions about initial conditions and offsets."""
+    """Return the fit of a structure by a method, with selected initial conditions and offsets.
+
+    `may_add_offset` allows an offset that the structure lacks.
+    """
 
     def estimate(
         request: Structure,
@@ -231,8 +235,8 @@ def identify_pieces(
 ) -> Identification:
     """Identify an unstable plant under control from pieces of its runs, each with its own initial values.
 
-    The simulation of an unstable model diverges, but its error cannot grow beyond one piece. White measurement noise in
-    the feedback does not bias output-error estimates if the plant has a delay of one sample.
+    The simulation error of an unstable model grows exponentially, but each piece is too short for a large error. White
+    measurement noise in the feedback does not bias output-error estimates if the plant has a delay of one sample.
 
     Parameters
     ----------
@@ -250,7 +254,7 @@ def identify_pieces(
     Returns
     -------
     Identification
-        Result whose model splits other runs in the same way when it is compared with them.
+        Result whose model divides other runs into such pieces when it is compared with them.
     """
     pieces = as_runs([piece for run in runs for piece in run.split(duration)])
     request = replace(structure, initial="caputo")
@@ -264,7 +268,10 @@ def identify_pieces(
 
 
 def _check_offset_test(structure: Structure, method: EstimationMethod) -> None:
-    """Raise ModelError if the method or its options do not allow ``offset="auto"``, which may fit twice."""
+    """Raise ModelError if ``offset="auto"`` is not possible: with friction, non-linear terms or a checkpoint file.
+
+    It may need two fits, but the checkpoint file of a method stores one search.
+    """
     if structure.has_friction:
         raise ModelError(
             f"the equation of {structure.outputs[structure.friction_equations[0]]} has friction, which the test of "
@@ -323,7 +330,7 @@ def assess_fit(fit: Fit) -> Identification:
         extensions = run_extension_tests(fit, tests)
         missing = extensions.findings
         if extensions.friction_tested:
-            # The fit with friction decides about friction.
+            # The fit of the structure with friction replaces the correlation test for friction.
             outputs = {n: replace(o, direction=None) for n, o in tests.outputs.items()}
             tests = replace(tests, outputs=outputs)
         directed = [o for o, r in tests.outputs.items() if r.follows_direction]
@@ -367,7 +374,7 @@ def assess_fit(fit: Fit) -> Identification:
 
 
 def _offset_errors(fit: Fit, comparison: Comparison) -> tuple[dict[str, dict[str, float]], ...]:
-    """Return the standard errors of the offsets of each run; empty unless the fit is joint and has a covariance."""
+    """Return the standard errors of the offsets of each run, by output and kind; () if they are not computable."""
     joint = fit.joint
     if joint is None or has_loop_noise_model(fit.settings) or not np.isfinite(np.diag(joint.covariance)).any():
         return ()
@@ -375,9 +382,9 @@ def _offset_errors(fit: Fit, comparison: Comparison) -> tuple[dict[str, dict[str
 
 
 def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
-    """Return a function that computes output sensitivities to the parameters; None if the fit does not allow it.
+    """Return a function that computes output sensitivities to the parameters, or None.
 
-    It is available for joint fits of linear structures.
+    None is returned without a joint fit, without free parameters, and for a structure with friction.
     """
     joint, structure = fit.joint, fit.task.structure
     if joint is None or not joint.names or structure.has_friction:
@@ -387,12 +394,10 @@ def _sensitivities(fit: Fit) -> Callable[[], Mapping[str, list[Floats]]] | None:
 
 
 def _noise_finding(item: Finding, tests: Residuals) -> Finding:
-    """Return a finding, replaced by a milder one if the residuals are noise that no input explains.
+    """Return a finding, or a less severe one in its place if the residuals are noise that no input explains.
 
-    Findings on colored residuals and on a poor fit are replaced.
-
-    Residual tests omit the first and the last sample. If the fit is poor only because of these, the finding says that
-    they are outliers.
+    Findings on colored residuals and on a poor fit are replaced. Residual tests omit the first and the last sample. If
+    the fit is poor only because of these two samples, the finding states that they are outliers.
     """
     if item.code == "explains_little" and tests.outputs[item.output].nr <= MAX_NORMALIZED_RESIDUAL:
         inner = 100.0 * (1.0 - tests.outputs[item.output].nr)
@@ -413,7 +418,8 @@ def _coupling_finding(item: Finding, structure: Structure) -> Finding:
 def arm_findings(structure: Structure, findings: Sequence[Finding]) -> list[Finding]:
     """Return findings on the effects that the flexible-link model neglects, if residual tests fail.
 
-    The friction of a hub acts on its own equation. It enters that of a deflection only by the angle of the hub.
+    Friction at a hub is a term in the equation of the hub angle. It affects the equation of a deflection only through
+    this angle.
     """
     if not structure.name.startswith(FLEXIBLE_LINK) or not any(f.code in LEFT_OUT_CODES for f in findings):
         return []
@@ -457,7 +463,7 @@ def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
     Colored residuals of a joint fit are omitted, because its own findings report them.
     """
     if has_loop_noise_model(fit.settings):
-        # The loop is known, or its noise is; it is not part of what the model was estimated from.
+        # Such a fit is consistent in a closed loop, so detected feedback is no finding.
         tests = replace(tests, outputs={n: replace(o, feedback_tests={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return residual_findings(tests)
@@ -468,7 +474,7 @@ def _residual_findings(fit: Fit, tests: Residuals) -> list[Finding]:
 def _estimate(
     fit: Fit, comparison: Comparison, criteria: InformationCriteria | None, findings: tuple[Finding, ...]
 ) -> Estimate:
-    """Return the estimate that a model file stores: parameters, errors, fit and findings."""
+    """Return the estimate that a model file stores: parameters, standard errors, fit and findings."""
     joint, values, errors = fit.joint, dict(fit.model.orders), {}
     if joint is not None:
         values = joint.values_by_name
@@ -513,12 +519,12 @@ class BatchResult:
 def identify_one(
     runs: Run | Sequence[Run], structure: Structure, options: dict[str, Any]
 ) -> tuple[Identification | None, FtlmError | None]:
-    """Identify one item of a batch, and return (result, None) or (None, error)."""
+    """Identify one item of a batch, and return (result, None) or (None, error); other faults become InternalError."""
     try:
         return identify(runs, structure, **options), None
     except FtlmError as error:
         return None, error
-    except Exception as error:  # the others must go on
+    except Exception as error:  # A fault in one item must not stop the other items.
         return None, InternalError(f"internal fault: {type(error).__name__}: {error}; please report it")
 
 
@@ -563,7 +569,7 @@ def identify_many(
         If there are no runs, an item is not a run, or the method is unknown, has a `store`, or has its own executor as
         well.
     KeyboardInterrupt
-        Ctrl-C.
+        On Ctrl-C.
     """
     items = [runs] if isinstance(runs, Run) else list(runs)
     names = []

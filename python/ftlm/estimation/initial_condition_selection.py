@@ -38,7 +38,7 @@ INITIAL_CONDITIONS_WITH_LEVEL: tuple[Literal["rest"], Literal["caputo"]] = ("res
 OFFSETS_IN_MOTION: tuple[Literal["none"], Literal["level"]] = ("none", "level")
 #: Minimum ratio of the mean of an output to its standard deviation that suggests a level.
 MIN_LEVEL_MEAN_RATIO = 3.0
-#: Ratio of the residuals to the standard deviation of an output that suggests a level.
+#: Minimum ratio of the RMS residual to the standard deviation of an output that suggests a level.
 MIN_LEVEL_RESIDUAL_RATIO = 0.5
 #: Maximum number of samples with which an offset is tested without request: the test stores a sensitivity of each
 #: parameter at every sample.
@@ -50,11 +50,9 @@ def fit_with_offset_decision(
 ) -> Fit:
     """Return the fit of a structure, and decide on its initial conditions and its offset.
 
-    `estimate` serves ``offset="auto"``, which adds a constant per equation if it is significant; `fits` serves every
-    other offset.
-
-    The structure with the constant is fitted first, because a fit that lacks a necessary constant may end at any wrong
-    optimum.
+    `estimate` is used for ``offset="auto"``, which adds a constant to each equation if it is significant. The structure
+    with the constant is fitted first, because a fit that lacks a necessary constant may end at any wrong optimum.
+    `fits` is used for every other offset.
     """
     if structure.offset != "auto":
         fit = _fit_with_start_decision(structure, fits)
@@ -187,10 +185,10 @@ def _fit_with_constant(fit: Fit, structure: Structure, fits: InitialConditionFit
 
 
 def _fit_in_motion(fit: Fit, structure: Structure, fits: InitialConditionFits) -> Fit | None:
-    """Return a fit with nonzero initial conditions if the residuals of the fit from rest reject rest, else None.
+    """Return a fit with nonzero initial conditions if the residuals of the fit from rest contradict rest, else None.
 
-    A few quiet samples do not distinguish slow motion from rest. White residuals keep rest. If the residuals are not
-    white but have no slow component, those of the new fit must be white.
+    A few quiet samples do not distinguish slow motion from rest. With white residuals, rest is kept. If the
+    residuals are not white but have no slow component, those of the new fit must be white.
     """
     joint, runs = fit.joint, fit.task.runs
     automatic = structure.initial == "auto" and structure.offset in ("none", "constant") and structure.is_linear
@@ -230,8 +228,8 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
     """Return the best fit with a level added to each output, from rest or in motion; None if no level is preferred.
 
     Information criteria are compared under the noise color of the fit with the larger residuals. With `is_suggested`,
-    the optimum moves far, and automatic initial guesses are used. Otherwise the fit starts from the optimum without a
-    level.
+    the optimum may be far away, so automatic initial guesses are used. Otherwise the fit starts from the optimum
+    without a level.
     """
     if fit.joint is None or not fits.may_add_offset:
         return None
@@ -249,7 +247,7 @@ def _fit_with_level(fit: Fit, structure: Structure, fits: InitialConditionFits, 
             near = fit if candidate is None else candidate[1]
             level = fits.fit(request) if fresh else fits.refit(request, near, is_preferred)
             if level is not None and level.joint is not None and not (fresh or level.joint.converged):
-                # The optimum under other initial conditions is not near any optimum under these.
+                # There is no optimum under these initial conditions near the optimum under the others.
                 level = fits.fit(request)
         except FtlmError:
             continue

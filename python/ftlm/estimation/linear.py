@@ -43,7 +43,7 @@ MAX_IV_ITERATIONS = 40
 IV_RELATIVE_TOLERANCE = 1e-8
 #: Maximum relative change of a coefficient by the prior covariance that is not reported.
 MAX_PRIOR_SHIFT = 0.05
-#: Fewest block pulses with which the effect of the step is estimated.
+#: Minimum number of block pulses with which the bias by the discretization is estimated.
 MIN_STEP_TEST_PULSES = 32
 #: Maximum discretization bias of a coefficient, in standard errors, that is not reported.
 MAX_STEP_BIAS_ERRORS = 0.5
@@ -51,7 +51,11 @@ MAX_STEP_BIAS_ERRORS = 0.5
 
 @dataclass(frozen=True)
 class CoefficientFit:
-    """Result of a linear estimation at given orders: coefficients, known standard errors, pulses, findings."""
+    """Result of a linear estimation at given orders.
+
+    ``m`` is the number of block pulses per run, and ``initial`` are the initial conditions. ``values`` are the
+    coefficients by name, and ``errors`` their standard errors if the method gives them.
+    """
 
     m: int
     initial: Initial
@@ -63,10 +67,10 @@ class CoefficientFit:
 def estimate_coefficients(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, m: int | None
 ) -> CoefficientFit:
-    """Return the coefficients at given orders, estimated by the linear method that `settings` name.
+    """Return the coefficients at given orders, estimated by the linear method ``settings.coefficients``.
 
-    Non-linear terms contain derivatives of measured signals. They are computed from the raw and from smoothed signals,
-    and the estimate with the better simulation is returned.
+    Derivatives of measured signals in non-linear terms are computed in two ways, from raw and from smoothed signals.
+    Of the two estimates, the one with the better simulation is returned.
     """
     if settings.coefficients == "instrumental-variables":
         check_linear(structure.equations, "an instrument")
@@ -118,7 +122,7 @@ def _linear(
 def _multi_innovation(
     item: Equation, records: list[Record], settings: SearchSettings, prior: float | None
 ) -> list[float]:
-    """Return the multi-innovation estimate of the coefficients in closed form, equation (44) of the paper."""
+    """Return the multi-innovation estimate of the coefficients in closed form, eq. (44) of the paper."""
     haar = settings.row_basis == "haar"
     (raw, *_), _ = _core.multi_innovation(*_linear(item, records), settings.innovation_length, prior, haar, False)
     return raw
@@ -160,7 +164,7 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
 def step_bias_findings(
     runs: Sequence[Run], structure: Structure, settings: SearchSettings, fit: CoefficientFit
 ) -> list[Finding]:
-    """Return a finding if the discretization changes a coefficient by more than its standard error.
+    """Return a finding if the discretization biases a coefficient by more than half its standard error.
 
     The coefficients are estimated again with twice the step. The discretization has order 2, so one third of the change
     is the remaining error (Richardson).
@@ -198,7 +202,7 @@ def _prior_findings(output: str, raw: list[float], weak: list[float], settings: 
 
 @dataclass(frozen=True)
 class MultiInnovationTrace:
-    """Coefficients and simulation error after each step of the multi-innovation recursion, equation (44) of the paper.
+    """Coefficients and simulation error after each step of the multi-innovation recursion, eq. (44) of the paper.
 
     Parameters
     ----------
@@ -207,8 +211,8 @@ class MultiInnovationTrace:
     coefficients
         Coefficients by name, one value for each of these steps.
     error
-        Sum of absolute errors (45) of the model's simulation from rest after each of these steps; infinite if the
-        simulation diverges.
+        Sum of absolute errors, eq. (45) of the paper, of a simulation from rest with the coefficients of each step;
+        infinite if the simulation diverges.
     innovation_length
         Innovation length p.
     """
@@ -230,9 +234,9 @@ def multi_innovation_trace(
     m: int | None = None,
     every: int = 1,
 ) -> MultiInnovationTrace:
-    """Run the paper's recursion (44); return the coefficients and the simulation error (45) after each step.
+    """Run the recursion of eq. (44) of the paper, and return coefficients and simulation error after each step.
 
-    Equation numbers refer to the paper.
+    The error is the sum of absolute errors, eq. (45) of the paper.
 
     Parameters
     ----------
@@ -243,7 +247,7 @@ def multi_innovation_trace(
     innovation_length, prior_covariance, row_basis, m
         See :class:`ftlm.MultiInnovation` and :func:`ftlm.identify`.
     every
-        Interval between the steps that are returned; the last step is always returned.
+        Interval between returned steps, as a number of steps. The last step is always returned.
 
     Returns
     -------
@@ -300,9 +304,9 @@ def multi_innovation_trace(
 
 @check_arguments
 def trace_chart(traces: Sequence[tuple[str, MultiInnovationTrace]], *, title: str, log_x: bool = False) -> LineChart:
-    """Return a chart of the simulation error (45) after each step of recursion (44), as in the paper's Figure 4(b).
+    """Return a chart of the simulation error after each step of the multi-innovation recursion.
 
-    Equation and figure numbers refer to the paper.
+    It corresponds to Fig. 4(b) of the paper. The error is eq. (45) and the recursion is eq. (44) of the paper.
 
     Parameters
     ----------
@@ -348,8 +352,8 @@ class Streaming:
     Parameters
     ----------
     structure
-        One or several equations whose orders are numbers, without delays, initial terms or sensor filter; alpha - nu
-        of every term in [0, 2].
+        One or several equations whose orders are numbers, without delays, initial terms or sensor filter. The order of
+        the equation minus the order of a term must be in [0, 2] for every term.
     step
         Time between samples [s].
     longest
@@ -357,7 +361,7 @@ class Streaming:
     inputs
         Names of the input signals, which are constant between samples (zero-order hold).
     innovation_length, prior_covariance
-        Innovation length p and prior covariance K0 in equation (44) of the paper; by default the prior is weak, as in
+        Innovation length p and prior covariance K0 in eq. (44) of the paper; by default the prior is weak, as in
         :class:`ftlm.MultiInnovation`.
 
     Raises
@@ -447,7 +451,7 @@ class Streaming:
 
     @property
     def pulses(self) -> int:
-        """Number of rows processed by the paper's recursion (44): the number of samples minus one."""
+        """Number of rows processed by the recursion, eq. (44) of the paper: the number of samples minus one."""
         return self._recursions[0].pulses
 
     def __str__(self) -> str:

@@ -44,15 +44,18 @@ from ftlm.utils.statistics import autoregression
 from ftlm.utils.validation import Floats, check_choice, check_threads
 from ftlm.validation.residual_tests import DEFAULT_LAGS
 
-#: Maximum number of alternations of model and noise model, and largest change of a parameter of a converged one, in
-#: standard errors.
+#: Maximum number of alternations between model and noise model, and change of every parameter [standard errors] below
+#: which they have converged.
 MAX_ALTERNATIONS, ALTERNATION_TOLERANCE = 30, 0.02
-#: Relative size of a direction of lagged noise below which it is rounding.
+#: Singular value of lagged residuals, relative to the largest one, below which it counts as a rounding error.
 LAG_RANK_TOLERANCE = 1e-10
 
 
 def check_noise_model(runs: Sequence[Run], structure: Structure) -> None:
-    """Raise ModelError if the runs or the structure do not allow an autoregressive noise model."""
+    """Raise ModelError if the runs or the structure do not allow an autoregressive noise model.
+
+    It requires one output, a linear structure without saturations and dead zones, and uniform samples.
+    """
     label = parameter("noise", "ar")
     if len(structure.outputs) > 1:
         raise ModelError(
@@ -126,7 +129,7 @@ def _lag_columns(residuals: Sequence[Floats], order: int) -> Floats:
 
 
 def whiten(run: Run, colour: Floats) -> Run:
-    """Return a run filtered by A(q). The first output samples are then missing."""
+    """Return a run whose signals are filtered by A(q) with coefficients `colour`; its first outputs are missing."""
     past = colour.size - 1
 
     def whitened_samples(values: Floats) -> Floats:
@@ -144,7 +147,7 @@ def whiten(run: Run, colour: Floats) -> Run:
 
 
 def _at_estimate(fit: Fit, joint: JointFit, runs: Sequence[Run], weight: float) -> tuple[Objective, Iterate]:
-    """Return the objective of a fit on some runs, and its estimate as an iterate."""
+    """Return the objective of a fit for `runs`, with the output weight `weight`, and its estimate as an iterate."""
     problem = FreeProblem.of(replace(fit.task.structure, initial=joint.initial))
     values = joint.values_by_name
     return Objective(problem, runs, [weight], every=joint.refinement), start_from_values(problem, values)
@@ -169,7 +172,7 @@ def _with_noise_model_errors(fit: Fit, joint: JointFit, residuals: Sequence[Floa
     rows = np.asarray(grid.minimize(start, 1, plain=True).outcome["jacobian"])
     scale = 1.0 / np.maximum(column_norms(rows.T), 1e-300)
     rows = rows * scale[:, None]
-    # Missing samples have no sensitivity.
+    # Lagged residuals are set to 0 at missing samples, at which the sensitivities are 0.
     basis = orthonormal(
         np.nan_to_num(_lag_columns(residuals, order)) * np.any(rows != 0.0, axis=0)[:, None], LAG_RANK_TOLERANCE
     )
@@ -202,9 +205,9 @@ class EstimationMethod(Protocol):
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class OutputError:
-    """Output-error method: estimates orders and coefficients of all equations together, by maximum likelihood.
+    """Output-error method, which estimates orders and coefficients of all equations together.
 
-    The likelihood assumes white noise.
+    It maximizes the likelihood of white measurement noise.
 
     Orders are continuous, initialization is automatic, and parameters have confidence intervals.
 
@@ -216,8 +219,8 @@ class OutputError:
     intervals
         Kind of the 95 % intervals. ``"quadratic"``: estimate ± 1.96 standard errors, exact for a quadratic cost.
         ``"profile"``: profile likelihood for every parameter, ten to a hundred simulations each. ``"auto"``: profile
-        likelihood for parameters whose Wald interval is wrong by over a tenth, which two simulations per parameter
-        check. See :meth:`ftlm.Identification.profile`.
+        likelihood for parameters whose Wald interval is wrong by over a tenth. Two simulations per parameter test this.
+        See :meth:`ftlm.Identification.profile`.
     start
         Additional initial guess: an identification, a model of the same outputs, or values of free parameters by name.
         The cost of the fit is never larger than the cost of a fit from this guess alone. A missing coefficient starts
@@ -232,8 +235,8 @@ class OutputError:
         noise and the loop has a delay (Ljung, chapter 13). ``"ar"`` requires one output, a linear model and uniform
         samples; its intervals are ± 1.96 standard errors.
     bounds
-        (lower, upper) of coefficients and orders by name; infinite for an open side. A coefficient that ends on a bound
-        is fixed at the bound, has no confidence interval, and is named by a finding.
+        (lower, upper) of coefficients and orders by name; infinite without a bound on that side. A coefficient that
+        ends on a bound is fixed at the bound, has no confidence interval, and is named by a finding.
 
     Raises
     ------
@@ -398,7 +401,7 @@ class OrderSearchMethod:
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class LeastSquares(OrderSearchMethod):
-    """Least-squares method: minimizes the equation error at the best orders of an order grid.
+    """Least-squares method, which minimizes the equation error at the best orders of an order grid.
 
     It is the limit of the multi-innovation method for a weak prior. Noise on the outputs biases the estimate.
 
@@ -410,7 +413,7 @@ class LeastSquares(OrderSearchMethod):
     Raises
     ------
     ModelError
-        A value that :func:`ftlm.search_orders` does not accept.
+        If :func:`ftlm.search_orders` does not accept the value of an option.
     """
 
     name: ClassVar[str] = "least-squares"
@@ -419,7 +422,7 @@ class LeastSquares(OrderSearchMethod):
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class InstrumentalVariables(OrderSearchMethod):
-    """Method of refined instrumental variables: coefficients at the best orders of an order grid.
+    """Method of refined instrumental variables, which estimates coefficients at the best orders of an order grid.
 
     Noise on the outputs does not bias the coefficients.
 
@@ -431,7 +434,7 @@ class InstrumentalVariables(OrderSearchMethod):
     Raises
     ------
     ModelError
-        A value that :func:`ftlm.search_orders` does not accept.
+        If :func:`ftlm.search_orders` does not accept the value of an option.
     """
 
     name: ClassVar[str] = "instrumental-variables"
@@ -440,25 +443,26 @@ class InstrumentalVariables(OrderSearchMethod):
 @check_arguments
 @dataclass(frozen=True, kw_only=True)
 class MultiInnovation(OrderSearchMethod):
-    """Multi-innovation method of the paper, equation (44): coefficients with a prior at the best orders of a grid.
+    """Multi-innovation method, eq. (44) of the paper, which estimates coefficients with a prior at the best orders.
 
     Parameters
     ----------
     order_grid, criterion, norm, top, store, executor
         Options of the order search; see :func:`ftlm.search_orders`. Without a free order they must be the defaults.
     innovation_length
-        Innovation length p in equations (43)-(44) of the paper. It only weights the data against the prior.
+        Innovation length p in eqs. (43)-(44) of the paper. It only weights the data against the prior.
     prior_covariance
-        Diagonal entry of the prior covariance K0 in equations (43)-(44), the same for all coefficients. By default the
-        prior is weak and independent of units: 1e10 over the sum of squares of each coefficient's regressor. The paper
-        uses 1.
+        Diagonal entry of the prior covariance K0 in eqs. (43)-(44) of the paper, the same for all coefficients. By
+        default the prior is weak and independent of units: 1e10 over the sum of squares of each coefficient's
+        regressor. The paper uses 1.
     row_basis
-        Basis of the rows in equation (42): ``"haar"`` for Haar wavelets, for which m is a power of two, or ``"time"``.
+        Basis of the rows in eq. (42) of the paper: ``"haar"`` for Haar wavelets, for which m is a power of two, or
+        ``"time"``.
 
     Raises
     ------
     ModelError
-        A value that :func:`ftlm.search_orders` does not accept.
+        If :func:`ftlm.search_orders` does not accept the value of an option.
     """
 
     name: ClassVar[str] = "multi-innovation"
@@ -467,7 +471,7 @@ class MultiInnovation(OrderSearchMethod):
     row_basis: RowBasis = SearchSettings.row_basis
 
 
-#: Methods by the name that stands for their defaults.
+#: Classes of the estimation methods by name. The name alone selects the method with default options.
 METHODS_BY_NAME: dict[str, type[Any]] = {
     method.name: method
     for method in (OutputError, InstrumentalVariables, MultiInnovation, LeastSquares, GeneticAlgorithm)

@@ -37,55 +37,61 @@ from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Comparison, compare, validation_findings
 from ftlm.validation.data_advice import check_excitation, find_dead_channel
 
-#: Maximum correlation of two separately identifiable parameters, unless one of them is well determined.
+#: Maximum absolute correlation of two separately identifiable parameters, unless one of them is well determined.
 MAX_PARAMETER_CORRELATION = 0.995
-#: Least number of samples per period of a mode whose numbers do not rest on the inputs between samples, and damping
-#: ratio from which on a mode is not a swing.
+#: Minimum number of samples per period of a mode, below which its parameters depend on the assumed intersample behavior
+#: of the inputs; and damping ratio from which on a mode does not count as oscillatory.
 MIN_SAMPLES_PER_PERIOD, MAX_SWING_DAMPING = 8.0, 0.7
-#: Maximum relative standard error of a well-determined coefficient or delay, and largest standard error of an order.
-#: Its 95 % interval then spans less than half its value, or less than the increment of 0.5 between common mechanisms.
+#: Maximum relative standard error of a well-determined coefficient or delay, and maximum standard error of an order.
+#: The 95 % interval is then shorter than half the value, or than the increment 0.5 between orders of common mechanisms.
 MAX_RELATIVE_STANDARD_ERROR = 0.1
-#: An output is early if it leaves its level by so many standard deviations of its noise before its input can act, by a
-#: part of a row that its slope tells. Earlier by more, it would leave its level in the row before.
+#: An output responds too early if it leaves its level in the sample in which an input changes. The deviation must
+#: exceed `EARLY_SIGMAS` noise standard deviations. Divided by the next increment, it must be within `EARLY_ROWS`
+#: [samples]. With a larger ratio, the output would have left its level one sample earlier.
 EARLY_SIGMAS, EARLY_ROWS = 4.0, (0.1, 1.5)
-#: Outliers are reported from this number and this fraction of all residuals, or if they hold this fraction of the
-#: squares, which doubles the variance of every parameter.
+#: Outliers are reported from a minimum number and a minimum fraction of all residuals on. They are also reported if
+#: their fraction of the residual sum of squares reaches a limit, which doubles the variance of every parameter.
 MIN_OUTLIERS = 3
 MIN_OUTLIER_FRACTION = 2e-3
 MIN_OUTLIER_POWER_FRACTION = 0.5
-#: Residuals of so many rows of about the same speed measure the usual one at that speed.
+#: Number of samples of similar speed from which the standard deviation of the residuals at that speed is estimated.
 ROWS_OF_ONE_SPEED = 25
-#: Quantization step in noise standard deviations above which residuals are dominated by rounding.
+#: Quantization step, in noise standard deviations, above which quantization dominates the residuals.
 QUANTIZATION_NOISE_RATIO = 2.0
 #: Maximum deviation of a value from a multiple of the quantization step, as a fraction of the step.
 QUANTIZATION_STEP_TOLERANCE = 0.01
-#: Minimum change within a sample that counts as motion, as a fraction of the range of the output.
+#: Minimum change per sampling interval that counts as motion, as a fraction of the range or largest change of the
+#: output.
 MIN_MOTION_RANGE_FRACTION = 1e-6
-#: Level at which growth is significant, one-sided: a pole grows if its real part exceeds 0 by so many standard errors.
+#: One-sided confidence level of a growing mode, and number of standard errors by which the real part of its pole must
+#: exceed 0.
 GROWTH_LEVEL = 0.99
 GROWTH_SIGMAS = NormalDist().inv_cdf(GROWTH_LEVEL)
-#: A parameter whose variance falls below this share is fixed by the eliminated ones.
+#: Conditional variance of a parameter, relative to its variance, below which the eliminated parameters determine it.
 MIN_VARIANCE_RATIO = 1e-9
-#: Minimum number of intervals at less than SLOW_SPEED_RATIO times vs that determine the Stribeck term.
+#: Minimum number of sampling intervals at low speed that determine the Stribeck term. A speed is low below
+#: `SLOW_SPEED_RATIO` times the Stribeck speed.
 MIN_SLOW_INTERVALS, SLOW_SPEED_RATIO = 5, 2.0
-#: An end of the multistart is a second optimum if its log likelihood is smaller by no more than this, and a value
-#: differs by more than so many standard errors.
+#: Maximum decrease of the log likelihood from the best optimum to a second optimum, and minimum difference between
+#: their values of one parameter [standard errors].
 SECOND_OPTIMUM_LOG_LIKELIHOOD, SECOND_OPTIMUM_ERRORS = 2.0, 3.0
-#: Two optima are the same model if the squared differences of their residuals sum to less, in units of the variance.
+#: Sum of squared differences between the residuals of two optima, divided by the noise variance, below which both are
+#: the same model.
 SAME_MODEL_POWER = 1e-2
-#: Maximum cost on the coarse grid, relative to the best candidate, of candidates from which a second optimum is sought.
+#: Maximum cost of a multistart candidate from which a second optimum is sought, relative to the lowest cost. Both are
+#: costs on the coarse grid.
 MAX_SECOND_COST_RATIO = 1.05
 #: Maximum number of evaluations of the search for a second optimum.
 MAX_SECOND_EVALUATIONS = 60
-#: Samples of the first parts of all runs, on which second optima of longer records are looked for first, and fewest of
-#: one run.
+#: Second optima of long records are first sought on the first samples of each run: total number over all runs, and
+#: minimum number per run.
 MAX_SECOND_SAMPLES, MIN_SECOND_RUN_SAMPLES = 6000, 1000
-#: Maximum relative deviation of two coefficients from the coefficient law.
+#: Maximum relative deviation of a coefficient from its value by the coefficient law.
 MAX_LAW_DEVIATION = 0.05
 
 
 def identifiability_findings(joint: JointFit, problem: FreeProblem) -> list[Finding]:
-    """Return findings on failed convergence and on parameters that are not identifiable from the runs."""
+    """Return findings on failed convergence, and on parameters that are on a bound or not determined by the runs."""
     findings = []
     if not joint.converged:
         findings.append(make_finding("not_converged"))
@@ -135,8 +141,8 @@ def second_optimum_findings(
 ) -> list[Finding]:
     """Return a finding on the most likely other optimum whose parameters differ by over three standard errors.
 
-    An optimum is given as (values, decrease of the log likelihood, standard errors by name). The larger of the standard
-    errors of both optima is used.
+    `values` and `errors` are the parameters of the best optimum and their standard errors. Each other optimum is given
+    as (values, decrease of the log likelihood, standard errors by name). The larger standard error of both is used.
     """
     for other, fall, own in sorted(optima, key=lambda optimum: optimum[1]):
         if fall > SECOND_OPTIMUM_LOG_LIKELIHOOD:
@@ -162,7 +168,7 @@ def second_optimum_findings(
 def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> list[Finding]:
     """Return a finding if a candidate of the multistart leads to a second, almost equally likely optimum.
 
-    The best candidates are fitted to all samples.
+    Candidates of low cost that are far from the optimum are fitted to all samples.
     """
     errors = [joint.standard_errors[n] for n in joint.names]
     best_cost = min((cost for cost, _ in joint.survivors), default=0.0)
@@ -191,9 +197,9 @@ def multistart_findings(joint: JointFit, problem: FreeProblem, runs: Sequence[Ru
 
 
 def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> list[tuple[Floats, float]]:
-    """Return other optima that are almost as likely as the best one and simulate other outputs.
+    """Return other optima that are almost as likely as the best one but have other simulated outputs.
 
-    Each is returned as (values, decrease of the log likelihood).
+    Each is returned as (values, decrease of the log likelihood). The result is [] if a fit from one of `starts` fails.
     """
 
     def fit(values: Floats) -> tuple[Floats, float, Floats]:
@@ -217,7 +223,7 @@ def _other_optima(grid: Objective, best: Floats, starts: Sequence[Floats]) -> li
 
 
 def _unstable_optimum_findings(joint: JointFit) -> list[Finding]:
-    """Return findings on an unstable optimum, which say whether it or a stable one was chosen."""
+    """Return a finding on an unstable optimum, which states whether the unstable or a stable optimum was chosen."""
     if joint.unstable_optimum is None or joint.unstable_optimum.residual_excess <= 0.0:
         # An unstable optimum with a larger cost than the stable one is no alternative.
         return []
@@ -243,7 +249,7 @@ def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) 
         for n, p in joint.profiles.items()
         if n not in unidentifiable
     }
-    # An order that ends at 0 has nothing below it.
+    # An order cannot be below 0, so an order of 0 has no lower bound.
     open_ended = {n: s for n, s in sides.items() if s and (s != ["below"] or joint.orders.get(n) != 0.0)}
     if not open_ended:
         return []
@@ -254,8 +260,8 @@ def unbounded_interval_findings(joint: JointFit, unidentifiable: Sequence[str]) 
 def sample_findings(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[Finding]:
     """Return findings on discretization, color of residuals, outliers, quantization and interpolated samples.
 
-    Residuals at the level of rounding errors give no finding: standard errors are as small, and no change of an
-    estimate by a part of them matters.
+    Outputs whose residuals are at the level of rounding errors give no finding, because such residuals hardly change
+    the estimates.
     """
     exact = joint.exact_outputs(runs)
     outputs = [o for o in problem.structure.outputs if o not in exact]
@@ -319,7 +325,7 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
         noise = noise_at_start(y)
         early, slope = float(y[row]) - level, float(y[row + 1] - y[row])
         rows = early / slope if slope else math.inf
-        # A drifting level leaves its mean, too. Its last increment is not larger than the others, however.
+        # A drifting output also deviates from its mean level, but its last increment is not larger than the others.
         increments = np.diff(drop_missing(y[: row + 1]))
         usual = max(noise, float(np.sqrt(np.mean(increments[:-1] ** 2))))
         is_early = abs(early) > EARLY_SIGMAS * noise and abs(increments[-1]) > EARLY_SIGMAS * usual
@@ -332,7 +338,7 @@ def _early_output_findings(run: Run, structure: Structure, evidence: RestEvidenc
 
 
 def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit, output: str) -> list[Finding]:
-    """Return a finding on outliers of an output, unless a robust loss was used."""
+    """Return a finding on outliers among the residuals of an output; [] if a robust loss was used."""
     if joint.robust is not None:
         return []
     series = [joint.noise[output] * part[output] for part in joint.residuals]
@@ -346,7 +352,7 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
         rows = np.flatnonzero(np.abs(part) > limit)
         power += float(np.sum(part[rows] ** 2))
         if rows.size and not far:
-            # Compared rows begin behind the first one.
+            # The first residual belongs to the second sample of a run.
             first = f"first at row {int(rows[0]) + 1} of {run.name}"
         far += rows.size
     count = every.size
@@ -373,9 +379,9 @@ def _outlier_findings(runs: Sequence[Run], structure: Structure, joint: JointFit
 
 
 def _simulated_speeds(samples: Floats, residuals: Floats) -> Floats:
-    """Return the absolute change of the simulated output around each inner sample.
+    """Return, for each residual, the larger change of the simulated output to a neighboring sample (absolute value).
 
-    Outliers of the measured output do not affect it.
+    The simulated output is the measured one minus the residuals, so outliers of the measurement do not affect it.
     """
     simulated = interpolate_gaps(samples[1 : 1 + residuals.size] - residuals)
     steps = np.abs(np.diff(simulated, prepend=simulated[:1], append=simulated[-1:]))
@@ -385,9 +391,9 @@ def _simulated_speeds(samples: Floats, residuals: Floats) -> Floats:
 def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
     """Return a robust standard deviation of the residuals for each sample, by which outliers are detected.
 
-    It is the deviation of all samples, or that of samples with similar speed if that is larger. Residuals that grow
-    with speed, such as those of timing or gain errors, are therefore not outliers. If the machine is at rest during
-    most of the run, samples in motion are not outliers either.
+    It is estimated from all samples, or from the samples of similar speed if that estimate is larger. Residuals that
+    grow with speed, such as those of timing or gain errors, are therefore not outliers. If the machine is at rest
+    during most of the run, samples in motion are not outliers either.
     """
     usual = np.full(residuals.size, robust_deviation(drop_missing(residuals)))
     finite_rows = np.flatnonzero(~np.isnan(residuals))
@@ -399,7 +405,7 @@ def _usual_deviations(residuals: Floats, speeds: Floats) -> Floats:
 
 
 def _quantization_findings(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> list[Finding]:
-    """Return a finding on an output whose quantization step exceeds its noise standard deviation."""
+    """Return a finding if the quantization step of an output exceeds `QUANTIZATION_NOISE_RATIO` times its noise."""
     steps = [quantization_step(drop_missing(compared_values(run, structure, output))) for run in runs]
     coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > QUANTIZATION_NOISE_RATIO * noise]
     if not coarse:
@@ -457,7 +463,7 @@ def _are_inseparable(joint: JointFit, correlation: Floats, i: int, j: int) -> bo
 
 
 def excitation_findings(runs: Sequence[Run], structure: Structure) -> list[Finding]:
-    """Return findings on equations with free parameters that no run excites."""
+    """Return a finding for each equation whose free parameters are not excited in any run."""
     lacking = [{f.output: f for f in check_excitation(run, structure)} for run in runs]
     return [item for output, item in lacking[0].items() if all(output in other for other in lacking)]
 
@@ -497,8 +503,8 @@ def coefficient_law_findings(model: Model) -> list[Finding]:
 def discretization_findings(model: Model, comparison: Comparison) -> list[Finding]:
     """Return findings if the block-pulse discretization is unstable at this step although the model is stable.
 
-    In a stiff equation, a term of the output with alpha - nu > 1 (order of the equation minus order of the term) gives
-    the discretization an unstable mode at the Nyquist frequency that the model does not have.
+    Such an instability occurs in a stiff equation of order alpha if an output term has an order nu with alpha - nu > 1.
+    The discretization then has an unstable mode at the Nyquist frequency, which the model does not have.
     """
     findings = []
     for item in model.equations:
@@ -514,7 +520,7 @@ def discretization_findings(model: Model, comparison: Comparison) -> list[Findin
 
 
 def friction_direction_findings(model: Model, free: Sequence[OutputSamples]) -> list[Finding]:
-    """Return findings if a body slides in one direction only, so that friction and an offset are collinear."""
+    """Return a finding for each body that slides in one direction only, so that friction and offset are collinear."""
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
 
@@ -551,13 +557,13 @@ def stribeck_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputSa
 
 
 def stability_findings(model: Model) -> list[Finding]:
-    """Return a finding on poles with a positive real part, whose growth a short run may not show.
+    """Return a finding on poles with a positive real part; a short run may not reveal the growth of their modes.
 
     The finding is an error if the real part of a pole is significantly positive. Otherwise an integrator or a slowly
     decaying mode explains the run as well.
     """
     if not model.structure.is_linear:
-        # Friction holds what would grow slowly, and a spring that hardens what would grow; no poles say so.
+        # Friction or a hardening spring can bound a growing motion. Poles do not describe this.
         return []
     stable = model.stability(coupling=model.structure.coupling)
     if not stable.unstable_poles > 0:
@@ -604,7 +610,8 @@ def _has_significant_growth(model: Model, coupling: str) -> bool:
         unstable = [mode for mode in modes(model, coupling=coupling) if mode.unstable]
     except FtlmError:
         return True
-    # To first order the real part of a pole relates to its error as the damping does, on the axis as the size does.
+    # To first order, the real part of an oscillatory pole and the damping have the same ratio to their standard errors.
+    # For a real pole, the frequency has this ratio.
     ratios = [
         (mode.damping, mode.damping_error) if mode.oscillatory else (mode.frequency, mode.frequency_error)
         for mode in unstable
@@ -628,7 +635,7 @@ def _is_stable_without_insignificant_terms(model: Model, coupling: str) -> bool:
         at += 1 + 2 * len(item.terms)
     variances, statistic = np.diagonal(matrix).copy(), 0.0
     for eliminated in range(1, len(terms) + 1):
-        # A term whose variance is gone is fixed, or tied to one that is eliminated.
+        # A coefficient without remaining variance is fixed, or determined by the eliminated ones.
         free = [i for i in terms if matrix[i, i] > MIN_VARIANCE_RATIO * variances[i]]
         if not free:
             return False
@@ -659,7 +666,7 @@ def enumerate_names(names: Sequence[str]) -> str:
 
 
 def validate(result: Identification, runs: Run | Sequence[Run]) -> Comparison:
-    """Compare simulated and measured outputs on other runs; see :meth:`ftlm.Identification.validate`."""
+    """Return a comparison of the model with validation runs; see :meth:`ftlm.Identification.validate`."""
     comparison = compare(result.model, runs)
     findings = [
         *comparison.findings,

@@ -21,10 +21,10 @@ from ftlm.structure.equation import Equation, Term, derivative
 from ftlm.structure.expression import Channel, channel
 from ftlm.utils.validation import Floats
 
-#: Growth of a sensitivity from the first half of a run to the second one from which on it is exponential, if the output
-#: grows less than `MAX_OUTPUT_GROWTH`: no power of t of a stable model comes near.
+#: Growth factor of a sensitivity from the first to the second half of a run, above which the growth is exponential, and
+#: maximum growth factor of the output. The powers of t in a stable model grow far less.
 EXPONENTIAL_GROWTH, MAX_OUTPUT_GROWTH = 64.0, 4.0
-#: Relative change of a parameter for its sensitivity; the free run is smooth in it to rounding.
+#: Relative change of a parameter in the finite difference that gives its sensitivity.
 RELATIVE_CHANGE = 1e-7
 
 
@@ -39,7 +39,7 @@ def nonlinear_findings(model: Model, runs: Sequence[Run], free: Sequence[OutputS
 
 
 def _signal_values(model: Model, run: Run, samples: OutputSamples) -> dict[str, Floats]:
-    """Return samples of all signals by name: simulated outputs, and inputs after saturation and dead zone."""
+    """Return samples of all signals by name: simulated outputs, and inputs with saturation and dead zone applied."""
     limited = apply_input_nonlinearity(run.with_interpolated_gaps(), model.structure)
     simulated = dict(zip(model.outputs, samples.outputs, strict=True))
     return {name: simulated[name] if name in simulated else limited[name] for name in model.structure.signals}

@@ -60,24 +60,26 @@ from ftlm.utils.statistics import (
 from ftlm.utils.validation import Floats
 from ftlm.validation.residual_tests import DEFAULT_LAGS
 
-#: Block pulses per sampling interval if the fit does not state its refinement.
+#: Number of block pulses per sampling interval if the fit does not state its refinement.
 DEFAULT_PULSES_PER_SAMPLE = 2
-#: Relative size of the offset sensitivity below which it is collinear with the other parameters.
+#: Fraction of the norm of an offset sensitivity that the other sensitivities do not explain. Below this value, the
+#: offset is collinear with the other parameters.
 OFFSET_COLLINEARITY_TOLERANCE = 1e-6
-#: Minimum reported effect of an offset, as a fraction of the standard deviation of the output.
+#: Minimum RMS effect of a reported offset, as a fraction of the standard deviation of the output.
 MIN_OFFSET_SIZE_RATIO = 1e-3
 #: Significance level of the finding on an offset that was not requested.
 UNREQUESTED_OFFSET_LEVEL = 1e-4
-#: Maximum number of evaluations from the grid point to the nearby optimum.
+#: Maximum number of evaluations of a fit from a point of the order grid to the nearby optimum.
 MAX_REFINEMENT_EVALUATIONS = 40
-#: Maximum number of evaluations that screen initial conditions from an optimum under others. Those that explain a run
-#: as well converge in two to four.
+#: Maximum number of evaluations of a screening: a short fit with other initial conditions from a known optimum. Initial
+#: conditions that explain the runs equally well converge in two to four evaluations.
 MAX_SCREENING_EVALUATIONS = 12
 #: Increase of twice the log-likelihood by a full step below which a screening has converged.
 SCREENING_LIKELIHOOD_TOLERANCE = 0.01
-#: Share of the residuals of a screening that a fit to the end could leave, if the screening converged and if not.
+#: RMS residual that a complete fit may reach, relative to that of the screening: if the screening has converged, and if
+#: it has not.
 CONVERGED_RESIDUAL_SHARE, SCREENING_RESIDUAL_SHARE = 0.9, 0.5
-#: Change on halving the step, relative to the largest value, of simulations that judge a history.
+#: Change when the step is halved, relative to the largest value, at which simulations with a history have converged.
 HISTORY_SIMULATION_TOLERANCE = 1e-3
 
 
@@ -95,8 +97,8 @@ class OffsetTest:
     share
         Fraction of the residual sum of squares that the constants explain.
     size
-        Root-mean-square effect of the constants relative to the standard deviation of the output. A very small effect
-        may be rounding error.
+        Root-mean-square effect of the constants relative to the standard deviation of the output, largest over runs and
+        outputs. A very small effect may be rounding error.
     """
 
     statistic: float
@@ -152,7 +154,7 @@ def evaluate_at_point(
     weights = [1.0 / level for level in levels.values()]
     grid = replace(grid, weights=weights)
     if len(weights) > 1:
-        # Initial terms bring all outputs closest together, so that they follow the weights.
+        # Initial terms are fitted to all outputs together, so they depend on the weights.
         return grid, grid.minimize(point, 1, plain=True)
     scaled = {n: weights[0] * np.asarray(point.outcome[n]) for n in ("residuals", "jacobian")}
     cost = weights[0] ** 2 * float(point.outcome["cost"])
@@ -164,10 +166,11 @@ def offset_test(
 ) -> OffsetTest | None:
     """Test at given parameters for an unknown constant in each equation and run; None if not computable.
 
-    Two linear regressions of the residuals under autoregressive noise are compared: on the sensitivities to all free
-    parameters and initial terms, and on these and the response to a constant in each equation. The statistic is
-    twice the logarithm of the likelihood ratio of their one-step prediction errors. The `values` need only be
-    consistent; `every` is the number of block pulses per sampling interval.
+    Two linear regressions of the residuals under autoregressive noise are compared. The regressors of the first one are
+    the sensitivities to all free parameters and initial terms. The second one has the response to a constant in each
+    equation in addition. The statistic is
+    twice the logarithm of the likelihood ratio of their one-step prediction errors. `values` are consistent estimates
+    by name, and `every` is the number of block pulses per sampling interval.
     """
     reserved_names = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
     one = next(n for n in ("one", *(f"one{k}" for k in range(len(reserved_names) + 1))) if n not in reserved_names)
@@ -181,7 +184,7 @@ def offset_test(
         whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
         grid, point = evaluate_at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
     except FtlmError:
-        # No finite simulation on this grid: the result says so elsewhere.
+        # No statistic can be computed without a finite simulation on this grid.
         return None
     first = len(grid.problem.orders) + grid.problem.coefficients.index(names[0])
     rows = np.asarray(point.outcome["jacobian"])
@@ -207,7 +210,8 @@ def offset_test(
     if count == 0 or not total > 0:
         return OffsetTest(0.0, 0, 0.0, 0.0)
     along = projections(basis_part, residuals)
-    # The initial terms, which are projected out of all columns, are fitted anew under the color of the noise.
+    # The sensitivities are orthogonal to the responses to initial terms. These responses are regressors as well,
+    # because the regression under colored noise estimates the initial terms again.
     common = np.column_stack([basis, *_initial_responses(point, blocks, residuals.size)])
     few, many = (np.ascontiguousarray(c.T) for c in (common, np.column_stack([common, basis_part])))
     by_output = [list(places_of_output) for places_of_output in zip(*blocks, strict=True)]
@@ -226,10 +230,11 @@ def offset_test(
 def offset_errors(
     joint: JointFit, structure: Structure, runs: Sequence[Run], offsets: Sequence[Mapping[str, Mapping[str, float]]]
 ) -> tuple[dict[str, dict[str, float]], ...]:
-    """Return the standard errors of the offsets of each run, by output and kind; empty if not computable.
+    """Return the standard errors of the offsets of each run, by output and kind; () if not computable.
 
-    A joint fit eliminates the offsets, so its covariance lacks them. Here the Jacobian has a row for each: the response
-    to a constant input of 1 (for a ramp, to the time), or, for a level, ones in the output.
+    `offsets` are the estimates in the same form. A joint fit eliminates the offsets, so its covariance lacks them. Here
+    the Jacobian has a row for each offset. It is the response to the input 1 for a constant, and to the input t for a
+    ramp. For a level, it is 1 at the samples of the output.
     """
     listed = [(k, o, kind) for k, run in enumerate(offsets) for o, own in run.items() for kind in own]
     if not listed or len(offsets) != len(runs):
@@ -276,7 +281,10 @@ def offset_errors(
 
 
 def _level_responses(grid: Objective, point: Iterate, listed: Sequence[tuple[int, str, str]]) -> list[Floats]:
-    """Return the derivatives of the weighted residuals with respect to levels, orthogonal to the initial terms."""
+    """Return the derivatives of the weighted residuals by levels, made orthogonal to the responses to initial terms.
+
+    Each entry of `listed` is (index of the run, output, kind) and gives one array of all residuals.
+    """
     shares, blocks = grid.residual_weights, _residual_blocks(grid)
     bases, columns = _initial_responses(point, blocks, shares.size), []
     for k, output, _ in listed:
@@ -293,7 +301,7 @@ def _level_responses(grid: Objective, point: Iterate, listed: Sequence[tuple[int
 def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[Run]) -> dict[str, list[Floats]]:
     """Return the sensitivities of residuals to parameters by output, an array (parameters, samples) for each run.
 
-    The projection on the initial terms is subtracted. The result is {} if a sensitivity is not finite.
+    Their projection on the responses to initial terms is subtracted. The result is {} if the evaluation fails.
     """
     try:
         grid, point = evaluate_at_point(runs, structure, joint.values_by_name, max(joint.refinement, 1))
@@ -304,9 +312,9 @@ def output_sensitivities(joint: JointFit, structure: Structure, runs: Sequence[R
 
 
 def without_offset_equivalents(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
-    """Return initial terms without those that act like an offset; only ``"caputo"`` is changed.
+    """Return initial terms without the powers of t that the response to a constant contains.
 
-    A power of t is such a term if the response to a constant contains it.
+    Only ``"caputo"`` is changed. It becomes a history with the remaining exponents.
     """
     if initial != "caputo":
         return initial
@@ -330,7 +338,10 @@ def _residual_blocks(grid: Objective) -> list[list[tuple[int, int]]]:
 
 
 def _initial_responses(point: Iterate, blocks: list[list[tuple[int, int]]], size: int) -> list[Floats]:
-    """Return the responses to the initial terms of each run, as columns of all residuals."""
+    """Return an array (residuals, initial terms) of responses to initial terms for each run that has such terms.
+
+    The responses are 0 at the residuals of other runs, and `size` is the number of all residuals.
+    """
     columns = []
     for responses, own in zip(point.outcome["initial_responses"], blocks, strict=True):
         if len(responses):
@@ -340,7 +351,7 @@ def _initial_responses(point: Iterate, blocks: list[list[tuple[int, int]]], size
 
 
 def constant_input(runs: Sequence[Run], structure: Structure) -> str | None:
-    """Return the name of an input with a free coefficient that is constant in every run, or None."""
+    """Return the name of an input that is constant in every run and has a free coefficient at order 0, or None."""
     for item in structure.equations:
         for term in item.terms:
             plain = term.fixed is None and not term.order.names and term.order.constant == 0 and term.nonlinear is None
@@ -449,7 +460,7 @@ def fits_better(joint: JointFit, other: JointFit, margin: float = 0.0) -> bool:
 
 
 def has_colored_residuals(joint: JointFit) -> bool:
-    """Whether the residuals have the color that a missing term or a wrong initial condition produces."""
+    """Whether the variance of a sum of residuals is inflated as by a missing term or a wrong initial condition."""
     inflation = (variance_inflation(drop_missing(series)) for series in _pooled_residuals(joint))
     return max(inflation) > START_SETTINGS.white_inflation
 
@@ -483,7 +494,7 @@ def _fit_without_implausible_history(
     """Return the fit with Caputo initial terms if no plausible past input causes the fitted history, otherwise None.
 
     The free powers of t of a history can fit dynamics that the structure lacks. Under the prior on past inputs that
-    :func:`ftlm.compare` uses, such a history leaves larger residuals than Caputo's terms do.
+    :func:`ftlm.compare` uses, such a history gives larger residuals than Caputo's terms do.
     """
     try:
         residuals = _simulation_residuals(Model(_fitted_structure(joint, structure)), runs)
@@ -499,7 +510,7 @@ def _fit_without_implausible_history(
 
 
 def _simulation_residuals(model: Model, runs: Sequence[Run]) -> list[Floats]:
-    """Return the residuals of each output over all runs, simulated with initial terms estimated as in `compare`."""
+    """Return the residuals of each output over all runs, simulated with initial terms fitted as in `compare`."""
     parts = []
     for run in runs:
         simulated = simulate_refined(model, run, None, tolerance=HISTORY_SIMULATION_TOLERANCE)
@@ -523,10 +534,11 @@ def refit_after_screening(
 ) -> JointFit | None:
     """Return the refit of a linear structure with other initial conditions or offsets; None if screened out or failed.
 
-    First, the cost is minimized from the optimum with at most `MAX_SCREENING_EVALUATIONS` evaluations. The residuals,
-    multiplied by `CONVERGED_RESIDUAL_SHARE` or `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of those of a
-    complete fit. If `accepts` rejects them, the result is None. Otherwise the structure is fitted on the same grid,
-    and, with `refine` and if `accepts` accepts that fit, again with a refined step. `accepts` may reject the result.
+    First, the cost is minimized from the optimum of `joint` with at most `MAX_SCREENING_EVALUATIONS` evaluations. The
+    residuals, multiplied by `CONVERGED_RESIDUAL_SHARE` or `SCREENING_RESIDUAL_SHARE`, are an optimistic estimate of
+    those of a complete fit. If `accepts` rejects them, the result is None. Otherwise the structure is fitted on the
+    same grid, and, with `refine` and if `accepts` accepts that fit, again with a refined step. `accepts` may reject the
+    result.
     """
     problem = FreeProblem.of(structure)
     weights = [1.0 / max(joint.noise[o], 1e-300) for o in structure.outputs]

@@ -42,7 +42,7 @@ def sample_run(
 
 @dataclass
 class Iterate:
-    """Point in parameter space, the initial guess it came from, and its evaluation by the core."""
+    """Point in parameter space, the initial guess from which it was reached, and its evaluation by the core."""
 
     orders: list[float]
     coefficients: list[float]
@@ -149,7 +149,7 @@ class Objective:
         )
 
     def evaluate(self, attempt: Iterate) -> Iterate:
-        """Return the residuals and the cost at a point, without derivatives."""
+        """Return a point with its residuals and its cost, without derivatives."""
         return self.minimize(attempt, 0)
 
     def residuals(self, attempt: Iterate) -> list[dict[str, Floats]]:
@@ -196,8 +196,8 @@ class Objective:
 def covariance(attempt: Iterate, grid: Objective) -> Floats:
     """Return the covariance matrix of the parameters at an optimum, robust to colored residuals.
 
-    A parameter that is not identifiable has infinite variance; no small singular values are truncated. With a robust
-    loss the matrix is the covariance of an M-estimator.
+    A parameter that is not identifiable has infinite variance, because small singular values are not truncated. With a
+    robust loss the matrix is the covariance of an M-estimator.
     """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
     shares = None if grid.robust_weights is None else grid.residual_weights

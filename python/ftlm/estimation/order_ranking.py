@@ -66,14 +66,14 @@ def search_orders(
     criterion
         Error that is scored. ``"output-error"``: error of a simulation of each equation, whose inputs include the
         measured other outputs. ``"equation-error"``: error of the equation with measured signals on the right-hand
-        side. It prefers equations that are nearly identities, in which a signal predicts itself.
+        side. This error is smallest for equations that are nearly identities, in which a signal predicts itself.
     coefficients
-        Estimator of the coefficients: ``"multi-innovation"`` (paper (44) in closed form), ``"least-squares"``, or
-        ``"instrumental-variables"`` for refined instrumental variables, which noise on the outputs does not bias. With
-        instrumental variables, measured outputs that enter another equation are replaced by their projections on
-        filtered inputs.
+        Estimator of the coefficients: ``"multi-innovation"`` (closed form of eq. (44) of the paper),
+        ``"least-squares"``, or ``"instrumental-variables"`` for refined instrumental variables, which noise on the
+        outputs does not bias. With instrumental variables, measured outputs that enter another equation are replaced by
+        their projections on filtered inputs.
     norm
-        ``"l1"`` for the sum of absolute errors (45) of the paper, or ``"l2"`` for the RMSE (46).
+        ``"l1"`` for the sum of absolute errors, eq. (45) of the paper, or ``"l2"`` for the RMSE, eq. (46) of the paper.
     innovation_length, prior_covariance, row_basis
         Options of ``"multi-innovation"``; see :class:`ftlm.MultiInnovation`. With another estimator they must have
         their default values.
@@ -183,8 +183,8 @@ def identification_of_searches(
 def _alike_findings(search: SearchResult, residuals: Residuals) -> list[Finding]:
     """Return a finding on table rows whose score is not significantly larger than the score of rank 1.
 
-    For N independent residuals, the sum of squares at the true k free orders exceeds that at the best ones by a
-    relative amount of chi-squared with k degrees of freedom, divided by N. Colored residuals count as fewer samples.
+    Consider N independent residuals and k free orders. The sum of squares at the true orders exceeds that at the best
+    orders by the relative amount chi-squared(k) / N. Colored residuals count as fewer samples.
     """
     samples = min(sum(map(_independent_samples, o.residuals)) for o in residuals.outputs.values())
     best, distinct = search.table[0], search.distinct_rows
@@ -210,5 +210,5 @@ def _independent_samples(residuals: Floats) -> float:
     samples = drop_missing(residuals)
     if samples.size < 2 or is_constant([samples]):
         return float(samples.size)
-    # Squares of the residuals of a run that grows may overflow.
+    # The squared residuals of a diverging simulation may overflow.
     return samples.size / variance_inflation(samples / np.abs(samples).max())

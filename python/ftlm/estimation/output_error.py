@@ -55,8 +55,8 @@ class UnstableOptimum:
 class ProfileInterval:
     """Profile-likelihood interval of a parameter.
 
-    It contains the values at which the cost, minimized over all other parameters, rises by no more than the noise
-    explains.
+    It contains the values at which the cost, minimized over all other parameters, rises by at most the threshold of the
+    likelihood-ratio test.
 
     Parameters
     ----------
@@ -102,7 +102,8 @@ class RobustLossSummary:
     Parameters
     ----------
     downweighted_count
-        Number of residuals beyond 1.345 standard deviations, which have reduced weight (18 % of normal noise).
+        Number of residuals beyond 1.345 standard deviations, which have reduced weight. Normal noise has 18 % of such
+        residuals.
     outliers
         Number of residuals beyond five standard deviations.
     samples
@@ -114,9 +115,9 @@ class RobustLossSummary:
     samples: int
 
 
-#: Residual of cost 1 in a coarse fit, as a fraction of the standard deviation of the output.
+#: Residual that counts as 1 in the cost of a coarse fit, as a fraction of the standard deviation of the output.
 COARSE_SHARE = 0.01
-#: Maximum relative difference of the costs of one and the same optimum.
+#: Relative difference of two costs below which both fits have ended at the same optimum.
 SAME_COST = 1e-3
 
 
@@ -141,12 +142,12 @@ class JointFit:
         Number of block pulses per sampling interval on the finest grid. The estimates are extrapolated from this grid
         and the next coarser one to step 0.
     step_converged
-        Whether halving the step moved every estimate by less than a tenth of its standard error.
+        Whether halving the step changed every estimate by less than a tenth of its standard error.
     converged
         Whether the gradient vanishes, apart from active bounds. False if the maximum number of evaluations was reached,
         no step lowered the cost, or the iterates left the range that the time grid can represent.
     starts
-        (cost per residual on a coarse grid, origin) of every initial guess, best first.
+        (cost per residual on a coarse grid, origin as text) of every initial guess, best first.
     survivors
         (cost per residual on a coarse grid, parameters) of the distinct best candidates of the multistart.
     residuals
@@ -222,7 +223,7 @@ class JointFit:
         return out
 
     def exact_outputs(self, runs: Sequence[Run]) -> set[str]:
-        """Return the outputs whose residuals are negligible: errors of rounding and discretization, not noise."""
+        """Return the outputs whose residuals are no larger than rounding and discretization errors."""
         sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in self.noise}
         return {o for o, noise in self.noise.items() if noise <= ROUNDING_RESIDUAL_RATIO * sizes[o]}
 
@@ -322,7 +323,7 @@ def fit_output_error(
         given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
     automatic = start is None and near is None and not guesses
     if automatic and problem.orders and structure.is_linear:
-        # A fit would leave the coefficients undetermined, after a search of all orders.
+        # The coefficients of collinear inputs are not identifiable. This check avoids a search of all orders.
         why = describe_collinear_inputs(runs, structure)
         if why is not None:
             raise ConvergenceError(f"no initial guess of {', '.join(outputs)} has a finite simulation; {why}")
@@ -374,8 +375,8 @@ def level_count(runs: Sequence[Run], structure: Structure) -> int:
 
 
 def fit_state(joint: JointFit, problem: FreeProblem) -> dict[str, Any]:
-    """Return a fit as keyword data, from which the core restores its objective and optimum."""
-    # If an unstable optimum was left, its valley is not that of the fit.
+    """Return the data of a fit by name, from which the core restores its objective and optimum."""
+    # If an unstable optimum was discarded, the core must not return to it.
     steady = joint.unstable_optimum is not None and not joint.unstable_optimum.is_accepted
     return {
         "estimate": joint.values,
@@ -394,7 +395,8 @@ def start_from_values(problem: FreeProblem, values: Mapping[str, float]) -> Iter
     return Iterate(orders, coefficients, "given start", {}, inputs)
 
 
-#: Distance of an order from its own bounds, so that derivatives exist there. Nothing is fitted.
+#: Distance between an estimated order and the bounds that :func:`problem_of` gives it, so that derivatives exist at the
+#: estimate. The order is not fitted again.
 ORDER_BOUND_MARGIN = 0.5
 
 

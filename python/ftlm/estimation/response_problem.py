@@ -36,7 +36,11 @@ def is_impedance(record: FrequencyData) -> bool:
 
 @dataclass(frozen=True)
 class ResponseRecord:
-    """One measured frequency response in scaled time, with its weights."""
+    """One measured frequency response in scaled time, with its weights.
+
+    ``output`` is the index of an equation, ``input`` the name of a signal, and ``frequency`` is divided by the unit of
+    the problem. Residuals are multiplied by ``weight``.
+    """
 
     output: int
     input: str
@@ -48,10 +52,8 @@ class ResponseRecord:
 class ResponseProblem:
     """Estimation problem of a structure from measured frequency responses, in scaled time.
 
-    The time unit is chosen so that parameters are near 1.
-
-    The time unit is 1/`unit` seconds. Parameter vectors have the order of `names`: free orders, free coefficients, free
-    delays.
+    The time unit is 1/`unit` seconds, where `unit` is the geometric mean of the measured frequencies. Parameters are
+    then near 1. Parameter vectors have the order of `names`: free orders, free coefficients, free delays.
     """
 
     def __init__(
@@ -67,8 +69,8 @@ class ResponseProblem:
         self.coefficients = tuple(dict.fromkeys(structure.coefficient_names))
         self.delays = tuple(item.signal for item in structure.free_inputs)
         self.names = (*self.orders, *self.coefficients, *(item.name for item in structure.free_inputs))
-        #: Free orders of an impedance that the user gives no values. As exponents of constant-phase elements they are
-        #: at most 1; an order such as alpha + 0.5 may exceed it.
+        #: Free orders of an impedance for which the user gives no values. They are exponents of constant-phase elements
+        #: and at most 1. A sum such as alpha + 0.5 may exceed 1.
         self.exponents = tuple(
             n
             for n in self.orders
@@ -85,7 +87,7 @@ class ResponseProblem:
         at = len(self.orders)
         self._coefficient = {name: at + k for k, name in enumerate(self.coefficients)}
         self._delay = {name: at + len(self.coefficients) + k for k, name in enumerate(self.delays)}
-        #: Of each free coefficient, its term with its equation.
+        #: (equation, term) of each free coefficient, by name.
         self.term_of = {t.coefficient: (e, t) for e in structure.equations for t in e.terms}
 
     def with_records(self, records: Sequence[FrequencyData], weights: Sequence[Floats]) -> ResponseProblem:
@@ -135,13 +137,13 @@ class ResponseProblem:
         return out
 
     def jacobian_in_seconds(self, values: Floats, jacobian: Floats) -> Floats:
-        """Convert a Jacobian by parameters in the problem's time unit to one by parameters in seconds."""
+        """Convert a Jacobian with respect to scaled parameters to one with respect to parameters in seconds."""
         out = jacobian.copy()
         log = np.log(self.unit)
         for name, at in self._coefficient.items():
             item, term = self.term_of[name]
             power = self.order_at(item.order, values) - self.order_at(term.order, values)
-            # c' = c unit^-(alpha - order): by c itself, and by each order at a fixed c.
+            # The scaled coefficient c unit^-(alpha - order) depends on the coefficient c and on the orders.
             for order, sign in ((item.order, -1.0), (term.order, 1.0)):
                 for n, w in order.weights:
                     out[:, self._place[n]] += sign * w * log * float(values[at]) * jacobian[:, at]
@@ -224,9 +226,9 @@ class ResponseProblem:
         return response, out
 
     def residuals(self, values: Floats, *, jacobian: bool = True) -> tuple[Floats, Floats]:
-        """Return the weighted residuals, all real parts before all imaginary parts, and their Jacobian.
+        """Return the weighted residuals (model minus measurement) and their Jacobian.
 
-        Without `jacobian` the Jacobian has no columns.
+        All real parts precede all imaginary parts. Without `jacobian`, the Jacobian has no columns.
         """
         residual_parts, rows = [], []
         with np.errstate(all="ignore"):
@@ -241,7 +243,7 @@ class ResponseProblem:
         return np.concatenate([flat.real, flat.imag]), np.concatenate([matrix.real, matrix.imag])
 
     def constraints(self) -> tuple[Floats, Floats, list[str]]:
-        """Return linear constraints ``rows @ values <= limits`` of orders and delays, with a description of each."""
+        """Return (rows, limits, descriptions) of the constraints ``rows @ values <= limits`` of orders and delays."""
         rows: list[Floats] = []
         limits: list[float] = []
         words: list[str] = []
@@ -303,9 +305,10 @@ class ResponseProblem:
         return max([MAX_DEFAULT_SEARCH_ORDER, *(o.constant for o in orders if not o.names)])
 
 
-#: Maximum number of grid points, of frequencies, of reweighting iterations, and of initial guesses returned.
+#: Maximum numbers of grid points, of frequencies, of reweighting iterations, and of returned initial guesses.
 MAX_GRID_POINTS, MAX_START_FREQUENCIES, REWEIGHTING_ITERATIONS, MAX_STARTS = 3000, 160, 4, 8
-#: Points whose exact cost is computed, corner frequencies tried for one own term, and points at which they are tried.
+#: Maximum number of grid points whose exact cost is computed, number of corner frequencies for one grid point, and
+#: maximum number of grid points with corner frequencies.
 MAX_EVALUATED_POINTS, CORNERS_PER_POINT, MAX_CORNER_POINTS = 60, 14, 120
 
 
@@ -339,7 +342,7 @@ def _points(problem: ResponseProblem) -> Floats:
     axes = list(problem.search_ranges().values())
     has_values = [n in problem.structure.order_values for n in problem.orders]
     delays = [(item.bounds[0] * problem.unit, item.bounds[1] * problem.unit) for item in problem.structure.free_inputs]
-    # An error of a third of a period at the highest frequency is still within reach of the optimum.
+    # The fit still converges from a delay error of a third of a period at the highest frequency.
     fastest = max(float(r.frequency.max()) for r in problem.records)
     fine = [int(np.clip(np.ceil((high - low) * fastest / 2.0) + 1, 2, 60)) for low, high in delays]
     room = max(MAX_GRID_POINTS // int(np.prod(fine, initial=1)), 60)
@@ -348,7 +351,7 @@ def _points(problem: ResponseProblem) -> Floats:
     free = count - sum(has_values)
     each = int(np.floor((room / max(lattice, 1)) ** (1.0 / free))) if free and lattice <= room else 0
     if (free and each < 4) or (not free and lattice > room):
-        # For too many axes, a low-discrepancy sequence replaces the grid; it is deterministic.
+        # For too many axes, a deterministic low-discrepancy sequence replaces the grid.
         spread = halton(room, count)
         columns = [
             np.asarray(a)[(spread[:, k] * len(a)).astype(int)] if g else a[0] + spread[:, k] * (a[1] - a[0])
@@ -390,7 +393,7 @@ def halton(count: int, width: int) -> Floats:
 def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Floats]:
     """Return the best initial guesses: grid points with coefficients by linear least squares.
 
-    The equations are solved one after another, and the points are sorted by their total cost.
+    The coefficients of each equation are computed separately. Points are sorted by the total cost of all equations.
     """
     slow = points[np.unique(np.linspace(0, len(points) - 1, min(MAX_CORNER_POINTS, len(points))).astype(int))]
     points, corners = (
@@ -413,13 +416,13 @@ def _linear_coefficients(problem: ResponseProblem, points: Floats) -> list[Float
 
 
 def _corner_frequencies(problem: ResponseProblem, first: int, slow: Floats) -> Floats:
-    """Return one corner frequency for each grid point, at which the slowest output term is fixed.
+    """Return one corner frequency for each grid point, which fixes the coefficient of the slowest output term.
 
-    It is NaN for the `first` points. Each row of `slow` gives several additional points, with corner frequencies
-    distributed over the measured band.
+    It is NaN for the `first` points, where this coefficient is estimated. Each row of `slow` gives several additional
+    points, with corner frequencies distributed over the measured band.
 
-    If noise hides a small arc of an impedance, iteratively reweighted least squares are biased, and the coefficients of
-    output terms are far too small or too large. If the slowest output term is fixed, the remaining bias is small.
+    If noise hides a small arc of an impedance, iteratively reweighted least squares are biased. The coefficients of
+    output terms are then far too small or too large. If the slowest output term is fixed, the remaining bias is small.
     """
     every = np.concatenate([r.frequency for r in problem.records])
     frequencies = np.geomspace(every.min(), every.max(), CORNERS_PER_POINT)
@@ -446,7 +449,8 @@ def _equation(
 ) -> tuple[Floats, Floats]:
     """Return the coefficients of one equation at every grid point by reweighted least squares, and their cost.
 
-    `place` is the index of the equation, and `corners` are those of :func:`_corner_frequencies`.
+    They have shapes (points, names) and (points,). `place` is the index of the equation, and `corners` are the corner
+    frequencies from :func:`_corner_frequencies`.
     """
     item = problem.structure.equations[place]
     alpha = _orders(problem, item.order.constant, item.order.weights, points)
@@ -541,10 +545,9 @@ def _shifts(problem: ResponseProblem, signal: str, points: Floats) -> Floats:
 
 
 def _signal(problem: ResponseProblem, record: ResponseRecord, name: str, late: Complex) -> Complex | float:
-    """Return the frequency response of a signal to the record's input.
+    """Return the frequency response from the input of a record to a signal.
 
-    It is the measured response of an output, the factor `late` of a delay for the input itself, and 0 for other
-    signals.
+    It is the measured response of an output, the delay factor `late` for the input itself, and 0 for other signals.
     """
     outputs = problem.structure.outputs
     if name not in outputs:

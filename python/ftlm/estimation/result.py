@@ -34,7 +34,7 @@ from ftlm.validation.residual_tests import Residuals, resid
 if TYPE_CHECKING:
     from ftlm.estimation.verdict import Validation, Verdict
 
-#: Physical parameters of stage j by name, and their units (of whole orders).
+#: Names of the physical parameters of stage j, and their units for integer orders.
 PHYSICAL_UNITS = {
     "K_s{j}": "N m/rad",
     "J_{j}1": "kg m^2",
@@ -43,7 +43,7 @@ PHYSICAL_UNITS = {
     "B_{j}2": "N m s/rad",
     "K_tau{j}": "N m/A",
 }
-#: Relative step of the numerical gradient: its error is far below any standard error's own.
+#: Relative step of the numerical gradient. The resulting error is far below the uncertainty of a standard error.
 GRADIENT_STEP = 1e-6
 
 
@@ -76,9 +76,9 @@ class PhysicalParameter:
 def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> dict[str, PhysicalParameter]:
     """Return the physical parameters of a flexible link from its coefficients and one known parameter per stage.
 
-    The coefficients a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (equations (16)-(21)
-    of the paper), or j = J_1/J_2 in place of r, determine five ratios of six parameters. Standard errors follow from
-    the joint covariance to first order. The known value is treated as exact.
+    The coefficients are a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2, eqs. (16)-(21)
+    of the paper, or j = J_1/J_2 in place of r. They determine five ratios of six parameters. Standard errors follow
+    from the joint covariance to first order. The known value is treated as exact.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> d
                 "laws=('orders', 'coefficients') and all terms free"
             )
         place = [joint.names.index(n) for n in needed]
-        # J_1/J_2, or that and 1.
+        # The last coefficient is r = 1 + J_1/J_2, or j = J_1/J_2, to which 1 is added.
         centre = joint.values[place] + np.array([0.0, 0.0, 0.0, 0.0, float(ratio.startswith("j"))])
         spread = joint.covariance[np.ix_(place, place)]
         values = _physical(centre, name, amount, stage)
@@ -144,7 +144,7 @@ def physical_parameters(joint: JointFit, known_values: Mapping[str, float]) -> d
 def _physical(coefficients: NDArray[np.float64], name: str, value: float, stage: int) -> NDArray[np.float64]:
     """Return K_s, J_1, J_2, B_1, B_2 and K_tau of a stage from a, b, d, g, r and one known parameter."""
     a, b, d, g, r = coefficients
-    # Every parameter in units of J_1.
+    # All parameters are relative to J_1.
     shares = np.array([a, 1.0, 1.0 / (r - 1.0), -b, d, g])
     index = [pattern.format(j=stage) for pattern in PHYSICAL_UNITS].index(name)
     out: NDArray[np.float64] = value / shares[index] * shares
@@ -187,8 +187,8 @@ class Identification:
     comparison
         Simulation error and equation error on the estimation runs.
     searches
-        Order searches from which the orders come, by output, or by ``"stage"`` for a search under the order law. Empty
-        if there was no order search.
+        Order searches that determined the orders, by output, or by ``"stage"`` for a search under an order law. Empty
+        without an order search.
     settings
         Options and decisions of the estimator by name.
     findings
@@ -234,8 +234,8 @@ class Identification:
     def standard_errors(self) -> dict[str, float]:
         """Standard errors of the parameters by name; {} for methods that give none.
 
-        Standard errors of output error and instrumental variables are robust to colored residuals. Instrumental
-        variables give standard errors of the coefficients, and only if no order is free.
+        Standard errors of output error are robust to colored residuals. Instrumental variables give standard errors of
+        the coefficients and, after an order search, of the orders.
         """
         if self.joint is None:
             return dict(self.coefficient_errors)
@@ -281,7 +281,7 @@ class Identification:
 
     @property
     def offsets(self) -> dict[str, Parameter]:
-        """Constants, ramps and levels by name; each belongs to one estimation run."""
+        """Offsets (constants, ramps and levels) by name; each is estimated for one estimation run."""
         names = [name for name, _, _ in self.comparison.per_run]
         return offset_estimates(self.model, names, self.comparison.offsets, self.offset_errors)
 
@@ -326,7 +326,7 @@ class Identification:
         """Fit of the simulation to the measured output in percent, by output."""
         return self.comparison.fit
 
-    #: The same, by the name that has the unit.
+    #: Same as `fit`, under a name that states the unit.
     fit_percent = fit
 
     def physical(self, **values: float) -> dict[str, PhysicalParameter]:
@@ -365,15 +365,16 @@ class Identification:
 
         A profile refits all other parameters at each value of one parameter.
 
-        The interval of a parameter contains the values at which the sum of squares rises by at most the squared normal
-        quantile times the noise variance, which is enlarged for colored residuals. For a quadratic cost it equals the
-        Wald interval. In a curved valley it may be asymmetric or unbounded, and standard errors are misleading. A
-        robust loss keeps the weights of the fit. Each bound is followed continuously from the optimum, so another
-        optimum behind a ridge is not found.
+        The interval of a parameter contains the values at which the rise of the sum of squares is below a limit. The
+        limit is the squared normal quantile times the noise variance, enlarged for colored residuals. For a quadratic
+        cost it equals the
+        Wald interval. If the cost has a curved valley, the interval may be asymmetric or unbounded, and standard errors
+        are misleading. With a robust loss, the weights of the fit are kept. Each bound is followed continuously from
+        the optimum, so another optimum behind a ridge is not found.
 
-        A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley. These are 10
-        to 200 simulations per parameter on the finest grid of the fit. The result does not depend on the number of
-        threads. Ctrl-C stops the search after at most one refit.
+        A bound takes two to four refits if the cost is nearly quadratic, and up to forty in a long valley. This amounts
+        to 10 to 200 simulations per parameter on the finest grid of the fit. The result does not depend on the number
+        of threads. Ctrl-C stops the search after at most one refit.
 
         Parameters
         ----------
@@ -445,14 +446,14 @@ class Identification:
         path
             File to write.
         validation
-            Validation runs; without them the page says that the model was not validated.
+            Validation runs. Without them, the page states that the model was not validated.
         force
             Overwrite an existing file.
 
         Returns
         -------
         pathlib.Path
-            The file.
+            Path of the written file.
 
         Raises
         ------
@@ -500,17 +501,26 @@ class Identification:
         The first of these rules that applies gives the reason. NR is the normalized residual, the RMS of the simulation
         error relative to the standard deviation of the output.
 
-        *Do not use*: the simulation overflows or has an unstable pole; a parameter is not identifiable (infinite
-        standard error); NR exceeds 0.5 for an output, on estimation or validation runs, together or on one of them; the
-        orders of an equation make it nearly an identity.
+        *Do not use*:
 
-        *With care*: on validation the fit falls by 20 points, or the residual (100 - fit) exceeds 10 % and three times
-        that of estimation, or 5 % and five times; stability is not decided, or the damping of an oscillatory mode is
-        not significantly positive (an integrator is permitted); residuals are correlated with an input, are not white,
-        or are colored in a closed loop (each only above a thousandth of the output); the fit did not converge; a
-        parameter has no effect, a coefficient has a relative standard error above 0.5, an order one above 0.25, a delay
-        or a limit an unbounded interval; initial conditions may hide an offset; another finding has this level; the
-        method gives no standard errors; there is no validation.
+        - The simulation overflows, or the model has an unstable pole.
+        - A parameter is not identifiable (infinite standard error).
+        - NR of an output exceeds 0.5, over all estimation or validation runs or on one of them.
+        - The orders of an equation make it nearly an identity.
+
+        *With care*:
+
+        - The fit to validation runs is lower by 20 percentage points than that to estimation runs. Or the validation
+          residual, 100 minus the fit, exceeds 10 % and three times the estimation residual, or 5 % and five times it.
+        - Stability is not decided, or the damping of an oscillatory mode is not significantly positive. An integrator
+          is permitted.
+        - Residuals are correlated with an input, are not white, or are colored in a closed loop. Residuals below a
+          thousandth of the output do not count.
+        - The fit did not converge.
+        - A parameter has no effect. The relative standard error of a coefficient exceeds 0.5, or the standard error of
+          an order exceeds 0.25. The interval of a delay, saturation or dead zone is unbounded.
+        - Initial conditions may hide an offset.
+        - Another finding has this level, the method gives no standard errors, or there is no validation.
 
         A saved model stores its findings, so its verdict is the same.
         """

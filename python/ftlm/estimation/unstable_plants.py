@@ -21,8 +21,8 @@ from ftlm.simulation.output_samples import measured_samples
 from ftlm.structure.structure import Structure
 from ftlm.validation.comparison import MAX_NORMALIZED_RESIDUAL, Comparison, simulate_runs
 
-#: Length of a piece in time constants of the fastest growing mode, that of shorter runs, and fewest samples. By
-#: its end an error of the model has grown by e^5, or e^2.5.
+#: Length of a piece, and minimum length if a run is shorter, both in time constants of the fastest growing mode; and
+#: minimum number of samples. Over a piece, a model error grows by the factor e^5, or at least e^2.5.
 PIECE_TIME_CONSTANTS, MIN_PIECE_TIME_CONSTANTS, MIN_PIECE_SAMPLES = 5.0, 2.5, 20
 #: Maximum exponent a T of the growth exp(a T) of a mode over the shortest piece.
 MAX_GROWTH_EXPONENT = 15.0
@@ -30,7 +30,7 @@ MAX_GROWTH_EXPONENT = 15.0
 MIN_PIECES, MAX_PIECES = 5, 40
 #: Maximum residual of the pieces, relative to the standard deviations of their outputs, of an acceptable model.
 MAX_PIECE_RESIDUAL = 0.3
-#: Findings on plants that no simulation of a whole run follows.
+#: Codes of findings on unstable plants whose runs are divided, because simulations of whole runs diverge.
 SPLIT_CODES = ("plant_needs_pieces", "plant_unstable_in_pieces")
 
 
@@ -43,8 +43,7 @@ class PieceTest:
     seconds
         Length of a piece [s].
     residual
-        RMS of the residuals divided by the RMS of the output, whose mean is subtracted in each piece; the largest
-        over all outputs.
+        RMS residual divided by the RMS of the output about its mean in each piece; largest over all outputs.
     """
 
     seconds: float
@@ -65,9 +64,9 @@ def piece_test(model: Model, runs: Sequence[Run]) -> PieceTest | None:
     """Simulate an unstable model on short pieces of the runs and return the result; None if not possible.
 
     Runs of an unstable plant are bounded only because a controller feeds back the output. A correct unstable model
-    follows the output within a piece. A wrongly unstable model of a stable plant does not, over five time constants,
-    from any initial values. The result is None if the model is stable, its modes are unknown, samples are nonuniform,
-    too few or too far apart for the growth, or a simulation fails.
+    reproduces the output within a piece. If the plant is stable, an unstable model cannot reproduce the output over
+    five time constants, whatever its initial values are. The result is None if the model is stable, its modes are
+    unknown, or a simulation fails. It is also None if samples are nonuniform, too few or too far apart for the growth.
     """
     try:
         growing = [m.pole.real for m in modes(model, coupling=model.structure.coupling) if m.unstable]

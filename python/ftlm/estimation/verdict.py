@@ -24,21 +24,22 @@ from ftlm.validation.comparison import MAX_FIT_DROP_POINTS, MAX_NORMALIZED_RESID
 from ftlm.validation.residual_tests import NEGLIGIBLE_RESIDUAL_RATIO, OutputResiduals
 
 TRUST_LEVEL = "trust"
-#: Maximum relative standard error of a well-determined coefficient, and largest standard error of an order. Half the 95
-#: % interval then equals the coefficient, or the increment of 0.5 between common mechanisms.
+#: Maximum relative standard error of a well-determined coefficient, and maximum standard error of an order. Half the
+#: width of the 95 % interval then equals the coefficient, or the increment 0.5 between orders of common mechanisms.
 MAX_COEFFICIENT_ERROR_RATIO, MAX_ORDER_ERROR = 0.5, 0.25
-#: Limits of the validation loss: ratio to the estimation loss, and percentage below which the ratio does not matter.
+#: Limits of the validation loss (100 minus fit [%]): pairs of the maximum ratio to the estimation loss, and of the loss
+#: [%] up to which any ratio is accepted.
 VALIDATION_LOSS_LIMITS = ((3.0, 10.0), (5.0, 5.0))
 #: Minimum significant difference in fit on a validation run [percentage points].
 MIN_FIT_GAIN = 0.5
-#: NR below which a model explains something of an output that noise buries.
+#: NR below which a model explains a part of an output that consists mostly of noise.
 MAX_BURIED_RESIDUAL = 0.99
-#: Findings that explain a poor fit by the data.
+#: Codes of findings that attribute a poor fit to the data.
 POOR_FIT_CODES = ("buried_in_noise", "end_row_far_off")
 NOT_SEPARABLE_TOPIC = "not_separable"
-#: Findings on validation runs with rows to which the model was fitted.
+#: Codes of findings on validation runs that contain samples to which the model was fitted.
 REPEATED_RUN_CODES = ("estimation_run_repeated", "estimation_rows_repeated")
-#: Findings on an unstable plant: simulations of whole runs do not judge its model.
+#: Codes of findings on an unstable plant, whose model cannot be validated by simulations of whole runs.
 UNSTABLE_PLANT_CODES = ("plant_unstable", "plant_unstable_in_pieces", "plant_needs_pieces")
 
 
@@ -168,21 +169,21 @@ def _combined_verdict(
     has_validation: bool,
     method: str = "",
 ) -> Verdict | None:
-    """Return the verdict from the findings of a fit by a method and from its comparisons with other runs.
+    """Return the verdict from the findings `own` of a fit and from comparisons with validation `runs`.
 
-    Without findings it is None.
+    None if no finding is a warning. `method` is the name of the estimation method.
     """
     buried = [f.output for f in own if f.code in POOR_FIT_CODES]
     findings = [f for comparison in runs for f in _poor_fits("the validation run of ", comparison, buried)]
     findings += [f for comparison in runs for f in _validation_losses(estimation_fits, comparison)]
-    # Remedies never advise the method of the fit.
+    # A remedy must not suggest the method that was used.
     findings = [replace(f, method=method) for f in findings]
     own_first = [f for f in own if f.level == LEVEL_DO_NOT_USE]
     return verdict_from([*own_first, *findings, *own, *([] if has_validation else [make_finding("not_validated")])])
 
 
 def verdict_from(findings: Iterable[Finding]) -> Verdict | None:
-    """Return the verdict with the most serious of some findings as its reason; None if none is a warning."""
+    """Return the verdict whose reason is the most serious of some findings; None if no finding is a warning."""
     listed = list(findings)
     bad = [f for level in (LEVEL_DO_NOT_USE, LEVEL_WITH_CARE) for f in listed if f.level == level]
     if not bad:
@@ -213,7 +214,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
 
 
 def saved_findings(estimate: Estimate) -> list[Finding]:
-    """Return the findings against a model from its file, those recorded at the fit first."""
+    """Return the findings against a model that its file records, plus one on unidentifiable parameters if missing."""
     findings = list(estimate.against)
     unidentifiable = [n for n, e in estimate.standard_errors.items() if e is None]
     if unidentifiable and not any(f.kind.topic == NOT_SEPARABLE_TOPIC for f in findings):
@@ -301,7 +302,7 @@ def _unstable_poles(model: Model) -> Iterator[Finding]:
 
 
 def _undamped_modes(model: Model) -> Iterator[Finding]:
-    """Yield findings about oscillatory modes whose damping is not significantly positive."""
+    """Yield a finding about the slowest oscillatory mode whose damping is not significantly positive, if any."""
     for mode in modes(model, coupling=model.structure.coupling):
         if mode.oscillatory and mode.damping - NORMAL_95 * (mode.damping_error or 0.0) <= 0.0:
             spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
@@ -327,12 +328,12 @@ def improves_prediction(
 ) -> bool | None:
     """Whether fractional orders improve the prediction of other runs; None if the test is inconclusive.
 
-    `gains` are the gains of fit on validation runs, `intervals` the confidence intervals of orders by run and name, and
-    `whole` the integer orders by name.
+    `gains` are the increases of the fit on validation runs [percentage points], `intervals` the confidence intervals of
+    orders by name and run, and `whole` the integer orders by name.
 
-    True if every estimation run excludes an integer order, the intervals of the runs overlap, no gain is negative, and
-    the median gain is significant. False if no gain is significant, or if no run excludes an integer order and the
-    median gain is not significant. Otherwise None.
+    True if every estimation run excludes an integer order, the intervals of the runs overlap, no gain is significantly
+    negative, and the median gain is significant. False if no gain is significant, or if no run excludes an integer
+    order and the median gain is not significant. Otherwise None.
     """
     runs = list(next(iter(intervals.values()), {}))
     is_outside = [any(not e[r][0] <= whole[n] <= e[r][1] for n, e in intervals.items()) for r in runs]
@@ -360,9 +361,10 @@ def is_buried(residuals: OutputResiduals) -> bool:
 
 
 def _poor_fits(where: str, comparison: Comparison, buried: Sequence[str] = ()) -> Iterator[Finding]:
-    """Yield a finding on each output of which the simulation explains less than half, over all runs or in one.
+    """Yield a finding on the outputs whose NR exceeds `MAX_NORMALIZED_RESIDUAL` over all runs, or else in one run.
 
-    Each run is also tested by itself, because the total is dominated by runs with large signals.
+    Each run is also tested by itself, because runs with large signals dominate the total. `buried` are outputs that are
+    not tested.
     """
     for run, errors in _each(comparison):
         useless = [o for o, f in errors.items() if not f.nr <= MAX_NORMALIZED_RESIDUAL and o not in buried]
@@ -373,7 +375,7 @@ def _poor_fits(where: str, comparison: Comparison, buried: Sequence[str] = ()) -
 
 
 def _each(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]:
-    """Yield the metrics of the simulation error over all runs, and of each run by name if there are several."""
+    """Yield ("", output error over all runs), then (name, output error) of each run if there are several."""
     yield "", comparison.output_error
     if len(comparison.per_run) > 1:
         for name, _, errors in comparison.per_run:
@@ -385,7 +387,7 @@ def _on(run: str) -> str:
 
 
 def _validation_losses(estimation_fits: Mapping[str, float], validation: Comparison) -> Iterator[Finding]:
-    """Yield a finding on each output whose validation fit is far below its estimation fit."""
+    """Yield a finding on the first run and output whose validation fit is far below the estimation fit, if any."""
     for run, errors in _each(validation):
         for output, figures in errors.items():
             if output not in estimation_fits:
@@ -422,7 +424,7 @@ def _residuals(result: Identification) -> Iterator[Finding]:
     yield from coupled
     yield from (f for f in result.findings if f.code == "residuals_follow_direction" and f.output in outputs)
     yield from (f for f in result.findings if f.code == "loop_found" and f.output in outputs)
-    # With a reference the loop is known: its noise is not part of what the model was estimated from, nor what it lacks.
+    # Such a fit is consistent under colored noise, so color alone is no finding.
     coloured = [] if looped else [o for o, r in outputs.items() if not (r.whiteness.passed or r.is_noise)]
     yield from (make_finding("residuals_not_white", output=o) for o in coloured)
 
@@ -439,7 +441,7 @@ def _is_uncertain(result: Identification, name: str) -> bool:
     if name in result.orders:
         return error > MAX_ORDER_ERROR or (name in result.profiles and math.isinf(result.profiles[name].high))
     if name not in numbers:
-        # A delay or a limit may well be 0.
+        # A delay, saturation or dead zone may be 0.
         return False
     if name in result.profiles:
         interval = result.profiles[name]

@@ -29,23 +29,23 @@ from ftlm.validation.residual_tests import friction_term, sign_tanh_slope
 
 #: Highest integer order.
 MAX_ORDER = 4
-#: Number of best candidates whose neighbors are fitted first, and number of candidates that are validated, of integer
-#: and of fractional orders.
+#: Number of best candidates whose neighbors are fitted first, and maximum numbers of validated candidates with integer
+#: orders and with fractional orders.
 EXTENDED_CANDIDATES, VALIDATED_CANDIDATES, VALIDATED_FRACTIONAL = 3, 6, 2
-#: Difference of Schwarz criteria beyond which a candidate of integer orders is not validated, unless it is the best of
-#: its order, and one of fractional orders.
+#: Maximum difference from the lowest Schwarz criterion for a validated candidate: with integer orders (the best of each
+#: order is always validated), and with fractional orders.
 MAX_BIC_GAP, MAX_FRACTIONAL_BIC_GAP = 60.0, 10.0
-#: Minimum decrease of the Schwarz criterion for which delays or an offset are tried in all candidates, and the largest
-#: distance from the best one of forms whose neighbors are fitted.
+#: Minimum decrease of the Schwarz criterion by a delay or an offset in a first test, for which it is tried in all
+#: candidates. Also the maximum difference from the lowest criterion for forms whose neighbors are fitted.
 MIN_BIC_DECREASE = 6.0
-#: Order of the best form of integer orders for which D^2 y = a1 D^mu y + a0 y + … is tried.
+#: Order of the best integer-order form at which the form D^2 y = a1 D^mu y + a0 y + … is tried as well.
 FRACTIONAL_DAMPING_ORDER = 2
-#: Offsets of free responses.
+#: Offsets that are tried for free responses (runs without an input).
 FREE_OFFSETS = ("none", "level")
 #: Initial guesses of the order alpha of fractional forms.
 INITIAL_FRACTIONAL_ORDERS = (0.5, 0.8, 1.2, 1.7)
 
-#: Delay of inputs by name [s]: a number, or (lower, upper) of one to estimate.
+#: Delays of inputs by name [s]: a number, or bounds (lower, upper) of an estimated delay.
 Delays: TypeAlias = Mapping[str, float | tuple[float, float]]
 
 
@@ -200,14 +200,15 @@ class AutomaticSelection:
 
     problem: OutputProblem
     evaluator: CandidateEvaluator
-    #: Inputs that depend on the output. Forms with feedthrough are then not tried: feedback within a row looks like it.
+    #: Inputs that depend on the output. Forms with feedthrough are then not tried, because feedback within one sample
+    #: resembles feedthrough.
     feedback: tuple[str, ...] = field(default=(), init=False)
 
     def run(self) -> list[Trial]:
-        """Fit the candidates, validate the best ones, and return all trials in this order."""
+        """Fit the candidates, validate the best ones, and return the trials of this evaluator."""
         fits = self._fit_integer_orders()
         if fits:
-            # Under colored noise high orders overfit: the best form of each order is validated, whatever its BIC.
+            # High orders overfit under colored noise, so the best form of each order is validated, whatever its BIC.
             leaders = _best_of_each_order(fits)
             near = [f for f in fits if f.bic < fits[0].bic + MAX_BIC_GAP and f.form not in leaders]
             leading = [f for f in fits if f.form in leaders]
@@ -271,7 +272,7 @@ class AutomaticSelection:
         best = fits[0]
         problem, end = self.problem, self.problem.suffix
         residuals = [part[problem.output] for part in best.joint.residuals]
-        # There are residuals of the inner samples only.
+        # Residuals exclude the first and the last sample.
         signals = {n: [compared_values(r, best.structure, n)[1:-1] for r in problem.runs] for n in problem.drivers}
         coefficients = best.joint.coefficients
         names = []
@@ -358,7 +359,7 @@ class AutomaticSelection:
         position = replace(speed, order=2, friction="derivative")
         for form in ([speed] if changes_sign else []) + [position, replace(position, integrator=True)]:
             if fits and not has_white_residuals(fits[0].joint):
-                # Negative friction would drive the motion.
+                # Negative friction would add energy, so it is not physical.
                 friction_fits = [f for f in self._fit([form]) if f.joint.coefficients[f"fc{self.problem.suffix}"] > 0.0]
                 ranked = _rank([*fits, *friction_fits])
                 least = min(f.bic for f in ranked if f.form != form)
@@ -458,14 +459,14 @@ def _neighbors(form: IntegerOrderForm) -> list[IntegerOrderForm]:
 
 
 def _gain(fits: Sequence[FittedForm], has: Callable[[IntegerOrderForm], bool]) -> float:
-    """Return how much the forms with a property lower the minimum of BIC; 0 if no form has it."""
+    """Return the decrease of the lowest BIC by forms with a property; 0 if no form has the property."""
     with_it = [f.bic for f in fits if f.form is not None and has(f.form)]
     without = [f.bic for f in fits if f.form is not None and not has(f.form)]
     return min(without, default=math.inf) - min(with_it) if with_it else 0.0
 
 
 def _frequency(fits: Sequence[FittedForm], offset: str, suffix: str) -> float:
-    """Return the frequency [rad/s] of a resonance of order 2, or else of the pole of order 1; 1 if there is none."""
+    """Return the frequency [rad/s] of the oscillatory mode at order 2, or else of the pole at order 1; default 1."""
     for order in (2, 1):
         for item in fits:
             if item.form is not None and (item.form.order, item.form.offset, item.form.integrator) == (

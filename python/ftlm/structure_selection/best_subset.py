@@ -36,7 +36,7 @@ MIN_SCREENING_SAMPLES = 1000
 LOG_FREQUENCY_SPACING = 0.15
 DAMPING_FACTORS = tuple(np.geomspace(0.006, 4.0, 10).tolist())
 GRID_REFINEMENTS = 2
-#: Number of subsets around whose points the grid is refined.
+#: Number of best subsets around whose grid points the grid is refined.
 REFINED_SUBSETS = 24
 #: Maximum number of subsets for an exhaustive search. Beyond it, the best subsets of each size are extended.
 MAX_EXHAUSTIVE_SUBSETS = 4096
@@ -67,7 +67,7 @@ class ScreenedSubset:
 
 @dataclass(frozen=True)
 class Column:
-    """Input term at one of the integer values of its order."""
+    """Input term at one integer value of its order; ``names`` are the free orders that this value fixes."""
 
     coefficient: str
     signal: str
@@ -138,7 +138,10 @@ class BaseModel:
 
 @dataclass
 class Products:
-    """Inner products of the column responses and of the residual without inputs, by grid point and run."""
+    """Inner products of the column responses and of the residual without inputs.
+
+    ``values`` has the shape (grid points, runs, columns + 1, columns + 1); the last row and column are the residual.
+    """
 
     points: list[tuple[float, ...]]
     values: Floats
@@ -172,7 +175,7 @@ def screen_subsets(inside: NestedStructures, folds: Folds, pool: TaskPool) -> li
     return sorted(subsets.values(), key=lambda s: (s.score, s.change.words))
 
 
-#: Free own coefficients with the integer orders of their terms.
+#: Free coefficients of output terms, as (name, integer order of the term).
 Free = tuple[tuple[str, float], ...]
 
 
@@ -333,7 +336,10 @@ def _change(ground: BaseModel, subset: Sequence[int]) -> Change | None:
 
 @dataclass(frozen=True)
 class SubsetScore:
-    """Score of a subset, its best grid point in each fold and over all runs, and its coefficients."""
+    """Score of a subset, with its coefficients from all runs.
+
+    ``points`` are the indices of the best grid points: one for each fold, then the one for all runs.
+    """
 
     score: float
     points: tuple[int, ...]
@@ -363,7 +369,11 @@ class SubsetScorer:
 
     @classmethod
     def of(cls, ground: BaseModel, folds: Folds, spread: Sequence[float], ends: Sequence[int]) -> SubsetScorer:
-        """Return the scorer of a base model and its folds."""
+        """Return the scorer of a base model and its folds.
+
+        `spread` are the variances of the output in each run, and `ends` are the boundaries of the runs among the
+        compared samples.
+        """
 
         def place(run: Run) -> int:
             return next(k for k, r in enumerate(ground.runs) if r is run)
@@ -380,7 +390,8 @@ class SubsetScorer:
     def score_subset(self, products: Floats, pooled: Floats, subset: Sequence[int]) -> SubsetScore:
         """Return the score of a subset on validation runs.
 
-        It is fitted on the estimation runs of each fold, at the best grid point of the fold.
+        It is fitted on the estimation runs of each fold, at the best grid point of the fold. `products` are
+        :attr:`Products.values`, and `pooled` are their sums over the estimation runs of each fold.
         """
         keys = [*subset, -1]
         cut = pooled[:, :, keys][:, :, :, keys]

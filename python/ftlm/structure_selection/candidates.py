@@ -225,7 +225,8 @@ class NestedStructures:
                         if term.coefficient in droppable:
                             continue
                         return None
-                    # The last own term with a free order is damping (order 1); those before it have lower orders.
+                    # The last output term with a free order is damping (order 1). Output terms before it have lower
+                    # orders.
                     later = item.terms[item.terms.index(term) + 1 :]
                     below = any(t.column == item.output and t.order.is_single for t in later)
                     value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
@@ -240,7 +241,7 @@ class NestedStructures:
         names = [*self.structure.coefficient_names]
         names_used += [n for n in names if n not in droppable]
         variant = Variant(frozenset(names_used), tuple(sorted(whole.items())), self.structure.offset == "constant")
-        # Without own terms the equation is valid only once an input term is added.
+        # Without output terms, the equation becomes valid only when an input term is added.
         alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
         return variant if self.is_valid(variant) or not alone else None
 
@@ -257,7 +258,7 @@ class NestedStructures:
                 for v in self.integer_values(name)
             ]
             if self._owns(term):
-                # If other own terms have all integer orders, the order is free from the start.
+                # If other output terms occupy all integer orders, the order is free from the start.
                 variants = [v for v in variants if self.is_valid(v)] or [replace(variant, coefficients=coefficients)]
         else:
             variants = [replace(variant, coefficients=coefficients)]
@@ -372,12 +373,12 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
                 "ftlm.flexible_link(…)"
             )
     if len({n for n, _ in items}) < len(items):
-        # Equal texts of structures that differ elsewhere get a number.
+        # Structures with equal texts may differ in other properties. Numbers distinguish their names.
         items = [(f"{n} ({k + 1})", s) for k, (n, s) in enumerate(items)]
     out: dict[str, Structure] = {}
     for name, structure in items:
         if structure.offset == "auto":
-            # With and without are two candidates.
+            # The structure without an offset and the structure with one are two candidates.
             out |= {name: replace(structure, offset="none"), f"{name}, offset": replace(structure, offset="constant")}
         else:
             out[name] = structure
@@ -391,7 +392,7 @@ def name_candidates(structures: Sequence[Structure] | Mapping[str, Structure]) -
 
 
 def _content(structure: Structure) -> str:
-    """Return a text that identifies a candidate up to parameter names and the sequence of its terms."""
+    """Return a text that identifies a candidate up to parameter names and the order of its terms."""
     if structure.has_order_law or structure.coefficient_law:
         return repr(structure)
     rest = (

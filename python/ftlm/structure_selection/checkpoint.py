@@ -26,7 +26,7 @@ from ftlm.utils.checkpoint_file import DIGEST_BYTES, RECORD_ENCODER, CheckpointF
 
 Result = TypeVar("Result")
 Expected = TypeVar("Expected")
-#: Version of fit and validation. Results of different versions must not be combined.
+#: Version of the algorithms for fit and validation. Results of different versions must not be combined.
 ALGORITHM_VERSION = 1
 #: Errors of a candidate's fit. Any other error is a defect.
 ErrorName: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
@@ -98,7 +98,7 @@ class FitError(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ref
 class StoredFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"):
     """Joint fit in the form in which it is stored.
 
-    A history and given exponents of initial terms look alike in it; ``history`` distinguishes them.
+    Exponents of a history and exponents that the user gave are stored as equal lists. ``history`` distinguishes them.
     """
 
     joint: JointFit
@@ -177,7 +177,10 @@ class Store:
             raise
 
     def _take(self, number: int, payload: bytes, request: Request) -> None:
-        """Compare the first record with the request, or keep the result that any other record contains."""
+        """Compare the first record with the request, or load the result from any other record.
+
+        Raise DataError if the record is unexpected or inconsistent, or belongs to another selection.
+        """
         path = self._file.path
         try:
             record = ANSWER_DECODER.decode(payload)
@@ -210,7 +213,7 @@ class Store:
             raise DataError(f"store {path} holds a selection {difference}; choose another file")
 
     def _expect(self, answer: Answer, kind: type[Expected], description: str) -> Expected:
-        """Return an answer of the expected kind; raise for another one."""
+        """Return an answer of the expected kind; raise DataError for another kind."""
         if isinstance(answer, kind):
             return answer
         words = {StoredFit: "a fit", FitError: "an error", StoredTrial: "a validation", StoredSubsets: "subsets"}

@@ -29,7 +29,7 @@ BLOCKS_PER_RUN = 4
 MIN_BLOCK_SAMPLES = 15
 #: Relative tolerance of simulations on a block.
 SIMULATION_TOLERANCE = 1e-4
-#: Lower limit of the fit [%] in scores; diverging candidates are not distinguished.
+#: Lower limit of the fit [%] in scores. All candidates that diverge have the same score.
 MIN_FIT_PERCENT = -100.0
 
 
@@ -37,7 +37,8 @@ MIN_FIT_PERCENT = -100.0
 class Fold:
     """Estimation runs and validation data of one fold.
 
-    The validation data are another run, or rows of an estimation run whose outputs are masked in the fit.
+    The validation data are another run, or the samples `rows` (start, stop) of an estimation run. In the latter case,
+    the outputs in these samples are masked in the fit.
     """
 
     runs: Runs
@@ -115,7 +116,7 @@ class Fold:
 
 
 def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run:
-    """Return a run in which the samples of some outputs in a range of rows are marked as missing."""
+    """Return a run in which the samples `rows` (start, stop) of some outputs are marked as missing."""
     signals = {n: np.array(run[n]) for n in run.outputs}
     for name in outputs:
         signals[name][rows[0] : rows[1]] = np.nan
@@ -131,7 +132,7 @@ def mask_outputs(run: Run, outputs: Sequence[str], rows: tuple[int, int]) -> Run
     return masked.with_unmasked_run(run)
 
 
-#: Maximum number of pieces of the runs of an unstable plant that are folds.
+#: Maximum number of folds of an unstable plant, whose runs are divided into pieces.
 MAX_SPLIT_FOLDS = 16
 
 
@@ -202,8 +203,8 @@ class Folds:
         if validation != "blocks":
             raise ModelError(f"{setting('validation')} {validation!r} is not known; use 'runs', 'blocks', or a run")
         blocks = [Fold(every, run, rows) for run in every for rows in block_ranges(run)]
-        # Without the only rows in which an input changes, a fit has nothing to identify the plant from, and noise about
-        # a standstill shows no prediction.
+        # Without the only samples in which an input changes, the plant is not identifiable. A block at standstill
+        # contains only noise, which does not validate a prediction.
         parts = [fold for fold in blocks if fold.has_estimation_excitation and fold.has_motion] or blocks
         return cls(every, tuple(parts), f"each of {len(parts)} blocks by a fit without its outputs")
 
@@ -211,9 +212,8 @@ class Folds:
     def of_pieces(cls, runs: Runs, duration: float) -> Folds:
         """Return folds that leave out one piece of the runs of an unstable plant at a time.
 
-        `duration` is the shortest duration of a piece [s].
-
-        At most :data:`MAX_SPLIT_FOLDS` pieces are left out, spread evenly. The final estimate uses all pieces.
+        `duration` is the shortest duration of a piece [s]. At most :data:`MAX_SPLIT_FOLDS` pieces, evenly distributed,
+        are used. The final estimate uses all pieces.
         """
         every = [piece for run in runs for piece in run.split(duration)]
         indices = np.unique(np.linspace(0, len(every) - 1, MAX_SPLIT_FOLDS).astype(int))
@@ -229,7 +229,7 @@ def _same(one: Run, other: Run) -> bool:
 
 
 def block_ranges(run: Run) -> list[tuple[int, int]]:
-    """Return the (start, stop) rows of consecutive blocks of nearly equal length."""
+    """Return (start, stop) of consecutive blocks of nearly equal length; raise DataError if the run is too short."""
     if run.length < MIN_BLOCK_SAMPLES * BLOCKS_PER_RUN:
         raise DataError(
             f"{run.name} has {run.length} rows, too few to be cut into {BLOCKS_PER_RUN} blocks; give "
@@ -301,12 +301,12 @@ class Trial:
 
     @property
     def parts(self) -> dict[str, float]:
-        """Fit in percent on each part of the validation data by name, in the sequence of the scores."""
+        """Fit in percent on each part (output of a run or block) of the validation data, in the order of the scores."""
         return {f"{output} of {name}": fit for name, part in self.validation.items() for output, fit in part.items()}
 
     @property
     def worst_fold(self) -> float:
-        """Worst fit in percent on validation data."""
+        """Lowest fit in percent over all parts of the validation data; NaN without validation."""
         return min(self.parts.values(), default=math.nan)
 
     @property
@@ -343,10 +343,11 @@ def fit(
 ) -> JointFit:
     """Return the best output-error fit from some initial guesses; without any, from automatic ones.
 
-    `near` is a fit of this structure to nearly the same runs, from which the fit starts.
+    `near` is a fit of this structure to nearly the same runs, from which the fit starts. Raise the last error if every
+    fit fails.
 
-    A friction coefficient that an initial guess omits starts at 0, where the gradient may be 0. Automatic initial
-    guesses are therefore added.
+    A parameter that an initial guess omits starts at 0 or 1. Friction coefficients start at 0, where the gradient may
+    vanish. Automatic initial guesses are therefore added.
     """
     fixed_structure = fix_initial_conditions(structure, runs)
     if near is not None:
@@ -375,14 +376,17 @@ def log_residual_power(joint: JointFit) -> float:
 
 
 def validate_fit(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
-    """Return the trial of a candidate, refitted on each fold from its fit on all runs."""
+    """Return the trial of a candidate, which is fitted to each fold from the optimum `joint` of the fit to all runs.
+
+    Raise FtlmError, with the name of the fold, if a fit or a simulation fails.
+    """
     model = fitted_model(joint, structure)
     estimation = compare(model, folds.runs).fit
     grows = (
         folds.split is None and structure.is_linear and model.stability(coupling=structure.coupling).unstable_poles > 0
     )
     start = joint.values_by_name
-    # A fine fit was also computed on half its step. Each fold starts one level coarser, so it compares the same grids.
+    # A fine fit compares its last two grids. Each fold starts on the coarser one, so that it compares the same grids.
     near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.step_converged else joint
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
@@ -439,16 +443,17 @@ def _validate_separately(structure: Structure, fold: Fold, joint: JointFit, *, r
 
 
 def validation_score_bound(joint: JointFit, folds: Folds) -> float:
-    """Return a lower bound of the validation score, from the fit on all runs alone; -inf if there is none.
+    """Return a lower bound of the validation score from the fit to all data alone; -inf if no bound can be given.
 
-    A fit without a fold is compared with the fit on all runs. Its sum of squares over all runs cannot be smaller, and
-    over the remaining runs it cannot be larger. On the fold its sum of squares is therefore at least that of the fit on
-    all runs. For several outputs this holds for the weighted sum of squares, not for each output.
+    Consider a second fit, which omits the data of one fold. Over all data, its sum of squares cannot be smaller than
+    that of the first fit. Over the data that it uses, its sum of squares cannot be larger. On the fold, its sum of
+    squares is therefore at least that of the first fit. For several outputs this holds for the weighted sum of squares
+    only.
     """
     if not joint.converged:
         return -math.inf
     pooled = {o: drop_missing(np.concatenate([part[o] for part in joint.residuals])) for o in joint.noise}
-    # Residuals are divided by the noise standard deviations that weighted them.
+    # Stored residuals are divided by the standard deviations that weighted them. This scale restores the noise level.
     scale = {o: v / max(float(np.sqrt(np.mean(pooled[o] ** 2))), 1e-300) for o, v in joint.noise.items()}
     scores = []
     for fold in folds.parts:
@@ -457,7 +462,7 @@ def validation_score_bound(joint: JointFit, folds: Folds) -> float:
             return -math.inf
         first, last = fold.rows or (0, fold.validation_run.length)
         if fold.rows is not None and first == 0 and joint.initial != "rest":
-            # Its initial terms are estimated from all rows, so its residuals may be smaller.
+            # The initial terms of this block are estimated from all samples, so its residuals may be smaller.
             return -math.inf
         for output, residuals in joint.residuals[place].items():
             if residuals.size != fold.validation_run.length - 2:
@@ -506,9 +511,8 @@ def residual_variance_inflation(joint: JointFit) -> float:
 def schwarz_criterion(joint: JointFit, inflation: float) -> float:
     """Return the Schwarz criterion (BIC) of a fit; doi:10.1214/aos/1176344136.
 
-    The number of samples is divided by `inflation`.
-
-    Initial terms and offsets count as parameters: the initial term of a canceled pole and zero can model a level.
+    The number of samples is divided by `inflation`, the variance inflation of correlated residuals. Initial terms and
+    offsets count as parameters, because the initial term of a canceled pole and zero can model a level.
     """
     samples = joint.samples / inflation
     each = samples / max(len(joint.noise), 1)

@@ -23,7 +23,7 @@ from ftlm.utils.files import to_frame
 from ftlm.utils.formatting import Cell, attributes, json_value
 from ftlm.utils.validation import Floats
 
-#: Maximum number of printed rows, and the fit [%] below which values are not distinguished.
+#: Maximum number of printed rows, and lower limit of printed fits [%].
 MAX_PRINTED_ROWS, MIN_PRINTED_FIT_PERCENT = 12, -1000.0
 #: Note on an unstable candidate.
 UNSTABLE_NOTE = " (grows without bound)"
@@ -36,8 +36,8 @@ class Selection:
     Parameters
     ----------
     trials
-        Validated candidates, best prediction first. Candidates that fail on a part of the validation data that others
-        predict follow, and candidates without a fit are last.
+        Validated candidates, best prediction first. They are followed by candidates that fail on a part of the
+        validation data although others predict it. Candidates without a fit are last.
     chosen
         Index of the chosen candidate in `trials`.
     best
@@ -101,7 +101,7 @@ class Selection:
         return self.best.validate(runs)
 
     def summary(self) -> str:
-        """Return as text: the summary of the model, the candidates, and the reason for the choice."""
+        """Return text with the summary of the model, the candidates, and the reason for the choice."""
         return str(self)
 
     @property

@@ -83,16 +83,17 @@ def automatic_problems(
 
 #: Difference of Schwarz criteria that is not significant; doi:10.1080/01621459.1995.10476572.
 BIC_TOLERANCE = 2.0
-#: Difference of Schwarz criteria that is very strong evidence; the same source.
+#: Difference of Schwarz criteria that is very strong evidence; doi:10.1080/01621459.1995.10476572.
 BIC_STRONG_EVIDENCE = 10.0
 #: Minimum number of folds for a t-test of scores, and one-sided 95 % quantiles of Student's t from this number on.
 MIN_T_TEST_FOLDS, STUDENT_QUANTILES_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
-#: Score above which a candidate fails on a part if it also exceeds the best score on that part by the second value.
+#: A candidate fails on a part of the validation data if its score there exceeds the first value and is higher than the
+#: best score by more than the second value. A score is ln(1 - fit / 100).
 FAILURE_SCORE, FAILURE_SCORE_GAP = math.log(0.5), math.log(2.0)
 #: t statistic of a difference of scores over the folds beyond which a prediction is better: the two-sided 95 % quantile
 #: of Student's t for four blocks.
 MIN_BETTER_T_STATISTIC = 3.2
-#: Maximum number of listed candidates.
+#: Maximum number of candidates in a list of structures.
 MAX_CANDIDATES = 10_000
 
 
@@ -119,10 +120,11 @@ def select(
 
     A candidate fails on a run or a block if its residual there exceeds half of the output and twice the residual of
     another candidate. Candidates with the fewest failures are eligible. Of those that predict as well as the best, the
-    one with the lowest Schwarz criterion is chosen, with a number of samples corrected for the autocorrelation of the
-    residuals. A candidate predicts as well as the best if its residual is at most 1 % larger. Up to 5 % are tolerated
-    if the difference over three or more folds is not significant at 95 % or, with fewer folds, if its criterion is
-    lower by 10. Ties are decided by fewer parameters, then lower order, then better prediction.
+    one with the lowest Schwarz criterion is chosen. The criterion uses a number of samples that is corrected for the
+    autocorrelation of the residuals. A candidate predicts as well as the best if its residual is at most 1 % larger. Up
+    to 5 % are tolerated if the difference over three or more folds is not significant at 95 %. With fewer folds, up to
+    5 % are tolerated if the criterion is lower by 10. Ties are decided by fewer parameters, then lower order, then
+    better prediction.
 
     Parameters
     ----------
@@ -133,11 +135,12 @@ def select(
         ``"auto"``: every input (none for a free decay), integer orders 1 to 4 with zeros, delays, direct feedthrough,
         an integrator, an output level and a drift, then fractional orders. Fractional orders are chosen if they predict
         better, or as well with a Schwarz criterion lower by 10. Feedthrough is not tried if an input depends on the
-        output (a closed loop), because feedback without delay looks like feedthrough. Each output has its own
+        output (a closed loop), because feedback without delay resembles feedthrough. Each output has its own
         selection, and the chosen equations are identified together.
     validation
         ``"runs"``: each run is predicted by a fit to the others; the default for several runs. ``"blocks"``: each
-        quarter of a run is predicted by a fit to the rest; the default for one run. Or separate validation runs.
+        quarter of a run is predicted by a fit to the rest; the default for one run. Separate validation runs may be
+        given instead.
     delay
         With ``"auto"``: delay of each input by name [s], a number, or bounds (lower, upper) for an estimate. By
         default, structures without delays and with delays of up to 60 samples are compared. An input has a single
@@ -148,7 +151,7 @@ def select(
     threads
         Number of candidates fitted concurrently, by default all cores; the result does not depend on it.
     progress
-        Callback with (fitted candidates, candidates so far).
+        Callback with (number of fitted candidates, number of candidates known so far).
     store
         Checkpoint file with every finished fit. The same call with the same file resumes an interrupted selection and
         gives the same result bit for bit.
@@ -171,15 +174,14 @@ def select(
     ConvergenceError
         If no candidate can be fitted.
 
-    Notes
-    -----
-    Initial terms are Caputo's (none from rest, otherwise initial values such as position and velocity) unless the
-    structure states otherwise. A history (powers of t for past inputs) would have more terms if more orders are free,
-    so candidates could not be compared. Each step of forward selection takes one fit for each possible addition. For
-    records of more than about 1800 samples the candidates are prescreened on subsampled records, and only survivors are
-    fitted. With three or more input terms in one equation and validation on whole runs, every subset at integer orders
-    is first scored in closed form on a grid of the coefficients of output terms, and selection starts from the best
-    subset. For a list of more than 200 candidates a ``UserWarning`` estimates the remaining time after the first ones.
+    Notes ----- Initial terms are Caputo's (none from rest, otherwise initial values such as position and velocity)
+    unless the structure states otherwise. A history (powers of t for past inputs) would have more terms if more orders
+    are free, so candidates could not be compared. Each step of forward selection takes one fit for each possible
+    addition. For records of more than about 1800 samples the candidates are prescreened on subsampled records, and only
+    survivors are fitted. With three or more input terms in one equation and validation on whole runs, selection starts
+    from the best subset of these terms. Every subset at integer orders is scored in closed form for this purpose, with
+    the coefficients of output terms on a grid. For a list of more than 200 candidates a ``UserWarning`` estimates the
+    remaining time after the first ones.
     """
     workers = check_threads(threads)
     several = as_runs(runs)
@@ -234,7 +236,7 @@ def _run_selection(
     every: Mapping[str, Structure],
     sought: Sequence[OutputProblem],
 ) -> Selection:
-    """Return the selection among given structures, nested structures, or automatic structures of outputs."""
+    """Return the selection among the structures `every`, those nested in `searched`, or automatic ones for `sought`."""
     if sought:
         selection = _select_automatically(work, sought)
         winner = selection.trials[selection.chosen]
@@ -272,7 +274,10 @@ def _piece_duration(sought: Sequence[OutputProblem]) -> float | None:
 
 @dataclass(frozen=True)
 class Choice:
-    """Best of several ranked trials with the reason, and the choices for single outputs that it combines."""
+    """Trials ranked from best to worst, the chosen one, and the reason as text.
+
+    `parts` are the choices for single outputs, if their equations are combined.
+    """
 
     ranked: tuple[Trial, ...]
     winner: Trial
@@ -281,7 +286,7 @@ class Choice:
 
 
 def _choose(work: CandidateEvaluator, *, prefers_integer_orders: bool) -> Choice:
-    """Rank the trials and choose one of them.
+    """Rank the trials and choose one of them; raise ConvergenceError if no candidate could be fitted.
 
     With `prefers_integer_orders`, the rule of :func:`_eligible_indices` decides on fractional orders.
     """
@@ -313,7 +318,7 @@ def _combine_choices(work: CandidateEvaluator, choices: Sequence[Choice]) -> Cho
     """Return the choice of one structure that has the chosen equations of several outputs.
 
     An input has a single delay in a structure. If the chosen equations have different delays of an input, the best
-    candidates without free delays are combined instead.
+    candidates without free delays are combined instead. Raise ConvergenceError if the combination cannot be fitted.
     """
     agreed = _have_common_delays([c.winner for c in choices])
     if not agreed:
@@ -405,10 +410,10 @@ def _identify_choice(work: CandidateEvaluator, choice: Choice) -> Selection:
 
 
 def _with_criteria(ranked: Sequence[Trial]) -> list[Trial]:
-    """Return ranked trials with BIC. The best trial's residuals give the effective number of samples.
+    """Return ranked trials with their Schwarz criteria (BIC).
 
-    The trial with the whitest residuals is not suitable for this, because a high order can fit drifts and disturbances
-    and still predict worse.
+    The effective number of samples follows from the residuals of the best trial. Those of the trial with the whitest
+    residuals are not suitable, because a high order can fit drifts and disturbances and still predict worse.
     """
     inflation = 1.0 if ranked[0].joint is None else residual_variance_inflation(ranked[0].joint)
     return [t if t.joint is None else replace(t, bic=schwarz_criterion(t.joint, inflation)) for t in ranked]
@@ -445,9 +450,9 @@ def _fractional_order_findings(winner: Trial, ranked: Sequence[Trial], result: I
 
 
 def _failed_parts(every: Sequence[Trial]) -> list[list[str]]:
-    """Return, for each trial, the names of the parts on which it fails.
+    """Return, for each trial, the names of the parts of the validation data on which it fails.
 
-    It fails on a part if its prediction is bad while a stable trial predicts the part far better.
+    A trial fails on a part if its prediction is poor while a stable trial predicts this part far better.
     """
     scores_by_part = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
     least: dict[str, float] = {}
@@ -472,7 +477,7 @@ def _rank_trials(every: Sequence[Trial]) -> list[Trial]:
 
 
 def _peer_indices(ranked: Sequence[Trial]) -> list[int]:
-    """Return the indices of trials that are as stable as the best one and fail on no more parts."""
+    """Return the indices of valid trials that are as stable as the best one and fail on no more parts than it does."""
     best, failures = ranked[0], [len(f) for f in _failed_parts(ranked)]
     return [
         k
@@ -587,7 +592,7 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
 
 
 def _failure_text(winner: Trial, ranked: Sequence[Trial]) -> str:
-    """Return text on better candidates that fail on a part, and on failures of the winner."""
+    """Return text on candidates with better scores that fail on a part, and on parts on which the winner fails."""
     failures = dict(zip(map(id, ranked), _failed_parts(ranked), strict=True))
     text = ""
     better = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.unstable == winner.unstable]

@@ -36,8 +36,8 @@ from ftlm.structure_selection.cross_validation import (
 )
 from ftlm.utils.resources import interruptible_pool
 
-#: Number of samples of the subsampled records, maximum number of evaluations of an optimization on them (the budget of
-#: a rung of the multistart), and ratio to the lowest cost above which a candidate is excluded.
+#: Options of the prescreening: number of samples of the subsampled records, maximum number of evaluations of an
+#: optimization (as in a rung of the multistart), and ratio to the lowest cost above which a candidate is excluded.
 PRESCREEN_SAMPLES, PRESCREEN_EVALUATIONS, MAX_PRESCREEN_COST_RATIO = 1200, 60, 3.0
 
 Item = TypeVar("Item")
@@ -47,7 +47,7 @@ Start = tuple[Structure, Sequence[Mapping[str, float]]]
 
 
 def prescreen(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: TaskPool) -> list[int]:
-    """Return the indices of structures that are worth a fit on all samples, in ascending sequence.
+    """Return the indices of structures that are worth a fit on all samples, in ascending order.
 
     Each structure is fitted to subsampled records with a limited number of evaluations. It is excluded if its cost
     exceeds the lowest cost by the factor that the multistart uses for successive halving. At least `least` structures
@@ -93,7 +93,7 @@ def _prescreen_cost(
     return cost
 
 
-#: Initial guesses of an order that becomes free, relative to its integer value.
+#: Differences between the initial guesses of an order that becomes free and its integer value.
 INITIAL_ORDER_SHIFTS = (0.0, -0.4, 0.4)
 #: Initial guesses of a free input parameter, as fractions of its interval.
 INITIAL_INPUT_FRACTIONS = (0.1, 0.3, 0.6, 0.9)
@@ -103,16 +103,17 @@ MAX_IDLE_STEPS = 2
 MIN_SCORE_IMPROVEMENT = 0.005
 #: Relative difference of validation residuals up to which two predictions count as equal.
 SCORE_TOLERANCE = 0.01
-#: Upper limit of that difference, for any scatter over folds.
+#: Relative difference of validation residuals above which predictions never count as equal, however large the scatter
+#: over folds is.
 MAX_SCORE_TOLERANCE = 0.05
-#: Screened subsets are fitted if their residual is within this relative margin of the best one, up to this number. The
-#: best subset of each size is fitted in addition.
+#: Screened subsets are fitted if their residual exceeds that of the best subset by at most this fraction; and maximum
+#: number of these subsets. The best subset of each size is fitted in addition.
 SUBSET_SCORE_MARGIN, MAX_FITTED_SUBSETS = 0.03, 8
-#: Number of listed candidates above which the total time is estimated first.
+#: Number of candidates in a list above which the total time is estimated from the first ones.
 TIME_ESTIMATE_CANDIDATES = 200
-#: Score gap to the best initial structure above which another one is not extended (no optional terms).
+#: Maximum difference from the best score for an initial structure that is extended, if no term is optional.
 MAX_ROOT_SCORE_GAP = math.log(2.0)
-#: Number of changes per step with the lowest criterion that are evaluated on validation data.
+#: Number of changes per step that are evaluated on validation data: those with the lowest Schwarz criterion.
 VALIDATED_CHANGES = 2
 
 
@@ -127,11 +128,15 @@ class CandidateEvaluator:
     threads
         Number of candidates evaluated concurrently; the result does not depend on it.
     progress
-        Callback with (fitted candidates, candidates so far).
+        Callback with (number of fitted candidates, number of candidates known so far).
     clock
         Function that returns the time [s].
     store
         Checkpoint file with the results of each step, if any.
+    done_count, known_count
+        Numbers of candidates that are fitted, and that are known up to now.
+    trials
+        Trials of all validated candidates.
     """
 
     folds: Folds
@@ -208,7 +213,7 @@ class CandidateEvaluator:
 
 @dataclass(frozen=True)
 class FittedVariant:
-    """Variant (nested structure) with its fit."""
+    """Variant (nested structure) with its fit and its Schwarz criterion."""
 
     change: Change
     joint: JointFit
@@ -220,10 +225,8 @@ def initial_guesses(
 ) -> list[dict[str, float]]:
     """Return initial guesses of a structure from the estimates `values` of a nested structure.
 
-    `whole` contains the integer values near which orders that become free start.
-
-    A coefficient that is not in `values` starts at 0; a friction parameter that is not in `values` gets no initial
-    value.
+    Orders that become free start near their integer values in `whole`. A coefficient that is not in `values` starts at
+    0. A friction parameter that is not in `values` is omitted.
     """
     problem = FreeProblem.of(structure)
     usual: dict[str, list[float]] = {}
@@ -293,21 +296,21 @@ class StepwiseSelection:
         return signature(self._build(change))
 
     def _untried_changes(self, changes: Iterable[Change]) -> list[Change]:
-        """Return changes to untried variants, each once."""
+        """Return the changes that lead to structures that are not yet fitted, without duplicates."""
         return list({key: c for c in changes if (key := self._key(c)) not in self.keys}.values())
 
     def _fit_roughly(self, changes: Sequence[Change]) -> list[tuple[Change, JointFit | FtlmError]]:
-        """Fit changes from automatic initial guesses, on the first grid alone."""
+        """Return each change with the fit of its structure, or the error; guesses are automatic, steps not refined."""
         joints = self.work.map_candidates(lambda c: self.work.fit_candidate(self._build(c), [], refine=False), changes)
         return list(zip(changes, joints, strict=True))
 
     def _validate_failures(self, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Trial]:
-        """Return failed trials if none of the structures can be fitted."""
+        """Return all trials after structures were added as failed trials, because none of them can be fitted."""
         self.work.trials += [self.work.validate(c.words, self._build(c), joint) for c, joint in pairs]
         return self.work.trials
 
     def _eliminate_from_ends(self, ends: Sequence[tuple[Trial, FittedVariant]]) -> list[Trial]:
-        """Eliminate terms backward from each forward-selection result that is as good as the best."""
+        """Run backward elimination from each result in `ends` that predicts as well as the best; return all trials."""
         least = min(_ranking_key(trial) for trial, _ in ends)
         for trial, at in ends:
             if (trial.unstable, trial.score) <= (least[0], least[1] + SCORE_TOLERANCE):
@@ -339,7 +342,7 @@ class StepwiseSelection:
         return self._eliminate_from_ends(ends)
 
     def _select_from_subsets(self, subsets: Sequence[ScreenedSubset]) -> list[tuple[Trial, FittedVariant]]:
-        """Fit and validate the best subsets; extend the best of them by free orders."""
+        """Return the best fitted subset, and its extension by forward selection; [] if no subset can be fitted."""
         if not subsets:
             return []
         best_subsets = [s for s in subsets if s.score <= subsets[0].score + SUBSET_SCORE_MARGIN][:MAX_FITTED_SUBSETS]
@@ -381,7 +384,10 @@ class StepwiseSelection:
     def _eliminate_from_full(
         self, low: FittedVariant, values: Sequence[Mapping[str, float]]
     ) -> tuple[Trial, FittedVariant] | None:
-        """Eliminate one term at a time from the full structure at integer orders; return the best result."""
+        """Eliminate one term at a time from the full structure at integer orders, and return the best result.
+
+        None if the full structure has fewer than two terms more than `low`, or cannot be fitted.
+        """
         full = self.inside.richest(low.change.variant)
         if len(full.coefficients) - len(low.change.variant.coefficients) < 2:
             return None
@@ -413,10 +419,10 @@ class StepwiseSelection:
     def validate_variants(
         self, candidates: Sequence[FittedVariant], *, limit: float = math.inf, margin: float = 0.0
     ) -> list[Trial]:
-        """Evaluate fitted variants on validation data, without those that cannot be the best.
+        """Return the trials of fitted variants, without those that cannot be the best.
 
-        Variants from the first whose lower bound of the score exceeds `limit` are evaluated after those before it. They
-        are skipped if all their bounds exceed the best score up to then by more than the margin.
+        The first variant whose lower bound of the score exceeds `limit`, and all variants after it, are evaluated last.
+        They are skipped if all their lower bounds exceed the best score of the others by more than the margin.
         """
 
         def one(candidate: FittedVariant) -> Trial:
@@ -433,7 +439,7 @@ class StepwiseSelection:
         return trials
 
     def _fit_changes(self, at: FittedVariant, changes: Sequence[Change]) -> list[FittedVariant]:
-        """Fit changes from the current optimum, best first; for long records only survivors of the prescreening."""
+        """Fit changes from the optimum of `at`, and return the fits, best first; prescreening excludes poor changes."""
         values = at.joint.values_by_name
         starts: list[Start] = []
         for change in changes:
@@ -445,7 +451,7 @@ class StepwiseSelection:
         return self._by_criterion([(changes[k], joint) for k, joint in zip(selection, joints, strict=True)])
 
     def _by_criterion(self, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[FittedVariant]:
-        """Sort fitted variants by Schwarz's criterion, with the smallest variance inflation of their residuals."""
+        """Return fitted variants, lowest Schwarz criterion first; the smallest variance inflation of all is used."""
         fits = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
         if not fits:
             return []
@@ -500,7 +506,7 @@ def evaluate_list(candidates: Mapping[str, Structure], work: CandidateEvaluator)
         return work.validate(name, structure, work.fit_candidate(structure, []), fine=True)
 
     items = list(candidates.items())
-    # Stored results take no time, so they give no estimate of it.
+    # Stored results take no time, so they do not allow an estimate.
     if len(items) > TIME_ESTIMATE_CANDIDATES and not (work.store is not None and len(work.store)):
         start_time = work.clock()
         work.trials += work.map_candidates(one, items[: work.threads])

@@ -45,19 +45,18 @@ from ftlm.utils.validation import Floats, as_floats
 
 @dataclass(frozen=True)
 class Metrics:
-    """Error metrics of one output: error (45), RMSE (46) and NR (47) of the paper, and fit.
+    """Error metrics of one output: the metrics of eqs. (45) to (47) of the paper, and the fit in percent.
 
     Parameters
     ----------
     error
-        Sum of absolute errors over all samples (or block pulses), in the unit of the output; equation (45) of the
-        paper.
+        Sum of absolute errors over all samples (or block pulses), in the unit of the output; eq. (45) of the paper.
     rmse
-        Root mean square error, in the unit of the output; equation (46).
+        Root mean square error, in the unit of the output; eq. (46) of the paper.
     nr
-        Normalized residual: RMSE divided by the standard deviation of the output; equation (47).
+        Normalized residual: RMSE divided by the standard deviation of the output; eq. (47) of the paper.
     fit
-        Fit in percent: 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖).
+        Fit in percent: 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), with the measured output y and the predicted output ŷ.
     """
 
     error: float
@@ -70,7 +69,7 @@ class Metrics:
         return attributes(self, ("error", "rmse", "nr", "fit"))
 
 
-#: Metrics of an unknown error.
+#: Metrics of an output whose error cannot be computed: all are NaN.
 UNKNOWN_METRICS = Metrics(math.nan, math.nan, math.nan, math.nan)
 
 
@@ -86,8 +85,8 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     Returns
     -------
     Metrics
-        Metrics that are not finite if the prediction is not finite. NR and fit are meaningless for a constant
-        measurement.
+        Error metrics; they are not finite if the prediction is not finite. NR and fit are meaningless if all measured
+        values are equal.
 
     Raises
     ------
@@ -104,7 +103,11 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
 
 
 def pooled_metrics(outputs: list[Floats], residuals: list[Floats]) -> Metrics:
-    """Return metrics over several runs from their measured outputs and residuals, without missing samples."""
+    """Return the metrics of one output over several runs, without missing samples.
+
+    `outputs` (measured) and `residuals` have one array per run; a missing sample is NaN in `outputs`. With several
+    runs, the mean of each run is subtracted from its output.
+    """
     finite = [~np.isnan(y) for y in outputs]
     if not all(k.all() for k in finite):
         outputs = [y[k] for y, k in zip(outputs, finite, strict=True)]
@@ -114,19 +117,21 @@ def pooled_metrics(outputs: list[Floats], residuals: list[Floats]) -> Metrics:
     return Metrics(*_core.metrics(np.concatenate([y - np.mean(y) for y in outputs]), np.concatenate(residuals)))
 
 
-#: Orders of an output's own terms closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
+#: Difference alpha - nu below which an equation of order alpha predicts smooth outputs from its own term of order nu.
+#: The fractional integral of order alpha - nu is then nearly the identity.
 NEAR_IDENTITY_ORDER_GAP = 0.25
-#: Ratio of output error to equation error (NR) above which the equation error is misleading.
+#: NR of the output error divided by NR of the equation error, above which the equation error is misleading.
 MAX_ERROR_RATIO = 5.0
-#: Drop of the fit from estimation to validation data, in percentage points, that indicates overfitting.
+#: Decrease of the fit from estimation to validation data [percentage points] above which overfitting is reported.
 MAX_FIT_DROP_POINTS = 20.0
 #: Normalized residual (NR) of a simulation above which the model explains little of the output.
 MAX_NORMALIZED_RESIDUAL = 0.5
-#: Change of a simulation on halving the step, relative to its largest value, at which refinement terminates.
+#: Change of a simulation when its step is halved, relative to its largest value, at which refinement terminates.
 REFINEMENT_TOLERANCE = 1e-6
-#: Maximum number of pulses of a refined simulation (at least four per sampling interval), and the change on halving the
-#: step above which a warning reports that it has not converged.
+#: Maximum number of block pulses of a refined simulation. Four per sample are allowed in any case.
 MAX_PULSES = 1 << 20
+#: Change of a simulation when its step is halved, relative to its largest value, above which a finding reports that
+#: the simulation has not converged.
 VISIBLE_STEP_CHANGE = 1e-3
 
 
@@ -137,33 +142,35 @@ class Comparison:
     Parameters
     ----------
     output_error, equation_error
-        Metrics by output, over all runs. The output error is the error of the simulation; the equation error is the
-        error of the equation with measured signals on its right-hand side.
+        Metrics by output, over all runs. The output error is the error of the simulation. The equation error is the
+        error of the equation when measured signals are inserted on its right-hand side.
     per_run
-        (equation error, output error) of each run by name, each as metrics by output.
+        One tuple (run name, equation error, output error) for each run; both errors are metrics by output.
     simulated, measured
         Simulated and measured values by output, one array per run: samples at the sample times, or means over block
         pulses if ``output_samples`` is False. Missing samples are NaN in ``measured`` and excluded from the output
-        error. With missing samples there is no equation error.
+        error. An output with missing samples has no equation error.
     step
-        Width of the block pulses of each run [s], for the equation error.
+        Width [s] of the block pulses with which the equation error is computed, for each run.
     m
-        Number of block pulses per run, for the equation error.
+        Number of block pulses per run with which the equation error is computed.
     initial
         Coefficients of the initial terms (powers of t) in the simulation, one mapping per run: output -> exponent ->
-        value. They are valid for that run only.
+        value. Each mapping applies to its run only.
     findings
-        Findings on reasons to doubt these metrics.
+        Findings that state why these metrics may be misleading.
     times
         Time of each value of ``simulated`` and ``measured`` [s since the first sample], one array per run.
     output_samples
         Whether samples at the sample times are compared; False for means over block pulses, as in the paper.
     offsets
-        Estimated offsets of the equations, one mapping per run: output -> ``"constant"`` [unit of D^alpha y] (and
-        ``"ramp"`` [that unit/s]) -> value. They are estimated on each run separately. Empty for a model without an
-        offset, and for an output whose initial terms make the offset unidentifiable or whose simulation diverges.
+        Estimated offsets, one mapping per run: output -> kind -> value. Kinds are ``"level"`` [unit of the output y],
+        or ``"constant"`` [unit of D^alpha y] and ``"ramp"`` [unit of D^alpha y per second]. They are estimated on each
+        run separately. Empty for a model without an offset. The mapping of an output is empty if its initial terms make
+        the offset unidentifiable or its simulation diverges.
     without_equation_error
-        Reason by name, for each output without an equation error: friction acts on it, or samples are missing.
+        Reason by output name, for each output without an equation error: friction, missing samples, or a non-linear
+        term that is undefined for some samples.
     """
 
     output_error: dict[str, Metrics]
@@ -190,11 +197,11 @@ class Comparison:
         """Fit of the simulation in percent, by output."""
         return {name: figures.fit for name, figures in self.output_error.items()}
 
-    #: The same, by the name that has the unit.
+    #: Same as `fit`, under a name that states the unit.
     fit_percent = fit
 
     def to_frame(self) -> Any:
-        """Return both errors of every run as a pandas DataFrame, one row for each run, output and kind of error."""
+        """Return a pandas DataFrame of the metrics; one row per run, output and kind (output error, equation error)."""
         rows = [
             {"run": run, "output": name, "of": kind, "error": f.error, "rmse": f.rmse, "nr": f.nr, "fit": f.fit}
             for run, equation, output in self.per_run
@@ -243,11 +250,11 @@ class Comparison:
         return comparison_html(self)
 
 
-#: Reasons for a missing equation error.
+#: Texts that state why an output has no equation error.
 FRICTION_REASON = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
 MISSING_SAMPLES_REASON = "some of its samples are missing, and interpolated samples are not measurements"
 UNDEFINED_TERM_REASON = "a non-linear term of the measured signals has no value in some of the rows"
-#: Note on an offset that the initial history makes unidentifiable.
+#: Note on an offset that is not identifiable, because the initial terms of a history explain it as well.
 HIDDEN_OFFSET_NOTE = "not separately identifiable from the initial conditions; begin the run at rest to identify it"
 
 
@@ -257,10 +264,10 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
 
     The output error compares each sample y[k] with the simulation (free run: only inputs and initial conditions are
     used) at the same time. The time step is refined until the simulation has converged, as in :func:`ftlm.simulate`.
-    Initial values are fitted to the samples of the run, unless the model starts from rest. Initial terms of a history
-    (past inputs) have a prior, so that they explain no more than plausible inputs before the run could. A run of an
-    unstable plant is simulated in pieces with their own initial values if the model was identified in this way. The fit
-    is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
+    Initial values are fitted to the samples of the run, unless the model starts from rest. A prior limits the initial
+    terms of a history (past inputs) to the response that plausible inputs before the run can cause. If the model of an
+    unstable plant was identified from pieces of runs, each run is simulated in such pieces. Each piece then has its own
+    initial values. The fit in percent is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), where ŷ is the simulated output.
 
     Parameters
     ----------
@@ -290,17 +297,20 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
 
 
 def simulate_runs(model: Model, runs: Sequence[Run]) -> list[OutputSamples]:
-    """Simulate each run with initial terms fitted to it, and return samples of the outputs.
+    """Return the simulated outputs of each run at its sample times, with initial terms fitted to the run.
 
-    The time step is refined until converged. A model that was identified from pieces of runs is simulated in such
-    pieces, each with its own initial terms.
+    The time step is refined until the simulation has converged. If the model was identified from pieces of runs, each
+    run is divided into pieces of the same duration, and each piece has its own initial terms.
     """
     duration = None if model.estimate is None else model.estimate.piece_duration
     return [_simulate_pieces(model, [run] if duration is None else run.split(duration)) for run in runs]
 
 
 def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:
-    """Return the concatenated simulations of consecutive pieces of a run, with the first piece's initial terms."""
+    """Simulate consecutive pieces of a run separately, and return the concatenated outputs.
+
+    The result has the initial terms of the first piece.
+    """
     free = [
         simulate_refined(model, run, None, tolerance=REFINEMENT_TOLERANCE, max_m=max(MAX_PULSES, 4 * run.length))
         for run in pieces
@@ -314,7 +324,10 @@ def _simulate_pieces(model: Model, pieces: Sequence[Run]) -> OutputSamples:
 
 
 def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, m: int) -> Comparison:
-    """Return a comparison from finished simulations of runs; the equation error is computed on m block pulses."""
+    """Return the comparison of runs with their simulations `free`, which are samples of the simulated outputs.
+
+    The equation error is computed on `m` block pulses per run.
+    """
     full = records(runs, model.structure, m)
     parts = []
     for run, sampled, rec in zip(runs, free, full, strict=True):
@@ -332,12 +345,12 @@ def compare_samples(model: Model, runs: Runs, free: Sequence[OutputSamples], *, 
 
 
 def _is_unconverged(sampled: OutputSamples) -> bool:
-    """Whether a simulation is finite, but halving the time step still changes it noticeably."""
+    """Whether a simulation is finite, but changes by more than `VISIBLE_STEP_CHANGE` when its time step is halved."""
     return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE_STEP_CHANGE))
 
 
 def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
-    """Return output error and equation error on the means over m block pulses, as in the paper's tables.
+    """Compare a model with runs by the means of signals over `m` block pulses, as in the tables of the paper.
 
     A mean averages neighboring samples. These errors therefore understate noise, and overstate model errors if an
     oscillation has few pulses per period.
@@ -354,7 +367,11 @@ def compare_means(model: Model, runs: Run | Sequence[Run], *, m: int | None = No
 
 
 def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
-    """Return the runs and the number of pulses; raise if runs lack a signal of the model or are too short."""
+    """Return the runs as a tuple, and the number of block pulses per run.
+
+    Raise DataError if an output of the model is constant in a run, or an input of a run. Raise ModelError if a run is
+    too short for the number of pulses.
+    """
     check_model(model)
     several = as_runs(runs)
     carried = min(run.length for run in several) - 1
@@ -366,17 +383,18 @@ def _check_arguments(model: Model, runs: Run | Sequence[Run], m: int | None) -> 
 
 
 def describe_missing_equation_errors(why: Mapping[str, str]) -> list[str]:
-    """Return lines of text on outputs without an equation error, with the reasons."""
+    """Return one line of text for each output without an equation error; `why` maps these outputs to reasons."""
     return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
 
 
 def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
-    """Return offsets of the equations, computed from their fitted responses c t^alpha / Gamma(alpha + 1).
+    """Return the offsets of a run as output -> kind -> value, from the fitted coefficients of the powers of t.
 
-    `initial` has the coefficients of the powers of t by output and exponent. The result is output -> kind -> value.
+    Kinds are ``"level"``, or ``"constant"`` and ``"ramp"``. `initial` has the coefficients by output and exponent. A
+    constant c in an equation of order alpha has the response c t^alpha / Gamma(alpha + 1).
 
-    The result is empty for an output with initial terms of a history, whose powers of t make a constant unidentifiable,
-    and for an output whose simulation diverges.
+    The mapping of an output is empty if its simulation diverges. It is also empty with initial terms of a history,
+    because their powers of t make a constant unidentifiable.
     """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
@@ -397,7 +415,7 @@ def offset_values(model: Model, initial: Mapping[str, Mapping[float, float]]) ->
 
 
 def describe_offsets(comparison: Comparison) -> list[str]:
-    """Return text on the offsets of every run that has any, one line per output."""
+    """Return lines of text on the estimated offsets, one for each run and output."""
     lines = []
     for (run, _, _), offsets, initial in zip(comparison.per_run, comparison.offsets, comparison.initial, strict=False):
         for output, values in offsets.items():
@@ -417,14 +435,19 @@ def describe_offsets(comparison: Comparison) -> list[str]:
 
 
 def describe_initial_terms(comparison: Comparison) -> str:
-    """Return text that names the runs whose initial terms and levels were estimated from their own outputs."""
+    """Return text with the names of the runs that have initial terms, each with the number of its terms."""
     counts = [sum(map(len, terms.values())) for terms in comparison.initial]
     return ", ".join(f"{run[0]} ({n})" for run, n in zip(comparison.per_run, counts, strict=True) if n)
 
 
 @dataclass(frozen=True)
 class _RunErrors:
-    """Data for the errors of one run, by output: simulation, measurement, equation signal and equation error."""
+    """Signals of one run from which its error metrics are computed, by output.
+
+    Output error: ``simulated`` and ``measured``. Equation error: residuals ``equation_errors`` of the equations, and
+    the block-pulse means ``equation_signals`` of the outputs. ``step`` is the width of a pulse [s]. ``initial`` has the
+    coefficients of the initial terms by output and exponent of t.
+    """
 
     step: float
     initial: dict[str, dict[float, float]]
@@ -443,10 +466,11 @@ def _run_errors(
     *,
     gaps: Container[str] = (),
 ) -> _RunErrors:
-    """Return the data for the errors of one run, after the sensor filter is applied to all signals.
+    """Return the signals of one run from which its error metrics are computed.
 
-    An output with missing samples (`gaps`) has no equation error, because it would be computed from interpolated
-    samples.
+    `full` is the block-pulse record for the equation error. In it, the sensor filter is applied to signals that were
+    not measured through it. An output with missing samples (`gaps`) has no equation error, because interpolated samples
+    are not measurements.
     """
     (step, means, sensor), inputs, powers = full.core(), list(full.inputs), full.start
     core = step, np.nan_to_num(means) if model.structure.has_nonlinear_terms else means, sensor
@@ -454,7 +478,7 @@ def _run_errors(
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
         for e in model.equations
         # An equation with friction has no equation error, because noise determines the sign of a measured velocity
-        # at rest. Gaps and undefined non-linear terms have none either.
+        # at rest. An output with gaps or with an undefined non-linear term has none either.
         if e.output not in gaps and e.friction is None and all(np.isfinite(full.of(t.column)).all() for t in e.terms)
     }
     return _RunErrors(full.step, initial, simulated, outputs, {o: full.of(o) for o in model.outputs}, missed)
@@ -463,7 +487,7 @@ def _run_errors(
 def _pooled_comparison(
     model: Model, runs: Sequence[Run], parts: Sequence[_RunErrors], m: int, times: list[Floats], *, sampled: bool
 ) -> Comparison:
-    """Return the comparison that pools the errors of all runs."""
+    """Return a comparison with the errors of each run, and with the errors pooled over all runs."""
     equation_error, output_error = _pooled_errors(parts)
     # Single runs may have equation errors although the pooled one is undefined.
     rubbed = {e.output for e in model.equations if e.friction is not None}
@@ -512,10 +536,10 @@ def _pooled_errors(parts: Sequence[_RunErrors]) -> tuple[dict[str, Metrics], dic
 def near_identity_findings(
     structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
 ) -> list[Finding]:
-    """Return findings on outputs whose equation error is misleadingly small.
+    """Return findings on outputs that the simulation explains poorly, or far worse than the equation error suggests.
 
-    If a term of the output has an order close to alpha, the equation predicts any smooth output from itself. Only the
-    simulation reveals that such a model is wrong.
+    If a term of the output has nearly the order of the equation, the equation predicts any smooth output from itself.
+    The equation error is then small for a wrong model as well, but the output error is not.
     """
     findings = []
     for item in structure.equations:
@@ -526,7 +550,7 @@ def near_identity_findings(
             for t in item.terms
             if t.column == name and alpha - t.order.constant < NEAR_IDENTITY_ORDER_GAP
         ]
-        # Negated so that NaN counts as bad. An undefined equation error is no evidence.
+        # Negated so that NaN counts as bad. An undefined equation error is no evidence against the model.
         unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
         worse = not output.nr <= MAX_ERROR_RATIO * equation.nr and not unknown
         useless = not output.nr <= MAX_NORMALIZED_RESIDUAL
@@ -545,7 +569,10 @@ def near_identity_findings(
 
 
 def validation_findings(own: Comparison, validation: Comparison) -> list[Finding]:
-    """Return findings on validation runs that are also estimation runs, and on outputs whose fit drops."""
+    """Return findings on validation samples that are also estimation samples, and on outputs with a far lower fit.
+
+    `own` is the comparison of the model with its estimation runs.
+    """
     findings = []
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
@@ -561,16 +588,16 @@ def validation_findings(own: Comparison, validation: Comparison) -> list[Finding
     return findings + validation_fit_findings({n: f.fit for n, f in own.output_error.items()}, validation)
 
 
-#: Rows compared to align two recordings. Fewer common rows than the second number count as chance.
+#: Number of successive samples that are compared to align two recordings, and minimum number of common samples.
+#: Fewer samples may agree by chance.
 ALIGNMENT_ROWS, MIN_COMMON_ROWS = 8, 32
 
 
 def common_rows(one: Floats, other: Floats) -> int:
-    """Return the number of samples that two records have in common as parts of one recording; 0 if there are none.
+    """Return the number of samples that two excerpts of one recording share; 0 if they share none.
 
-    Both records have shape (outputs, samples).
-
-    They have samples in common if one of them contains the other's first samples and agrees with it from there on.
+    Both arrays have shape (outputs, samples). They share samples if one contains the first samples of the other and
+    agrees with the other from there on.
     """
     if one.shape == other.shape and np.array_equal(one, other, equal_nan=True):
         return int(one.shape[1])
@@ -590,7 +617,7 @@ def common_rows(one: Floats, other: Floats) -> int:
 
 
 def validation_fit_findings(estimation_fits: Mapping[str, float], validation: Comparison) -> list[Finding]:
-    """Return findings on outputs whose fit on validation runs is far below that on the estimation data."""
+    """Return a finding for each validation run and output with a fit `MAX_FIT_DROP_POINTS` below the estimation fit."""
     findings = []
     for other, _, figures in validation.per_run:
         for output, f in figures.items():
@@ -669,15 +696,15 @@ def errors_table(compared: Iterable[tuple[str, Comparison]], *, units: Mapping[s
 
 
 def filter_state(exponent: float) -> str:
-    """Return a label for an initial term of negative exponent: -1 is an impulse, -2 its derivative, and so on.
+    """Return the label of an initial term whose exponent of t is negative.
 
-    These terms represent the initial state of a sensor filter.
+    Such a term represents an initial state of a sensor filter: -1 is an impulse, -2 its derivative, and so on.
     """
     return f"filter's state {round(-exponent)}"
 
 
 def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the simulations") -> Table | None:
-    """Return a table of the initial terms by run and output; None if every run starts at rest."""
+    """Return a table of the initial terms and offsets by run and output; None if no run has initial terms."""
     rows: list[list[Cell]] = [
         [name, symbol_html(output), Exact(exponent) if exponent > -1 else filter_state(exponent), value]
         for (name, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True)
@@ -710,5 +737,5 @@ def warnings_html(warnings: Sequence[str]) -> Markup:
 
 
 def comparison_html(comparison: Comparison) -> str:
-    """Return HTML with the warnings of a comparison and a table of the prediction and simulation error by run."""
+    """Return HTML with the warnings of a comparison and a table of its equation errors and output errors."""
     return str(warnings_html(comparison.warnings) + errors_table([("compared", comparison)]).to_html())

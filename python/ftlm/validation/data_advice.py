@@ -26,43 +26,49 @@ from ftlm.utils.statistics import estimate_noise, is_rest
 from ftlm.utils.validation import Floats
 from ftlm.validation.feedback import feedback_test
 
-#: Spectral lines below this share of the largest one do not count as excitation.
+#: Spectral lines below this fraction of the largest one do not count as excitation.
 SPECTRAL_LINE_THRESHOLD = 0.01
 #: Width of one spectral line in bins under the Blackman-Harris window (side lobes at -92 dB).
 LINE_BINS = 8
 BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
-#: A mean above this share of the standard deviation counts as a constant level; below it, as truncated periods.
+#: A mean of an input above this fraction of its standard deviation counts as a constant level. A smaller mean may come
+#: from truncated periods.
 LEVEL_SHARE = 0.3
 #: Two inputs with a larger absolute correlation are reported as collinear.
 MAX_INPUT_CORRELATION = 0.999
 #: Fewer samples than this are reported as too short for an estimate.
 MIN_USEFUL_SAMPLES = 100
-#: An output that is constant for longer than this share of the run while an input moves is a dead channel.
+#: An output that is constant for longer than this fraction of the run while an input changes is a dead channel.
 DEAD_SHARE = 0.005
-#: Share of the rows of a rest, at its end, in which an input may already have moved: a dead time.
+#: Fraction of an interval at rest, at its end, in which an input may already change because of a dead time.
 DEAD_TIME_SHARE = 0.1
 MIN_DEAD_SAMPLES = 50
-#: Consecutive samples at an extreme that count as clipped, and the share of the run from which it is reported.
+#: Minimum number of consecutive samples at an extreme value that count as clipped, and fraction of clipped samples in a
+#: run from which saturation is reported.
 MIN_CLIPPED_SAMPLES = 3
 CLIPPED_SHARE = 0.002
-#: A spike exceeds both neighbors by this many noise standard deviations and by this share of the range.
+#: A spike differs from both neighbors by more than this number of noise standard deviations and this fraction of the
+#: range. If a larger fraction of the samples than `MAX_SPIKE_SHARE` are spikes, none is reported.
 SPIKE_SIGMAS = 12.0
 SPIKE_SHARE = 0.03
 MAX_SPIKE_SHARE = 0.01
-#: An encoder wrap is a jump of more than this share of the range against the slope on both sides.
+#: An encoder wrap is a jump of more than this fraction of the range against the slope on both sides. The slope is taken
+#: over `WRAP_SLOPE` samples.
 WRAP_SHARE = 0.6
 WRAP_SLOPE = 5
-#: Thresholds of an unexplained trend: share of the output's standard deviation, and its significance over blocks.
+#: Thresholds of the change by an unexplained trend over a run: fraction of the standard deviation of the output, and
+#: number of standard errors, which are estimated from blocks.
 DRIFT_SHARE = 0.15
 DRIFT_SIGMAS = 6.0
 DRIFT_BLOCKS = 16
 DRIFT_PULSES = 1024
 DRIFT_LAGS = 12
-#: Minimum share of the trend regressor that must be orthogonal to the input responses for a drift test.
+#: Minimum fraction of the power of a linear trend that the responses to inputs do not explain, for a drift test.
 MIN_TREND_RESIDUAL_SHARE = 1e-3
-#: Maximum number of rows of the test for feedback.
+#: Maximum number of samples of the test for feedback.
 MAX_FEEDBACK_SAMPLES = 8_000
-#: Statistic over its limit from which undecided feedback is mentioned. Sweeps in open loop reach a few.
+#: Ratio of the test statistic to its limit above which inconclusive feedback is reported. Sweeps in open loop may
+#: have ratios above 1.
 MIN_UNDECIDED_RATIO = 3.0
 
 
@@ -175,7 +181,10 @@ def _constant(run: Run, name: str) -> Finding:
 
 
 def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
-    """Yield a finding on the longest interval over which an output is constant although it varies elsewhere."""
+    """Yield a finding on the longest interval over which an output is constant although it varies elsewhere.
+
+    No finding is given if quantization, saturation or rest without an input explains the interval.
+    """
     y = run[name]
     still = np.diff(y) == 0
     starts, lengths = _true_intervals(still)
@@ -192,7 +201,7 @@ def find_dead_channel(run: Run, name: str) -> Iterator[Finding]:
     # is legitimate.
     if _entered_steeply(y, first, rows):
         return
-    # The rows in which an input moves are of rest, too: the output answers later, after a dead time much later.
+    # The output may be at rest while an input already changes, because it responds after a dead time.
     late = max(1, int(DEAD_TIME_SHARE * rows))
     first_values = [run[n][first : first + rows - late] for n in run.inputs]
     ends = [run[n][first + rows - late : first + rows + 1] for n in run.inputs]
@@ -240,14 +249,14 @@ def _saturation(run: Run, name: str) -> Iterator[Finding]:
     y = run[name]
     levels = np.unique(y)
     if name in run.inputs and _few_levels(y):
-        return  # a signal of a few levels sits at its extremes by design
+        return  # A signal of few levels is at its extremes by design.
     noise, quantum = estimate_noise(y), _quantum(y)
     code, role = ("saturation_input", "input") if name in run.inputs else ("saturation", "output")
     for extreme, word in ((levels[0], "lowest"), (levels[-1], "highest")):
         starts, lengths = _true_intervals(y == extreme)
         long = lengths >= MIN_CLIPPED_SAMPLES
         if noise < 2 * quantum:
-            # If quantization exceeds the noise, only an interval that is entered at speed counts as clipped.
+            # If quantization exceeds the noise, only an interval that is entered steeply counts as clipped.
             steep = [_entered_steeply(y, int(s), int(n)) for s, n in zip(starts[long], lengths[long], strict=True)]
             clipped = int(np.sum(lengths[long][np.array(steep, dtype=bool)]))
         else:
@@ -319,7 +328,7 @@ def _wraps(run: Run, name: str) -> Iterator[Finding]:
 
 
 def _jumps_near(u: Floats, at: int) -> bool:
-    """Whether an input jumps within one row of row `at`, by at least the share of its range that an angle wrap has."""
+    """Whether an input jumps by more than the fraction `WRAP_SHARE` of its range within one sample of index `at`."""
     near = np.abs(np.diff(u[at - 1 : at + 3]))
     return bool(np.any(near > WRAP_SHARE * float(np.ptp(u)))) and float(np.ptp(u)) > 0.0
 
@@ -330,9 +339,9 @@ def spectral_lines(u: Floats) -> tuple[int, int]:
     phase = 2 * np.pi * np.arange(x.size) / x.size
     window = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
     size = np.abs(np.fft.rfft(x * window))
-    size[:2] = 0  # the mean's, through the window
+    size[:2] = 0  # The window spreads the mean over these bins.
     strong = size > SPECTRAL_LINE_THRESHOLD * size.max()
-    # A single line fills LINE_BINS bins; a broad stretch holds as many lines as fit into it.
+    # A single line fills LINE_BINS bins. A broader interval counts as the number of lines that fit into it.
     _, lengths = _true_intervals(strong)
     return int(np.sum(np.maximum(1, np.rint(lengths / LINE_BINS)))), int(np.argmax(size))
 
@@ -368,7 +377,7 @@ def check_excitation(run: Run, structure: Structure) -> Iterator[Finding]:
         else:
             inputs = [s for s in structure.signals if s in run.inputs]
         if not inputs:
-            # A free response: its transient is all there is.
+            # A free response has no input.
             continue
         moving = [n for n in inputs if np.ptp(run[n]) > 0]
         line_count = sum(2 * spectral_lines(run[n])[0] for n in moving)
@@ -426,7 +435,7 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
         basis = np.stack([np.ones(m), *columns, *free])
         scale = np.linalg.norm(basis, axis=1)
         basis = basis[scale > 0] / scale[scale > 0][:, None]
-        # Project trend and output on the complement of the lags: what these can explain is not counted as drift.
+        # The part of trend and output that the regressors explain does not count as drift, so it is removed.
         q = orthonormal(basis.T, 1e-8)
         y_left, t_left = y - q @ (q.T @ y), t - q @ (q.T @ t)
         if float(t_left @ t_left) < MIN_TREND_RESIDUAL_SHARE * float(t @ t):
@@ -442,9 +451,9 @@ def _drift(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]
 
 
 def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
-    """Yield a finding on each input that depends on past outputs, with the output on which it depends most.
+    """Yield a finding on each input that depends on past outputs, or for which this test is inconclusive.
 
-    The test is the feedback test of residuals; see :func:`feedback_test`.
+    It names the output with the largest test statistic. See :func:`feedback_test`.
     """
     rows = min(run.length, MAX_FEEDBACK_SAMPLES)
     signals = {name: run[name][:rows] for name in (*inputs, *outputs)}
@@ -508,7 +517,7 @@ class Inspection:
     run
         Name of the run.
     rows, step, duration
-        Number of samples, step [s] and duration [s].
+        Number of samples, sampling step [s] and duration [s].
     signals
         Statistics of each signal, inputs first.
     findings

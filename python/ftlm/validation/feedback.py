@@ -18,42 +18,50 @@ from ftlm.utils.statistics import chi_squared, robust_deviation
 from ftlm.utils.validation import Floats
 
 FeedbackState = Literal["command", "none", "found", "undecided"]
-#: Significance level over all sets of regressors, and the number of past innovations of the output in each set.
+#: Significance level over all sets of regressors, and numbers of past output innovations in the sets that have them.
 FEEDBACK_LEVEL = 0.005
 INNOVATION_COUNTS = (3, 12)
-#: Minimum number of rows of a run, and maximum number of tested rows.
+#: Minimum number of samples of a run, and maximum number of tested samples.
 MIN_FEEDBACK_ROWS, MAX_FEEDBACK_ROWS = 150, 8_000
-#: Maximum lags of the input itself, of other inputs and of the output; each is also limited by a share of the run.
+#: Maximum lags of the input itself, of other inputs and of the output; each is also limited by a fraction of
+#: the run.
 MAX_INPUT_LAGS, MAX_OTHER_LAGS, MAX_OUTPUT_LAGS = 60, 20, 40
-#: Number of levels of an input, and ratio of levels to rows, up to which a linear prediction leaves no innovation.
+#: Maximum number of distinct values, and maximum ratio of this number to the number of samples, of an input that
+#: switches between few levels. A linear prediction of such an input has no meaningful innovation.
 MAX_COMMAND_LEVELS, MAX_COMMAND_LEVEL_SHARE = 6, 0.01
-#: Minimum number of changes of an input that is constant between them.
+#: Minimum number of changes of an input that is constant between its changes.
 MIN_CHANGES = 80
-#: One-step prediction error of an input, relative to its deviation, below which its past determines it.
+#: One-step prediction error of an input, relative to its standard deviation, below which its own past determines it.
 PREDICTED_SHARE = 3e-4
-#: Innovations of an output below this share of its deviation are rounding.
+#: Innovation of an output, relative to its standard deviation, below which it is a rounding error.
 QUIET_SHARE = 1e-6
-#: Clip levels of innovations in standard deviations: of the input, of the output, of the residuals themselves.
+#: Limits [standard deviations] at which input innovations, output innovations, and residuals are clipped.
 INPUT_CLIP, OUTPUT_CLIP, RESIDUAL_CLIP = 3.0, 5.0, 12.0
-#: Threshold and iterations of the robust prediction of the input.
+#: Threshold [robust standard deviations] and number of iterations of the robust prediction of the input.
 ROBUST_SIGMAS, ROBUST_ITERATIONS = 2.0, 4
-#: Share of an innovation that outputs explain, prediction error and ratio from which no coincidence explains as much.
+#: Feedback is certain from these values on: the fraction of the input innovation that past outputs explain, the
+#: relative prediction error of the input, and the ratio of the test statistic to its limit.
 CERTAIN_SHARE, ROUGH_SHARE, CERTAIN_RATIO = 0.5, 2e-3, 5.0
-#: Minimum of rows x explained share x (relative prediction error)^2. Below it feedback hardly biases an estimate.
+#: Minimum of samples x explained fraction x (relative prediction error)^2, below which feedback hardly biases
+#: estimates.
 MIN_FEEDBACK_POWER = 0.01
-#: Shares of the largest possible input noise that are tried; number of shifts in time that serve as placebos, and
-#: ratio of the statistic to the largest of theirs from which feedback counts as found.
+#: Assumed variances of the noise on a measured input, as fractions of the largest possible variance.
 INPUT_NOISE_SHARES = (0.2, 0.4, 0.6, 0.75, 0.87, 0.94)
+#: Number of time shifts of the outputs that serve as placebos, and minimum ratio of the test statistic to the largest
+#: placebo statistic for detected feedback.
 PLACEBO_COUNT, PLACEBO_RATIO = 19, 1.2
-#: The same ratio where the innovation of the input is not white in every part of the run.
+#: Minimum ratio to the placebo statistic, and to the limit, if the input innovation is not white in all parts of a run.
 PLACEBO_RATIO_IN_DOUBT = 10.0
-#: Number of parts of the run that must agree, and smallest agreement of a part relative to the median part.
+#: Number of parts of a run, and minimum explained power of the median part relative to that of all parts together.
 STEADY_PARTS, STEADY_SHARE = 8, 0.05
-#: Rows of the short blocks whose color and dependence on the past are tested, and lags of the test of color.
+#: Number of samples of the short blocks in which whiteness and independence from past inputs are tested, and maximum
+#: lag of the test of whiteness.
 LOCAL_ROWS, LOCAL_LAGS = 50, 4
-#: Maximum number of spectral lines of an input, their ratio to the neighborhood, and its number of bins.
+#: Maximum number of spectral lines of an input, minimum ratio of their power to the median power of the neighborhood,
+#: and half-width of the neighborhood [bins].
 MAX_LINES, LINE_RATIO, LINE_NEIGHBORS = 16, 40.0, 400
-#: Weight of the newest residual in their low-pass part, which an integral action feeds back, and its length in rows.
+#: Weight of the newest residual in low-pass filtered residuals, which integral control feeds back, and length of the
+#: filter [samples].
 SLOW_FORGETTING, SLOW_MEMORY_ROWS = 0.1, 100
 RIDGE_SHARE = 1e-10
 
@@ -71,9 +79,9 @@ class FeedbackTest:
     reason
         Reason for the conclusion as text; empty if there is none.
     ratio
-        Test statistic divided by its limit: the 99.5 % quantile in open loop, over all sets of regressors.
+        Test statistic divided by its limit, which is the 99.5 % quantile in open loop over all sets of regressors.
     share
-        Share of the variance of the input's innovation that past outputs explain.
+        Fraction of the variance of the input innovation that past outputs explain.
     rows
         Number of samples that were tested.
     bias
@@ -199,9 +207,9 @@ def _fill_missing(residuals: Floats) -> Floats:
 
 
 def _has_clock(changes: Sequence[NDArray[np.intp]]) -> bool:
-    """Whether all changes of a signal fall on multiples of at least two rows, as for a generated signal.
+    """Whether all changes of a signal are multiples of at least two samples apart, as in a generated signal.
 
-    `changes` are the rows of the changes in each run.
+    `changes` are the sample indices of the changes in each run.
     """
     gaps = np.concatenate([np.diff(c) for c in changes])
     return bool(gaps.size >= MAX_COMMAND_LEVELS and np.gcd.reduce(gaps) > 1)
@@ -219,7 +227,7 @@ def _repeats(u: Floats) -> bool:
 
 
 def _lags(x: Floats, first: int, last: int, start: int) -> Floats:
-    """Return lagged values as columns, at lags ``first`` to ``last``, for rows from ``start`` on."""
+    """Return a matrix of lagged samples: rows are samples from ``start`` on, columns are lags ``first`` to ``last``."""
     windows = sliding_window_view(x, last - first + 1)
     return windows[start - last : x.size - last][:, ::-1]
 
@@ -231,7 +239,7 @@ def _line_regressors(u: Floats) -> list[Floats]:
     window, time, x = np.hanning(count - 1), np.arange(count), u - u.mean()
     columns: list[Floats] = []
     for _ in range(min(MAX_LINES, count // 60)):
-        # Spectrum of differences: the slow part of a random walk would look like a line.
+        # Differences are used, because the slow part of a random walk would resemble a line.
         power = np.abs(np.fft.rfft(np.diff(x) * window, size)) ** 2
         power[:16] = 0
         at = int(np.argmax(power))
@@ -251,14 +259,14 @@ def _line_regressors(u: Floats) -> list[Floats]:
 
 
 def _ridge_gram(weighted: Floats, past: Floats) -> Floats:
-    """Return the normal matrix of a weighted regression on the past, with a small ridge."""
+    """Return the normal matrix ``weighted.T @ past`` of a weighted regression on `past`, plus a small ridge."""
     gram: Floats = weighted.T @ past
     gram[np.diag_indices_from(gram)] += RIDGE_SHARE * np.trace(gram) / len(gram)
     return gram
 
 
 def _project_out(past: Floats, targets: Floats, weights: Floats | None = None) -> Floats:
-    """Return the residual of a weighted ridge regression of the targets on the past.
+    """Return the residuals of a weighted ridge regression of `targets` on the columns of `past`.
 
     The ridge is small, and one refinement step corrects it.
     """
@@ -281,7 +289,7 @@ def _score_ratio(innovation: Floats, columns: Floats) -> float:
 
 
 def _largest_score_ratio(innovation: Floats, columns: Floats) -> tuple[float, Floats]:
-    """Return the largest :func:`_score_ratio` over the sets of regressors, and the columns of its set."""
+    """Return the largest :func:`_score_ratio` over the sets of regressors, and the normalized columns of that set."""
     sizes = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(sizes > 0, sizes, 1.0)
     sets = [columns[:, :1], columns[:, :3], *(columns[:, 3 : 3 + k] for k in INNOVATION_COUNTS)]
@@ -303,7 +311,7 @@ def _local_color(w: Floats) -> float:
 
 
 def _local_past(w: Floats, past: Floats) -> float:
-    """Return the share of an innovation that the last two inputs explain over short blocks, divided by its limit."""
+    """Return the fraction of an innovation that `past` explains in short blocks, divided by its limit."""
     count = w.size // LOCAL_ROWS
     if count < 1:
         return 0.0
@@ -333,7 +341,7 @@ class _Innovations:
         outputs = self._clip_outliers(missed)
         sizes = [u.size - self.start for u in moves]
         ends = np.cumsum(sizes).tolist()
-        #: First and last row of every run among the stacked ones.
+        #: (start, stop) of each run in the stacked rows.
         self.places = [(end - size, end) for end, size in zip(ends, sizes, strict=True)]
         past = [np.concatenate([_lags(u, 1, self.input_lags, self.start) for u in inputs])]
         beside = []
@@ -389,12 +397,12 @@ class _Innovations:
         return out
 
     def _rows(self, offset: int) -> NDArray[np.intp]:
-        """Return the rows whose past within the same run reaches back far enough."""
+        """Return the stacked rows whose lagged regressors, delayed by `offset` samples, all lie in the same run."""
         skip = max(INNOVATION_COUNTS) + 2 + offset
         return np.concatenate([np.arange(min(first + skip, last), last) for first, last in self.places])
 
     def _regressors(self, rows: NDArray[np.intp], offset: int) -> Floats:
-        """Return the regressors: past residuals, their differences, their low-pass part, past output innovations."""
+        """Return the regressors at `rows`: past residuals, their differences, their low-pass part, and innovations."""
         lag = self.shift + offset
         back: Callable[[Floats, int], Floats] = lambda x, k: x[rows - k - offset]  # noqa: E731
         innovations = [back(self.output_innovation, k + self.shift) for k in range(max(INNOVATION_COUNTS))]
@@ -505,9 +513,8 @@ class _Innovations:
     def _response(self, columns: Floats, rows: NDArray[np.intp]) -> tuple[Floats, ...]:
         """Return the part of the input that the feedback explains, one array per run.
 
-        The explained innovations are filtered by the dependence of the input on its own past.
-
-        The part that is correlated with the residual of the same sample also counts as feedback.
+        The explained innovations pass through the autoregression of the input on its own past. The part that is
+        correlated with the residual of the same sample also counts as feedback.
         """
         now = _project_out(self.past[rows], self.residuals[rows, None], self.weights[rows])
         columns = np.column_stack([columns, now / max(float(np.linalg.norm(now)), 1e-300)])

@@ -15,7 +15,7 @@ from ftlm.validation.residual_tests import Residuals
 
 @dataclass(frozen=True)
 class InformationCriteria:
-    """Information criteria of a model: negative log likelihood plus a penalty per parameter; lower is better.
+    """Information criteria of a model: minus twice the log likelihood plus a penalty per parameter; lower is better.
 
     They compare models of the same runs.
 

@@ -39,15 +39,16 @@ from ftlm.validation.feedback import FeedbackTest, feedback_test
 
 #: Difference below which two orders count as equal.
 ORDER_TOLERANCE = 1e-9
-#: Ratio of residual RMS to the output's standard deviation below which discretization or quantization explains it.
+#: Ratio of residual RMS to the output's standard deviation below which discretization or quantization
+#: explains the residuals.
 NEGLIGIBLE_RESIDUAL_RATIO = 1e-3
 #: Simulated velocity, relative to the largest one, below which an output counts as at rest.
 MAX_REST_VELOCITY_RATIO = 0.01
-#: Slope at 0 of the tanh that replaces the sign of a measured velocity, times the largest velocity.
+#: Product of slope s and largest velocity in tanh(s v), which replaces the sign of a measured velocity v.
 SIGN_TANH_SLOPE = 100.0
-#: Minimum peak of a velocity against its main direction, relative to its peak, that counts as a reversal.
+#: Minimum peak velocity against the main direction, relative to the peak in the main direction, for a reversal.
 MIN_REVERSAL_RATIO = 0.01
-#: Singular values of sensitivities, relative to the largest one, below which they count as rounding errors.
+#: Singular value of a sensitivity matrix, relative to the largest one, below which it counts as a rounding error.
 SENSITIVITY_RANK_TOLERANCE = 1e-10
 
 
@@ -64,15 +65,16 @@ class CorrelationTest:
     band
         Half-width of the 99 % confidence band of a single correlation.
     statistic, limit
-        Test statistic and its 99 % limit for a true model. Whiteness: the sum over all positive lags.
-        Independence: the largest correlation at lags >= 0, against a simultaneous band for all of them.
+        Test statistic and its 99 % limit for a true model. The statistic for whiteness is the sum of normalized squared
+        autocorrelations over all positive lags; see :func:`ftlm.resid`. For independence it is the largest absolute
+        correlation at lags >= 0, and the limit is a simultaneous band for all these lags.
     passed
         Whether the test is conclusive and the statistic within its limit; False if the residuals are not finite.
     conclusive
-        Whether the test can fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant;
-        the test then neither passes nor fails.
+        Whether the test can fail at all. It cannot if the limit of a correlation exceeds 1 or the input is constant.
+        The test then neither passes nor fails.
     first
-        Minimum tested lag: 1 if only the correlation at lag 0 exceeds the limit, otherwise 0.
+        Smallest tested lag of an independence test: 1 if only the correlation at lag 0 exceeds the limit, otherwise 0.
     """
 
     lags: NDArray[np.int64]
@@ -122,7 +124,7 @@ class OutputResiduals:
         Measured minus simulated samples in SI units, one array per run, without the first and last sample of the run.
         NaN at missing samples.
     rms
-        Root mean square of the residuals over all runs.
+        Root mean square of the residuals over all runs, in SI units.
     nr
         ``rms`` divided by the standard deviation of the output.
     whiteness
@@ -131,7 +133,7 @@ class OutputResiduals:
         Tests of the cross-correlations with each input, by name. Both signals are filtered by the whitening filter of
         the residuals.
     feedback_tests
-        Feedback test of each input of the equation.
+        Feedback test of each input of the equation, by name.
     direction
         Test of the cross-correlations with the sign of the simulated velocity; None for equations with friction.
     sign_slope
@@ -210,9 +212,9 @@ class Residuals:
 
     @property
     def independent(self) -> dict[str, bool]:
-        """Result of the independence test by output; True if the residuals are uncorrelated with all earlier inputs.
+        """Result of the independence test by output; True if the residuals are uncorrelated with the inputs.
 
-        False if the test is inconclusive.
+        Inputs at the same and at earlier samples are tested. False if the test is inconclusive.
         """
         return {name: all(t.passed for t in output.informative_tests.values()) for name, output in self.outputs.items()}
 
@@ -247,7 +249,7 @@ class Residuals:
 
     @property
     def conclusive(self) -> bool:
-        """Whether one test has failed or every test is conclusive, except for constant inputs."""
+        """Whether at least one test has failed, or all tests are conclusive. Tests of constant inputs do not count."""
         return any(test.failed for test in self._informative_tests) or all(
             test.conclusive for test in self._informative_tests
         )
@@ -281,7 +283,7 @@ class Residuals:
         return residuals_html(self)
 
 
-#: Number of lags of the residual tests of every identification; the usual convention.
+#: Maximum lag [samples] of the residual tests after every identification; the usual convention.
 DEFAULT_LAGS = 25
 
 
@@ -323,11 +325,12 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = DEFAULT_LAGS) 
     order minimizes BIC. Without it, chance correlations of two slow signals hide a missing dead time (Box and Jenkins,
     chapter 11). The statistic is the largest correlation at lags >= 0, and its limit is the simultaneous 99 % band of
     all of them (Šidák). The variance of one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N
-    (doi:10.2307/2983611), but at least that for white residuals, and at least the mean of Σ eₜ² uₜ₋ₖ² over all lags,
-    which allows for noise that grows with the input. If the model has no feedthrough and only lag 0 is outside the
+    (doi:10.2307/2983611), but at least that for white residuals. It is also at least the mean of Σ eₜ² uₜ₋ₖ² over all
+    lags, which permits noise that grows with the input. If the model has no feedthrough and only lag 0 is outside the
     band, feedback or feedthrough within one sample explains it, and only the other lags are tested.
 
-    A test with a limit above 1 or with a constant input is inconclusive. Feedback: see :class:`ftlm.FeedbackTest`.
+    A test with a limit above 1 or with a constant input is inconclusive. The feedback test is described at
+    :class:`ftlm.FeedbackTest`.
     """
     check_model(model)
     several = as_runs(runs)
@@ -356,11 +359,12 @@ def run_residual_tests(
     lags: int,
     sensitivities: Callable[[], Mapping[str, list[Floats]]] | None = None,
 ) -> Residuals:
-    """Run whiteness, independence and feedback tests on the residuals of finished simulations of runs.
+    """Run whiteness, independence and feedback tests on the residuals of runs, given their simulations `free`.
 
     The first and last sample of each run are omitted. ``sensitivities`` is a function that returns, by output, the
     sensitivities to the fitted parameters, one array per run with shape (parameters, samples). It is called only if
-    colored residuals are correlated with an input.
+    colored residuals are correlated with an input or with the direction of motion. Raise DataError if a run is too
+    short for these lags.
     """
     check_run_lengths(runs, lags)
     residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
@@ -407,9 +411,12 @@ def _test_output(
     commands: Mapping[str, bool],
     run_inputs: Sequence[str],
 ) -> OutputResiduals:
-    """Run all tests of one output on its residuals without missing samples; tests fail if residuals are not finite.
+    """Run the whiteness, independence and feedback tests of one output; they fail if a residual is not finite.
 
-    ``commands`` states for each input of the equation whether the model has direct feedthrough from it.
+    ``series`` are the residuals and ``gaps`` the masks of missing samples, one array per run. ``signals`` are the
+    tested inputs by name, ``run_inputs`` the names of the inputs of the runs, and ``deviation`` is the standard
+    deviation of the output. ``commands`` states for each input of the equation whether the model has direct feedthrough
+    from it.
     """
     everything = np.concatenate([e[~gap] for e, gap in zip(series, gaps, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -438,7 +445,7 @@ def _test_output(
 
 
 def _signs_of_motion(velocities: Sequence[Floats]) -> list[Floats]:
-    """Return the sign of simulated velocities at each residual, 0 at rest; empty if nothing moves."""
+    """Return the sign of the velocity at each inner sample, 0 at rest, one array per run; [] if nothing moves."""
     largest = max(float(np.max(np.abs(v))) for v in velocities)
     if not 0.0 < largest < math.inf:
         return []
@@ -463,10 +470,11 @@ def _test_beyond_parameters(
     signs: list[Floats],
     lags: int,
 ) -> OutputResiduals:
-    """Return the tests of an output, in which a failure counts as passed if parameter errors explain it.
+    """Return the residuals of an output, with failed tests replaced by passed ones if parameter errors explain them.
 
-    Least squares ignores the color of the noise, so errors of the parameters alone can correlate residuals with an
-    input, or with the direction of motion. One generalized least-squares step removes that part of the residuals.
+    ``signs`` are the signs of the velocity. Least squares ignores the color of the noise, so errors of the parameters
+    alone can correlate residuals with an input, or with the direction of motion. One generalized least-squares step
+    removes that part of the residuals.
     """
 
     def repeat(test: CorrelationTest, signal: list[Floats]) -> CorrelationTest:
@@ -488,7 +496,7 @@ def _failed_test(lags: NDArray[np.int64]) -> CorrelationTest:
 
 
 def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
-    """Test the residuals for whiteness; the variance of the noise may change within a run."""
+    """Return the whiteness test of `count` residuals; the variance of the noise may change within a run."""
     limit = chi_squared_99(lags)
     own, statistic = autocorrelations(series, lags)[0], portmanteau(series, lags)
     band = NORMAL_99 / math.sqrt(count)
@@ -561,7 +569,7 @@ def _independence(
     white, through = noise.whiten(series), noise.whiten(signal)
     cross, _, _ = _core.correlation(white, through, lags)
     _, variance, _ = _core.correlation(noise.innovations, through, lags)
-    # Noise that is larger where the input is larger has a wider band, as colored noise has.
+    # Noise that grows with the input widens the band, as colored noise does.
     variance = max(variance, _product_variance(noise.innovations, through, lags))
     power, driven = (sum(dot(row, row) for row in rows) for rows in (white, noise.innovations))
     share = noise.inflation * driven / power if power > 0.0 else 1.0
@@ -574,7 +582,7 @@ def _independence(
 
 
 def _product_variance(white: list[Floats], signal: list[Floats], lags: int) -> float:
-    """Return the mean variance of the cross-correlations at lags >= 0, from products of the squared signals."""
+    """Return the variance of a cross-correlation, as the mean over lags >= 0 of products of the squared signals."""
     powers = [(e * e, v * v) for e, v in zip(white, (v - v.mean() for v in signal), strict=True)]
     total = sum(float(e.sum()) for e, _ in powers) * sum(float(v.sum()) for _, v in powers)
     each = [sum(dot(e[k:], v[: e.size - k]) for e, v in powers if e.size > k) for k in range(lags + 1)]
