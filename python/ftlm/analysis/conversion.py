@@ -35,7 +35,7 @@ from ftlm.utils.validation import Floats
 
 
 def _comment(text: str, mark: str) -> str:
-    """Return a text as comment lines, so that a name with line breaks cannot inject code."""
+    """Return a text as comment lines that begin with `mark`; each line of the text becomes a comment."""
     lines = re.split(r"[\r\n\u2028\u2029\x0b\x0c\x85]+", text)
     return "\n".join(f"{mark} {''.join(c if c.isprintable() else '?' for c in line)}" for line in lines)
 
@@ -87,7 +87,7 @@ def matlab_text(model: Model) -> str:
     Raises
     ------
     ModelError
-        As :func:`json_text`.
+        If an input has a saturation or a dead zone, or the model has friction.
     """
     check_no_input_nonlinearity(model, "a transfer function")
     transfer = transfer_functions(model)
@@ -143,7 +143,7 @@ def control_text(model: Model, *, band: tuple[float, float], order: int = 5) -> 
     Raises
     ------
     ModelError
-        In the cases of :func:`to_control`, except that python-control need not be installed.
+        In the cases of :func:`approximate`; python-control need not be installed.
     """
     near = approximate(model, band=band, order=order)
 
@@ -178,7 +178,8 @@ def export_text(
 ) -> str:
     """Return a model as text for another tool: a Python script, a MATLAB script, or JSON.
 
-    Raise ModelError for an unknown tool or a missing band.
+    `band` [rad/s] and `order` are arguments of :func:`control_text`, for "control" only. Raise ModelError for an
+    unknown tool, a missing band, or a model that the tool cannot represent.
     """
     if to == "json":
         return json_text(model)
@@ -194,9 +195,9 @@ def export_text(
     return control_text(model, band=band, order=order)
 
 
-#: Rest of a delay in sampling intervals below which the delay is a whole number of them.
+#: Fractional part of a delay in sampling intervals below which the delay counts as a multiple of the interval.
 WHOLE_DELAY_TOLERANCE = 1e-9
-#: Size of a Markov parameter, relative to its factors, below which it is rounding error.
+#: Magnitude of a Markov parameter c A^k b, relative to the norms of its factors, below which it is rounding error.
 MARKOV_TOLERANCE = 1e-12
 _LABEL_PATTERN = re.compile(r"([A-Za-z]+)\[(\d+)\]")
 
@@ -313,9 +314,9 @@ def _with_delay(system: Any, delay: Mapping[str, float]) -> Any:
 
 
 def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...], Floats, Floats]:
-    """Return the filtered signals, numerator and denominator of the sensor filter.
+    """Return the filtered signals, and numerator and denominator of the sensor filter in descending powers of s.
 
-    Raise ModelError if an input is filtered.
+    Without a filter, they are () and 1. Raise ModelError if an input is filtered, or an order is fractional.
     """
     sensor = model.structure.sensor_filter
     if sensor is None:
@@ -331,9 +332,9 @@ def _output_filter(model: Model, inputs: Sequence[str]) -> tuple[tuple[str, ...]
 def _filter_output(
     a: Floats, b: Floats, c: Floats, d: Floats, output: int, top: Floats, bottom: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return a state space in which one output is filtered by top / bottom, in observer form.
+    """Return state-space matrices in which the filter top / bottom is applied to one output, in observer form.
 
-    `top` and `bottom` are polynomials with the same number of coefficients.
+    `output` is the index of the output. `top` and `bottom` are coefficients in descending powers, of equal number.
     """
     count, own = bottom.size - 1, a.shape[0]
     top, bottom = top / bottom[0], bottom / bottom[0]
@@ -351,7 +352,7 @@ def _filter_output(
 def _sample_system(
     a: Floats, b: Floats, c: Floats, d: Floats, delays: Sequence[float], step: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the discrete-time state space for zero-order-hold inputs; delays of inputs become states.
+    """Return discrete-time state-space matrices for zero-order-hold inputs with delays [s], which become states.
 
     For a delay that is not a multiple of the step, the last two values of the input act within an interval (Åström and
     Wittenmark, Computer-Controlled Systems, section 2.3).
@@ -359,7 +360,7 @@ def _sample_system(
     expm = importlib.import_module("scipy.linalg").expm
 
     def hold(column: Floats, seconds: float) -> tuple[Floats, Floats]:
-        """Return the state-transition matrix over some seconds, and the effect of a constant input on the states."""
+        """Return the state-transition matrix over a duration [s], and the state after a unit input of this duration."""
         whole = expm(np.block([[a, column], [np.zeros((1, a.shape[0] + 1))]]) * seconds)
         return whole[:-1, :-1], whole[:-1, -1:]
 
@@ -368,7 +369,7 @@ def _sample_system(
     parts = [max(delay - k * step, 0.0) for delay, k in zip(delays, whole, strict=True)]
     lengths = [k + (part > WHOLE_DELAY_TOLERANCE * step) for k, part in zip(whole, parts, strict=True)]
     size = count + sum(lengths)
-    # Columns: states, past values of each input, then the inputs of this sample.
+    # The columns are the states, past values of each input, and the inputs at this sample.
     motion, read = np.zeros((size, size + inputs)), np.zeros((c.shape[0], size + inputs))
     motion[:count, :count], read[:, :count] = hold(np.zeros((count, 1)), step)[0], c
     first = count
@@ -402,7 +403,7 @@ def _coefficients(pairs: Sequence[tuple[float, float]]) -> Floats:
 
 
 def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> Structure:
-    """Return the structure that corresponds to a python-control system; see :meth:`ftlm.Model.from_control`."""
+    """Return the structure of a python-control system; for arguments and errors see :meth:`ftlm.Model.from_control`."""
     if getattr(system, "dt", None) not in (0, None):
         raise ModelError(
             f"the system is sampled (dt = {system.dt}); an equation is in continuous time; give a continuous-time "
@@ -430,9 +431,10 @@ def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequ
 
 
 def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
-    """Return an equation D^n y = … as text, from a denominator and a numerator for each input.
+    """Return an equation D^n y = … as text, from a monic denominator and a numerator for each input.
 
-    Polynomials have their highest power first.
+    Polynomials have their highest power first. Raise ModelError if the order n is not from 1 to 10, a numerator has a
+    higher order, or all numerators are 0.
     """
     order = bottom.size - 1
     if not 0 < order <= MAX_ORDER:
@@ -449,7 +451,10 @@ def _equation_text(output: str, inputs: Sequence[str], bottom: Floats, tops: Seq
 
 
 def _from_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
-    """Return, for each output, a common monic denominator and the numerators of all inputs over it."""
+    """Return, for each output, a common monic denominator and the numerators of all inputs for it.
+
+    `tops` and `bottoms` are numerators and denominators by output and input, with the highest power first.
+    """
     fractions = []
     for top, bottom in zip(tops, bottoms, strict=True):
         own = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in bottom]
@@ -475,7 +480,7 @@ def _product(factors: Sequence[Floats]) -> Floats:
 
 
 def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
-    """Return, for each output, the monic denominator and the numerators of the transfer functions."""
+    """Return, for each output, the monic denominator and the numerators of all inputs (Faddeev-LeVerrier algorithm)."""
     count = a.shape[0]
     bottom, powers = [1.0], [np.eye(count)]
     for k in range(1, count + 1):
@@ -500,9 +505,10 @@ def _from_state_space(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[
 
 
 def _names(what: str, names_argument: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
-    """Return signal names from the argument, or else from the labels of the system.
+    """Return the names of `count` signals from the argument, or else from the labels of the system.
 
-    The label u[0] becomes u0, or u if it is the only one.
+    The label u[0] becomes u0, or u if there is only one signal. `what` is "inputs" or "outputs". Raise ModelError for a
+    wrong number of names.
     """
     if names_argument is not None:
         names = [names_argument] if isinstance(names_argument, str) else list(names_argument)

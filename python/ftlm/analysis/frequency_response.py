@@ -25,11 +25,11 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, as_floats, check_choice
 
-#: A sum of coefficient * s^power, by power.
+#: Sum of terms coefficient * s^power, as a dictionary of coefficients by power.
 Polynomial: TypeAlias = dict[float, float]
 #: Difference below which two powers of s count as equal.
 POWER_TOLERANCE = 1e-9
-#: Size of a sum of coefficients, relative to its summands, below which it is rounding error.
+#: Magnitude of a sum of coefficients, relative to the sum of their magnitudes, below which it is rounding error.
 CANCELLATION_TOLERANCE = 1e-13
 #: Relative step of the numerical derivatives of the delta method.
 DERIVATIVE_STEP_RATIO = 1e-6
@@ -45,9 +45,9 @@ def check_no_input_nonlinearity(model: Model, what: str) -> None:
 
 
 def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
-    """Return the names of the inputs of a response: all signals but the outputs.
+    """Return the names of the inputs of a response: all signals except the outputs.
 
-    If equations are not coupled, the other outputs are inputs, too.
+    If the equations are not coupled, outputs that enter other equations are also inputs.
     """
     if coupled:
         return tuple(s for s in model.structure.signals if s not in model.outputs)
@@ -56,7 +56,7 @@ def response_inputs(model: Model, *, coupled: bool) -> tuple[str, ...]:
 
 
 def add_polynomial(into: Polynomial, other: Polynomial, factor: float = 1.0) -> None:
-    """Add a multiple of a polynomial to another one in place; nearly equal powers are merged."""
+    """Add `factor` times the polynomial `other` to the polynomial `into` in place; nearly equal powers are merged."""
     for power, value in other.items():
         at = next((p for p in into if abs(p - power) < POWER_TOLERANCE), power)
         into[at] = into.get(at, 0.0) + factor * value
@@ -71,9 +71,9 @@ def multiply_polynomials(a: Polynomial, b: Polynomial) -> Polynomial:
 
 
 def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
-    """Return the polynomials in s that multiply each output in an equation, and those that multiply each other signal.
+    """Return the polynomials in s of an equation: a list for the outputs `names`, and a dictionary for other signals.
 
-    Terms of outputs are moved to the left-hand side.
+    Terms of the outputs are moved to the left-hand side. Raise ModelError for friction or a non-linear term.
     """
     check_linear([item], "a frequency response")
     polynomials: list[Polynomial] = [{} for _ in names]
@@ -89,7 +89,10 @@ def equation_polynomials(item: Equation, names: Sequence[str]) -> tuple[list[Pol
 
 
 def determinant(matrix: list[list[Polynomial]]) -> Polynomial:
-    """Return the determinant of a small matrix of polynomials, by the sum over permutations."""
+    """Return the determinant of a small matrix of polynomials by the Leibniz formula.
+
+    Coefficients that are only rounding errors are omitted.
+    """
     n = len(matrix)
     out: Polynomial = {}
     size: Polynomial = {}
@@ -114,10 +117,10 @@ class TransferFunctions:
     outputs, inputs
         Signal names.
     denominator
-        Denominator of each output as (coefficient, power) pairs, highest power first. Coupled
-        outputs have the same denominator.
+        Denominator of each output as (coefficient, power) pairs, highest power first. Coupled outputs have the same
+        denominator.
     numerators
-        Numerator by output and input as such pairs; empty if an input has no effect on an output.
+        Numerator by (output, input), as pairs like the denominator; empty if the input has no effect on the output.
     delay
         Delay of each input [s].
     """
@@ -130,7 +133,7 @@ class TransferFunctions:
 
 
 def coupled_outputs(model: Model, *, coupled: bool) -> list[tuple[str, ...]]:
-    """Return groups of outputs whose equations are solved together."""
+    """Return the groups of outputs whose equations are solved together: one group if `coupled`, else one per output."""
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
@@ -143,7 +146,7 @@ def transfer_functions(model: Model, *, coupling: str = "simulated") -> Transfer
     model
         The model.
     coupling
-        ``"simulated"``: coupled equations, with all signals but the outputs as inputs. ``"measured"``: each equation
+        ``"simulated"``: coupled equations, with all signals except the outputs as inputs. ``"measured"``: each equation
         alone, with the other outputs among its inputs.
 
     Returns
@@ -153,7 +156,7 @@ def transfer_functions(model: Model, *, coupling: str = "simulated") -> Transfer
     Raises
     ------
     ModelError
-        Another coupling, or equations that cannot be solved for their outputs.
+        If `coupling` is unknown, the model is not linear, or the equations cannot be solved for their outputs.
     """
     coupled = is_coupled(coupling)
     inputs = response_inputs(model, coupled=coupled)
@@ -183,7 +186,7 @@ def _coefficient_pairs(polynomial: Polynomial) -> tuple[tuple[float, float], ...
 
 
 def is_coupled(coupling: str) -> bool:
-    """Return whether all equations are coupled; raise ModelError for an unknown coupling."""
+    """Return True for the coupling "simulated", False for "measured"; raise ModelError for another coupling."""
     check_choice("coupling", coupling, ("simulated", "measured"))
     return coupling == "simulated"
 
@@ -199,7 +202,7 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
     w
         Angular frequencies [rad/s], shape (W,), finite and nonnegative.
     coupling
-        ``"simulated"``: coupled equations, with all signals but the outputs as inputs. ``"measured"``: each equation
+        ``"simulated"``: coupled equations, with all signals except the outputs as inputs. ``"measured"``: each equation
         alone, with the other outputs among its inputs (in the order of ``model.structure.signals``).
     sensor
         Whether the sensor filter is included: the response of a filtered output is multiplied by the filter, and the
@@ -213,9 +216,9 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
     Raises
     ------
     DataError
-        Frequencies that are not finite numbers from 0.
+        If a frequency is negative or not finite.
     ModelError
-        Another coupling, an input that saturates or has a dead zone.
+        If `coupling` is unknown, an input has a saturation or dead zone, or the model is not linear.
     """
     check_no_input_nonlinearity(model, "a frequency response")
     coupled = is_coupled(coupling)
@@ -266,7 +269,7 @@ def frequency_response(model: Model, w: ArrayLike, *, coupling: str = "simulated
 
 
 def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
-    """Return the values of a polynomial with real powers at complex frequencies s."""
+    """Return the values of a polynomial with real powers at complex frequencies s, in the shape of s."""
     total = np.zeros(s.shape, dtype=np.complex128)
     for power, coefficient in polynomial.items():
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -313,7 +316,7 @@ def response_deviation(model: Model, w: ArrayLike, *, coupling: str = "simulated
 
 
 def covariance_of(model: Model) -> Floats | None:
-    """Return the covariance matrix of :func:`parameter_vector`; None if the model has none."""
+    """Return the covariance of the parameters in :func:`parameter_vector`; None if the model has no covariance."""
     if model.estimate is None or model.estimate.covariance is None:
         return None
     return np.asarray(model.estimate.covariance, dtype=np.float64)
@@ -322,7 +325,8 @@ def covariance_of(model: Model) -> Floats | None:
 def parameter_vector(model: Model) -> Floats:
     """Return all orders and coefficients of a model as a vector, equation by equation.
 
-    For each equation it has alpha, then order and coefficient of each term, then the parameters of its friction.
+    An equation contributes alpha, then order and coefficient of each term, then the parameters of its friction. The
+    coefficient of a term includes its known factor.
     """
     numbers: list[float] = []
     for item in model.equations:
@@ -337,7 +341,7 @@ def with_parameter_vector(model: Model, numbers: Floats) -> Model:
     equations = []
     for item in model.equations:
         alpha = replace(item.order, constant=next(at))
-        # Arguments are taken in this order: an order, then its coefficient.
+        # Keyword arguments are evaluated in this sequence: the order first, then the coefficient.
         terms = [
             replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor) for t in item.terms
         ]
@@ -349,9 +353,10 @@ def with_parameter_vector(model: Model, numbers: Floats) -> Model:
 
 
 def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Iterator[tuple[int, float, Model, Model]]:
-    """Yield index, step, and the models one step above and below, for each parameter of :func:`parameter_vector`.
+    """Yield (index, step, model with the parameter plus step, model with it minus step) for central differences.
 
-    Only the parameters in the mask `varied` are shifted. `ratio` is the step relative to the parameter.
+    The parameters are those of :func:`parameter_vector` for which the mask `varied` is True. `ratio` is the step
+    relative to the parameter, or to 1e-3 for smaller parameters.
     """
     values = parameter_vector(model)
     for k in np.flatnonzero(varied).tolist():
@@ -363,7 +368,7 @@ def shifted_models(model: Model, varied: NDArray[np.bool_], ratio: float) -> Ite
 def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...], friction: Friction | None) -> Equation:
     """Return an equation with other orders, terms and friction, without range checks.
 
-    Numerical derivatives at a limit of the range need orders beyond the limit.
+    Numerical derivatives at a limit of the range require orders beyond the limit.
     """
     new = copy.copy(item)
     vars(new).update(order=order, terms=terms, coulomb=UNSET if friction is None else friction)
@@ -373,8 +378,8 @@ def _replace_unchecked(item: Equation, order: Order, terms: tuple[Term, ...], fr
 def linear_part(model: Model) -> Model:
     """Return the model without friction, saturations and dead zones, with the covariance of the other parameters.
 
-    It describes small deviations while no body reverses or sticks, speeds stay well above a Stribeck speed, and inputs
-    stay between dead zone and saturation.
+    The result describes small deviations under three conditions. No velocity with friction is 0 or changes sign.
+    These velocities are well above the Stribeck speed. Inputs are between dead zone and saturation.
     """
     structure, keep = model.structure, list[bool]()
     for item in model.equations:
@@ -413,7 +418,7 @@ def step_response(model: Model, time: ArrayLike, *, tolerance: float = 1e-6) -> 
     DataError
         If the time points are not uniform from 0.
     ModelError
-        An input that saturates or has a dead zone.
+        If an input has a saturation or dead zone.
     ConvergenceError
         If the response of an unstable model overflows.
     """

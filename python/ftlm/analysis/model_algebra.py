@@ -25,15 +25,15 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import check_known, real_number
 
-#: Relative size below which the coefficient of the highest derivative has cancelled.
+#: Magnitude of the coefficient of the highest derivative, 1 before linearization, below which it counts as 0.
 CANCELLATION_TOLERANCE = 1e-12
-#: Coefficient and power of a term.
+#: (coefficient, power) of a term.
 Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """Transfer function: numerator and denominator with real powers of s, and a delay [s]."""
+    """Transfer function: numerator `top` and denominator `bottom` with real powers of s, and a delay [s]."""
 
     top: Polynomial
     bottom: Polynomial
@@ -42,12 +42,13 @@ class Ratio:
     def model(self, output: str, signal: str, *, improper_order: float = 0.0) -> Model:
         """Return the model of this transfer function as an equation.
 
-        The order of the numerator may exceed the order of the denominator by less than `improper_order`.
+        The order of the numerator may exceed the order of the denominator by at most `improper_order`. Raise ModelError
+        if it is higher, numerator or denominator is 0, or the order of the denominator is not in (0, 10].
         """
         bottom, top = ({p: c for p, c in side.items() if c != 0.0} for side in (self.bottom, self.top))
         if not bottom or not top:
             raise ModelError(f"the {'denominator' if top else 'numerator'} is 0; there is no such model")
-        # Integrals of a signal are powers below 0, and an equation is written without them.
+        # Powers below 0 are integrals of a signal; a multiplication by a power of s removes them from the equation.
         shift = -min(0.0, *bottom, *top)
         highest = max(bottom)
         order, gain = highest + shift, bottom[highest]
@@ -110,9 +111,9 @@ def transfer_function(
 
 
 def _polynomial(name: str, values_argument: Sequence[float] | Sequence[Pair]) -> Polynomial:
-    """Return (coefficient, power) pairs from coefficients of descending powers or from such pairs.
+    """Return a polynomial from coefficients in descending powers or from (coefficient, power) pairs.
 
-    Raise ModelError for other input.
+    `name` names the argument in messages. Raise ModelError for other input.
     """
     values = list(values_argument)
     pairs = [v if isinstance(v, (tuple, list)) else (v, len(values) - 1.0 - k) for k, v in enumerate(values)]
@@ -129,9 +130,9 @@ def _polynomial(name: str, values_argument: Sequence[float] | Sequence[Pair]) ->
 
 
 def _ratio(model: Model, what: str) -> tuple[Ratio, str, str]:
-    """Return the transfer function of a linear model of one output and one input, with their names.
+    """Return (transfer function, output name, input name) of a linear model with one output and one input.
 
-    `what` names the operation in messages.
+    `what` names the operation in messages. Raise ModelError for other models.
     """
     check_no_input_nonlinearity(model, what)
     if model.structure.has_friction or model.structure.sensor_filter is not None:
@@ -151,14 +152,14 @@ def _ratio(model: Model, what: str) -> tuple[Ratio, str, str]:
 
 
 def series(first: Model, second: Model) -> Model:
-    """Return the series connection, in which the output of `first` is the input of `second`; delays are added."""
+    """Return the series connection of `first` followed by `second`; see :meth:`ftlm.Model.series`."""
     (a, _, signal), (b, output, _) = _ratio(first, "a series"), _ratio(second, "a series")
     top, bottom = multiply_polynomials(a.top, b.top), multiply_polynomials(a.bottom, b.bottom)
     return Ratio(top, bottom, a.delay + b.delay).model(_distinct_name(output, signal), signal)
 
 
 def parallel(first: Model, second: Model) -> Model:
-    """Return the parallel connection, the sum of both outputs from one input; the delays must be equal."""
+    """Return the parallel connection, the sum of both outputs; see :meth:`ftlm.Model.parallel`."""
     (a, output, signal), (b, _, _) = _ratio(first, "a sum"), _ratio(second, "a sum")
     if a.delay != b.delay:
         raise ModelError(
@@ -198,7 +199,7 @@ def inverse(model: Model) -> Model:
 
 
 def _distinct_name(output: str, signal: str) -> str:
-    """Return the name of an output, changed if it equals the input's name."""
+    """Return the name of an output, with the suffix ``_out`` if it equals the name of the input."""
     return output if output != signal else f"{output}_out"
 
 
@@ -221,7 +222,7 @@ def linearize(model: Model, at: Mapping[str, float]) -> Model:
 
 
 def _channel_of(name: str) -> Channel:
-    """Return (signal, order of the derivative) for a text such as ``y`` or ``D^0.5 y``."""
+    """Return (signal, order of the derivative) for a text such as ``y`` or ``D^0.5 y``; raise ModelError for others."""
     parsed = EquationParser(name).parse_expression()
     if parsed.operation != "channel":
         raise ModelError(f"the operating point {name!r} is not a signal or derivative of one; write 'y' or 'D y'")
@@ -229,7 +230,11 @@ def _channel_of(name: str) -> Channel:
 
 
 def _linearized_equation(item: Equation, values: Mapping[Channel, float]) -> Equation:
-    """Return an equation in which every non-linear term is replaced by its first-order terms, without constants."""
+    """Return an equation with every non-linear term replaced by its first-order terms, without constants.
+
+    `values` is the operating point. Raise ModelError if a term has no derivative there, or the highest derivative
+    cancels.
+    """
     if not item.nonlinear_terms:
         return item
     terms = [t for t in item.terms if t.nonlinear is None]

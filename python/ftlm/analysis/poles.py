@@ -32,18 +32,19 @@ from ftlm.utils.parameters import parameter
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Complex, Floats
 
-#: Maximum degree of a polynomial in s^q with accurate roots in double precision.
+#: Maximum degree of a polynomial in s^q whose roots are accurate in double precision.
 MAX_ROOT_DEGREE = 100
-#: Minimum common base of orders.
+#: Minimum common base q of orders, that is, the largest number of which all orders are multiples.
 MIN_ORDER_BASE = 0.01
-#: Relative size of all other terms at which the lowest or the highest power dominates.
+#: Sum of the magnitudes of all other terms, relative to one term, below which this term dominates.
 DOMINANCE_RATIO = 1e-3
-#: Maximum angle between two points of the Nyquist curve, and maximum number of points.
+#: Maximum angle between two adjacent points of the Nyquist curve, and maximum number of points.
 MAX_TURN_RAD = 0.2
 MAX_NYQUIST_POINTS = 200_000
-#: Logarithm of the frequency used in case of overflow.
+#: Natural logarithm of the frequency [rad/s] that replaces a mean frequency which overflows.
 OVERFLOW_LOG_FREQUENCY = 600.0
-#: Distance of the Nyquist curve from 0, relative to its terms, below which a pole is on the axis.
+#: Magnitude of the characteristic function, relative to the sum of the magnitudes of its terms, below which a pole is
+#: regarded as on the imaginary axis.
 AXIS_TOLERANCE = 1e-9
 
 
@@ -54,17 +55,17 @@ class Stability:
     Parameters
     ----------
     stable
-        Whether no pole has a nonnegative real part; a pole at the origin also makes the model unstable.
+        Whether all poles have negative real parts. A pole at the origin makes the model unstable.
     unstable_poles
-        Number of poles with a positive real part; NaN if a pole on the imaginary axis prevents the count.
+        Number of poles with positive real parts; NaN if a pole on the imaginary axis prevents the count.
     origin_order
         Order of the pole at s = 0: 0 for none, 1 for an integrator.
     on_axis
-        Whether a pole other than the origin lies on the imaginary axis, within numerical accuracy.
+        Whether a pole other than s = 0 lies on the imaginary axis, within numerical accuracy.
     method
         Method used: ``"poles"`` (Matignon's criterion) or ``"argument principle"``.
     base
-        Largest number of which all orders are multiples, or None.
+        Largest number of which all orders are multiples; None if the method is the argument principle.
     """
 
     stable: bool
@@ -92,7 +93,7 @@ class Stability:
 
 
 def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
-    """Return the characteristic function of each group of coupled equations, as c by p of a sum of c s^p."""
+    """Return the characteristic function of each group of coupled equations: a sum of c s^p, as a dictionary {p: c}."""
     return [
         determinant([equation_polynomials(e, names)[0] for e in model.equations if e.output in names])
         for names in coupled_outputs(model, coupled=coupled)
@@ -100,22 +101,22 @@ def characteristic(model: Model, *, coupled: bool) -> list[Polynomial]:
 
 
 def common_base(powers: Sequence[float]) -> float | None:
-    """Return the largest number of which all powers are multiples; None if it is below 0.01."""
+    """Return the largest number, at most 1, of which all powers are multiples; None if it is below 0.01."""
     powers = [p for p in powers if abs(p) > POWER_TOLERANCE]
     fractions = [Fraction(p).limit_denominator(1000) for p in powers]
     if any(abs(float(f) - p) > 1e-8 for f, p in zip(fractions, powers, strict=True)):
         return None
     common = math.lcm(*(f.denominator for f in fractions))
     base = Fraction(math.gcd(*(int(f * common) for f in fractions)), common)
-    # Above 1 one root would stand for several poles.
+    # With a base above 1, one root would represent several poles.
     base /= max(math.ceil(base), 1)
     return float(base) if base * 1000 >= 999 * MIN_ORDER_BASE else None
 
 
 def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
-    """Return the common base q of a polynomial's powers, and its nonzero roots in the variable s^q.
+    """Return the common base q of the powers of s in a polynomial, and its nonzero roots in the variable s^q.
 
-    None without a common base, or if frequencies or coefficients overflow.
+    Return None if there is no common base, the degree exceeds 100, or frequencies or coefficients overflow.
     """
     lowest, highest = min(polynomial), max(polynomial)
     base = common_base([p - lowest for p in polynomial])
@@ -127,7 +128,7 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     sizes = {power: math.log(abs(value)) for power, value in polynomial.items() if value}
     if lowest not in sizes or highest not in sizes:
         return None
-    # In units of the mean frequency all coefficients have about the same size.
+    # With frequencies relative to their geometric mean, all coefficients have similar magnitudes.
     unit = (sizes[lowest] - sizes[highest]) / (highest - lowest)
     logs = {power: size - sizes[highest] + unit * (power - highest) for power, size in sizes.items()}
     if max(abs(unit), *logs.values()) > MAX_LOG_FREQUENCY:
@@ -141,7 +142,7 @@ def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
 
 @check_arguments
 def poles(model: Model, *, coupling: str = "simulated") -> Complex:
-    """Return the poles of a model of any orders; with fractional orders, those on the principal Riemann sheet.
+    """Return the poles of a model; with fractional orders, those on the principal Riemann sheet.
 
     Parameters
     ----------
@@ -160,7 +161,7 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     Raises
     ------
     ModelError
-        If poles are outside the floating-point range, or their number differs from the count by the argument principle.
+        If `coupling` is unknown, poles overflow, or their number differs from the count by the argument principle.
 
     Notes
     -----
@@ -174,14 +175,14 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
 
 @check_arguments
 def zeros(model: Model, output: str | None = None, input: str | None = None) -> Complex:
-    """Return the zeros of a transfer function of any orders; with fractional orders, those on the principal sheet.
+    """Return the zeros of a transfer function; with fractional orders, those on the principal Riemann sheet.
 
     Parameters
     ----------
     model
         The model; its equations are coupled.
     output, input
-        Names of the signals; not required if there is only one of each.
+        Names of the signals. A name may be omitted if the model has only one output or input.
 
     Returns
     -------
@@ -192,7 +193,7 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
     Raises
     ------
     ModelError
-        If a name is unknown, there are several signals and none is named, or zeros overflow.
+        If a name is unknown, a name is required but missing, or zeros overflow.
     """
     transfer = transfer_functions(model)
     pair = []
@@ -209,9 +210,9 @@ def zeros(model: Model, output: str | None = None, input: str | None = None) -> 
 
 
 def _principal_roots(polynomial: Polynomial, what: str) -> list[complex]:
-    """Return the roots of a sum of c s^p on the principal sheet, with their conjugates.
+    """Return the roots of a sum of c s^p on the principal Riemann sheet, with their conjugates.
 
-    ``what`` is "poles" or "zeros", for messages.
+    `what` is "poles" or "zeros" in messages. Raise ModelError if roots overflow or some were not found.
     """
     upper = zeros_of(polynomial, math.pi)
     if not _whole_orders(polynomial):
@@ -240,7 +241,7 @@ def _whole_orders(polynomial: Polynomial) -> bool:
 
 
 def _pole(w: complex) -> complex:
-    """Return s = exp(w), exactly real if w is on the negative real axis."""
+    """Return s = exp(w) for w = ln s; s is exactly real if Im w is 0 or pi."""
     if abs(w.imag) in (0.0, math.pi):
         return complex(math.copysign(math.exp(w.real), 1.0 if w.imag == 0.0 else -1.0))
     return cmath.exp(w)
@@ -266,14 +267,14 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
     Raises
     ------
     ModelError
-        Another coupling.
+        If `coupling` is unknown.
 
     Notes
     -----
     If the orders have a common base q, the roots lambda of the polynomial in s^q are stable for ``|arg lambda| > q
-    pi/2`` (Matignon 1996). Otherwise the number of zeros of the characteristic function D(s) with positive real part is
-    (p_max − p_min)/2 − Φ/π by the argument principle, where Φ is the change of arg D(jω) from ω = 0 to ∞, and p_max and
-    p_min are the highest and lowest power. Delays of inputs do not affect stability.
+    pi/2`` (Matignon 1996). Otherwise the argument principle gives the number of zeros of the characteristic function
+    D(s) with positive real parts, (p_max − p_min)/2 − Φ/π. Here Φ is the change of arg D(jω) from ω = 0 to ∞, and p_max
+    and p_min are the highest and lowest power of s in D. Delays of inputs do not affect stability.
     """
     coupled = is_coupled(coupling)
     unstable, on_axis, method, base = 0.0, False, "poles", None
@@ -282,7 +283,7 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
         if roots is not None:
             base, values = roots
             margin = np.abs(np.angle(values)) - base * math.pi / 2
-            # Companion matrices give simple roots to about 1e-9; closer to the axis than that is on it.
+            # Companion matrices give simple roots to about 1e-9; roots within 1e-7 rad of the axis count as on it.
             on_axis |= bool(np.any(np.abs(margin) <= 1e-7))
             unstable += float(np.sum(margin < -1e-7))
         else:
@@ -300,10 +301,11 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
 
 
 def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
-    """Return the number of zeros with a positive real part, and True if a zero is on the imaginary axis.
+    """Return the number of zeros with positive real parts, and whether a zero is on the imaginary axis.
 
-    The argument principle counts them. With another `angle` [rad], the zeros with a smaller argument are counted. On
-    the Riemann surface of ln s the angle may exceed pi.
+    The number follows from the argument principle; it is NaN if a zero is on the axis. With another `angle` [rad], the
+    zeros with abs(arg s) < angle are counted, and the axis is the ray arg s = angle. On the Riemann surface of ln s,
+    the angle may exceed pi.
     """
     lowest, highest = min(polynomial), max(polynomial)
     if highest - lowest < POWER_TOLERANCE:
@@ -312,13 +314,13 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     values = np.array(list(polynomial.values()))
 
     def shares(at: float, omega: float) -> float:
-        """Return the sum of the magnitudes of all other terms divided by the magnitude of the term with power `at`."""
+        """Return, at s = omega, the sum of the magnitudes of all other terms relative to the term with power `at`."""
         sizes = np.abs(values) * omega ** (powers - at)
         return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
 
     try:
         centre = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
-    except OverflowError:  # coefficients that ran away, over powers close to one another
+    except OverflowError:  # coefficients that differ much, with powers that differ little
         centre = math.exp(OVERFLOW_LOG_FREQUENCY)
     low, high = centre, centre
     while shares(lowest, low) > DOMINANCE_RATIO and low > 1e-300:
@@ -328,7 +330,10 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     log_omega = np.linspace(math.log(low), math.log(high), 2001)
 
     def curve(logs: Floats) -> tuple[Complex, Floats]:
-        """Return D(jω) divided by the sum of the magnitudes of its terms, and that sum relative to the largest term."""
+        """Return D(s) divided by the sum of the magnitudes of its terms, and this sum divided by its largest term.
+
+        D is the polynomial at s = ω exp(j angle), and `logs` are the values of ln ω.
+        """
         exponents = np.outer(powers, logs) + np.log(np.abs(values))[:, None]
         shift = exponents.max(axis=0)
         sizes = np.exp(exponents - shift)
@@ -355,22 +360,25 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
     return float(max(round(count), 0)), False
 
 
-#: Angle from the negative axis, also bounded by its uncertainty, below which a zero is a relaxation.
+#: Maximum angle [rad] between a relaxation and the negative real axis. The limit is smaller, 1.96 standard deviations
+#: of the angle, for a zero with a smaller uncertainty.
 REAL_AXIS_ANGLE_RAD = 0.02 * math.pi
-#: Maximum absolute ln of a frequency without overflow.
+#: Maximum abs(ln s) of a frequency without overflow.
 MAX_LOG_FREQUENCY = 700.0
-#: Half of the last printed digit of an order; smaller orders count as 0.
+#: Half of the last printed digit of an order; smaller absolute values count as 0.
 PRINTED_ORDER_TOLERANCE = 5e-5
-#: Maximum argument of zeros that give relaxations of a model without poles: D^0.5 y = -a y has one at arg s = 2 pi.
+#: Maximum argument of zeros that represent relaxations of a model without poles: D^0.5 y = -a y has a zero with
+#: arg s = 2 pi.
 MAX_SHEET_ANGLE_RAD = 2.0 * math.pi
-#: Increments of rounded orders whose polynomials give the seeds of Newton's method.
+#: Increments to which orders are rounded for the initial guesses of Newton's method, and maximum polynomial degree.
 SEED_ORDER_BASES = (0.25, 0.2, 0.1, 0.08, 0.05, 0.04, 0.03, 0.025, 0.02)
 MAX_SEED_DEGREE = 90
 #: Maximum number of Newton iterations, and maximum step in ln s.
 MAX_NEWTON_ITERATIONS, MAX_NEWTON_STEP = 60, 0.5
-#: Relative residual of the terms at a zero, and distance in ln s below which two zeros count as equal.
+#: Maximum sum of the terms at a zero, relative to the sum of their magnitudes, and distance in ln s below which two
+#: zeros count as equal.
 ZERO_TOLERANCE, DISTINCT_ZERO_TOLERANCE = 1e-10, 1e-7
-#: Relative step of numerical derivatives. Powers are rounded to nine decimals, a ten-thousandth of it.
+#: Relative step of numerical derivatives. It is 10^4 times the resolution of powers, which is 1e-9.
 POLE_DERIVATIVE_STEP_RATIO = 1e-5
 
 
@@ -381,18 +389,20 @@ class Mode:
     Parameters
     ----------
     pole
-        Pole [rad/s]: the upper one of a conjugate pair, or -1/T of a relaxation.
+        Pole [rad/s]: of a conjugate pair the one with positive imaginary part, of a stable relaxation -1/T with the
+        time constant T.
     frequency
         Natural frequency abs(pole) [rad/s].
     damping
-        Damping ratio -cos(arg pole): 1 for a relaxation, negative for an unstable mode.
+        Damping ratio -cos(arg pole): 1 for a stable relaxation, negative for an unstable mode.
     time_constant
         1/abs(Re pole) of an oscillation, 1/abs(pole) of a relaxation [s].
     oscillatory
-        Whether it is a complex pole pair. A relaxation is exponential for integer orders and a power of time for
-        others.
+        Whether the mode is a complex pole pair. A relaxation decays exponentially for integer orders, and as a power of
+        time for fractional orders.
     frequency_error, damping_error, time_constant_error
-        Standard errors from the covariance of the model; None without a covariance.
+        Standard errors from the parameter covariance of the model, in the units of the values; None without a
+        covariance.
     """
 
     pole: complex
@@ -422,7 +432,7 @@ class Mode:
 
 @check_arguments
 def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
-    """Return the modes of a model of any orders, slowest first: frequency, damping and time constant of its poles.
+    """Return the modes of a model, slowest first: frequency, damping and time constant of each pole.
 
     Parameters
     ----------
@@ -434,13 +444,13 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     Returns
     -------
     tuple of Mode
-        One mode per conjugate pair; poles at the origin are excluded. Standard errors are to first order from the
-        covariance of the fit.
+        One mode per real pole or conjugate pair; poles at the origin are excluded. Standard errors are first-order
+        approximations from the parameter covariance of the fit.
 
     Raises
     ------
     ModelError
-        An unknown coupling, or friction, for which poles are not defined.
+        If `coupling` is unknown, or the model has friction, for which poles are not defined.
 
     Notes
     -----
@@ -453,7 +463,7 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     coupled = is_coupled(coupling)
     result: list[Mode] = []
     for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
-        # A pole that underflows is one at the origin; one that overflows has no visible effect.
+        # A pole that underflows counts as a pole at the origin. A pole that overflows has no visible effect.
         sheet = [w for w in zeros_of(polynomial) or _relaxation_zeros(polynomial) if abs(w.real) < MAX_LOG_FREQUENCY]
         spreads = _standard_deviations(model, at, np.array(sheet), coupled=coupled)
         result += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
@@ -461,9 +471,9 @@ def modes(model: Model, *, coupling: str = "simulated") -> tuple[Mode, ...]:
 
 
 def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
-    """Return the mode of a zero w = ln s.
+    """Return the mode of a zero s of the characteristic function, given as w = ln s.
 
-    `spread` contains the standard deviations of Re w, Im w and ln abs(Re s).
+    `spread` contains the standard deviations of Re w, Im w and ln abs(Re s); None without a covariance.
     """
     size, angle = math.exp(w.real), w.imag
     # A poorly determined pole may be far from the real axis although its interval includes it, so the limit is fixed.
@@ -485,7 +495,10 @@ def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
 
 
 def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
-    """Return zeros outside the principal sheet as ln s, up to arg s = 2 pi or the first zero, whichever is farther."""
+    """Return the zeros of a sum of c s^p as ln s, up to arg s = 2 pi or up to the first zero, whichever is larger.
+
+    They represent relaxations of a model that has no zero on the principal Riemann sheet.
+    """
     powers = np.array(list(polynomial))
     gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
     zeros = zeros_of(polynomial, max(MAX_SHEET_ANGLE_RAD, math.pi / gap) + REAL_AXIS_ANGLE_RAD)
@@ -494,7 +507,7 @@ def _relaxation_zeros(polynomial: Polynomial) -> list[complex]:
 
 
 def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RAD) -> list[complex]:
-    """Return the zeros of a sum of c s^p as ln s, slowest first, with 0 <= Im <= reach, without s = 0."""
+    """Return the zeros of a sum of c s^p as ln s, slowest first, with 0 <= Im ln s <= reach [rad] and without s = 0."""
     powers = np.array(list(polynomial))
     lowest, highest = float(powers.min()), float(powers.max())
     if highest - lowest < POWER_TOLERANCE:
@@ -525,7 +538,7 @@ def zeros_of(polynomial: Polynomial, reach: float = math.pi + REAL_AXIS_ANGLE_RA
 
 
 def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
-    """Return initial guesses for zeros as ln s, from the sum with orders rounded to multiples of a base."""
+    """Return initial guesses for zeros as ln s, the roots of the sum with orders rounded to multiples of a base."""
     rounded: Polynomial = {}
     for power, value in polynomial.items():
         near = round(round(power / base) * base, 9)
@@ -540,9 +553,9 @@ def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
 
 
 def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
-    """Return initial guesses for zeros as ln s, from the sum of each pair of terms.
+    """Return initial guesses for zeros as ln s: for each pair of terms, the zeros of their sum.
 
-    They are accurate for distant zeros if orders are close.
+    The guesses are accurate for zeros of very small or large magnitude if orders differ little.
     """
     out = []
     for i, j in itertools.combinations(range(powers.size), 2):
@@ -555,7 +568,7 @@ def _two_term_zeros(powers: Floats, values: Floats, reach: float) -> Complex:
 
 
 def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
-    """Return the zeros to which Newton's method converges from the initial guesses `w`."""
+    """Return the zeros, as ln s, to which Newton's method converges from the initial guesses `w`."""
     if not w.size:
         return []
     for _ in range(MAX_NEWTON_ITERATIONS):
@@ -570,7 +583,7 @@ def _newton_zeros(w: Complex, powers: Floats, values: Floats) -> list[complex]:
 
 
 def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]:
-    """Return the terms of the sum at each ln s divided by the largest one, and the logarithm of its magnitude."""
+    """Return the terms c s^p at each w = ln s, divided by their largest magnitude m, and ln m."""
     exponents = np.outer(powers, w)
     largest = np.max(exponents.real + np.log(np.abs(values))[:, None], axis=0)
     return np.asarray(values[:, None] * np.exp(exponents - largest)), largest
@@ -579,9 +592,10 @@ def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]
 def _standard_deviations(
     model: Model, at: int, zeros: Complex, *, coupled: bool
 ) -> Sequence[tuple[float, float, float] | None]:
-    """Return, for each zero, the standard deviations of Re ln s, Im ln s and ln abs(Re s); None without a covariance.
+    """Return the standard deviations of Re ln s, Im ln s and ln abs(Re s) of each zero; None without a covariance.
 
-    They follow from d ln s = -dD / (dD/d ln s).
+    `zeros` are values of ln s at which the characteristic function D of the group `at` of coupled equations is 0. The
+    derivatives with respect to the parameters follow from d ln s = -dD / (dD/d ln s).
     """
     matrix = covariance_of(model)
     if matrix is None or not zeros.size:
@@ -591,7 +605,7 @@ def _standard_deviations(
     _, unit = _terms(zeros, np.array(list(own)), np.array(list(own.values())))
 
     def value(shifted: Model) -> tuple[Complex, Complex]:
-        """Return D and dD / d ln s at the zeros, divided by the largest term of the model."""
+        """Return D and dD / d ln s of a model with changed parameters at the zeros, relative to the largest term."""
         polynomial = characteristic(shifted, coupled=coupled)[at]
         powers = np.array(list(polynomial))
         terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
@@ -618,13 +632,14 @@ class SteadyState:
     Parameters
     ----------
     output, input
-        Names.
+        Names of the signals.
     gain
-        Final value of the output; 0 if it returns to 0, infinite if it grows without bound.
+        Final value of the output in SI units; 0 if the output returns to 0, infinite if it grows without bound.
     error
         Standard error of `rate`; None without a covariance.
     order
-        Exponent of the growth t^order: 0 for a finite gain, 1 for an integrator, negative if the output returns to 0.
+        Exponent of the growth t^order for large t: 0 for a finite gain, 1 for an integrator, negative if the output
+        returns to 0.
     rate
         Coefficient of t^order/Gamma(order + 1) for large t; the gain if the order is 0.
     order_error
@@ -647,12 +662,17 @@ def steady_states(model: Model) -> tuple[SteadyState, ...]:
     Parameters
     ----------
     model
-        A linear model.
+        Linear model whose equations are simulated together.
+
+    Returns
+    -------
+    tuple of SteadyState
+        One entry per output and input of the transfer functions that are not 0.
 
     Raises
     ------
     ModelError
-        An input that saturates or has a dead zone, or friction.
+        If an input has a saturation or dead zone, or the model has friction.
     """
     check_model(model)
     check_no_input_nonlinearity(model, "a steady state")
@@ -677,7 +697,7 @@ def steady_states(model: Model) -> tuple[SteadyState, ...]:
 
 
 def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return (order, coefficient) of the final behavior t^order of every step response, by output and input."""
+    """Return, by (output, input), the (order, rate) of each step response, as in :class:`SteadyState`."""
     transfer = transfer_functions(model)
     sensor = model.structure.sensor_filter
     out = {}
@@ -698,7 +718,7 @@ def _final_values(model: Model) -> dict[tuple[str, str], tuple[float, float]]:
 
 @check_arguments
 def dcgain(model: Model) -> Floats:
-    """Return the steady-state gain of every output from every input that is not itself an output.
+    """Return the steady-state gains from all inputs to all outputs; outputs do not count as inputs.
 
     Parameters
     ----------
@@ -708,13 +728,14 @@ def dcgain(model: Model) -> Floats:
     Returns
     -------
     ndarray, shape (outputs, inputs)
-        Gains in SI units of output over input. They are 0 if an input does not affect the output or its effect decays,
-        and infinite if it is integrated. Inputs are in the order of :func:`ftlm.analysis.transfer_functions`.
+        Gains in SI units of output over input. A gain is 0 if the input does not affect the output or its effect
+        decays, and infinite if the input is integrated. Inputs have the order of
+        :func:`ftlm.analysis.transfer_functions`.
 
     Raises
     ------
     ModelError
-        An input that saturates or has a dead zone, or friction.
+        If an input has a saturation or dead zone, or the model has friction.
     """
     states = steady_states(model)
     inputs = response_inputs(model, coupled=True)
@@ -725,9 +746,10 @@ def dcgain(model: Model) -> Floats:
 
 
 def settling_time(model: Model) -> float:
-    """Return a duration for response charts [s]: a few time constants of the slowest mode.
+    """Return a duration for response charts [s]: six time constants of the slowest mode plus the longest delay.
 
-    It is at most fifty periods of the fastest oscillation, so that a chart resolves the oscillation.
+    A time constant counts as at most twenty periods of its mode. Without the delay, the duration is at most fifty
+    periods of the fastest oscillation, so that a chart resolves this oscillation. A model without modes gives 10 s.
     """
     model_modes = modes(model)
     if not model_modes:

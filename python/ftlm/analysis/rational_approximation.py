@@ -27,16 +27,16 @@ MAX_GAIN_ERROR_DB, MAX_PHASE_ERROR_DEGREES = 1.0, 5.0
 COMPARISON_FREQUENCIES = 200
 #: Factor by which filters extend beyond the band on both sides, because their phase is inaccurate near their ends.
 BAND_EXTENSION_FACTOR = 100.0
-#: Distance of a pole from the imaginary axis, relative to the lower end of the band, below which it is on the axis.
+#: Distance of a pole from the imaginary axis, relative to the lower end of the band, below which it counts as on it.
 ORIGIN_POLE_RATIO = 1e-3
-#: Maximum order of Oustaloup's filter. Beyond it neighboring zeros and poles nearly cancel.
+#: Maximum order of Oustaloup's filter. At higher orders, adjacent zeros and poles nearly cancel.
 MAX_APPROXIMATION_ORDER = 50
 #: Order of the Padé approximation of a delay.
 PADE_ORDER = 4
 
 
 def identifier(name: str) -> str:
-    """Return a name changed so that it is valid in MATLAB, Python and python-control."""
+    """Return an identifier for a name that is valid in MATLAB, Python and python-control."""
     plain = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")[:60]
     return plain if plain and plain[0].isalpha() else f"x_{plain}"
 
@@ -52,15 +52,15 @@ class Approximation:
     outputs, inputs
         Signal names.
     band
-         Frequency band of the approximation [rad/s].
+        Frequency band (low, high) of the approximation [rad/s].
     order
         Order of Oustaloup's filter; each fractional operator has 2 order + 1 poles.
     gain_error, phase_error
-        Maximum gain error [dB] and phase error [degrees] over the band, by output and input.
+        Maximum gain error [dB] and phase error [degrees] over the band, by (output, input).
     stable
         Whether the approximation is stable.
     warnings
-        Warnings about limits of its use.
+        Warnings about limits of the approximation, as sentences.
     """
 
     a: Floats
@@ -99,9 +99,9 @@ class Approximation:
 
 
 def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
-    """Return poles, residues and direct gain of Oustaloup's filter for s^power, 0 < power < 1.
+    """Return (p, r, gain) of Oustaloup's filter gain + sum of r_k / (s + p_k) for s^power, 0 < power < 1.
 
-    Source: doi:10.1109/81.817385.
+    `band` is (low, high) [rad/s]; p and r have 2 order + 1 elements. Source: doi:10.1109/81.817385.
     """
     low, high = band
     k = np.arange(-order, order + 1) + order
@@ -110,7 +110,7 @@ def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floa
     zeros = low * ratio ** ((k + 0.5 * (1 - power)) / count)
     roots = low * ratio ** ((k + 0.5 * (1 + power)) / count)
     gain = high**power
-    # Residues as products of quotients: neither numerator nor denominator is ever formed.
+    # Each residue is a product of quotients, without the polynomials of numerator and denominator.
     differences = zeros[None, :] - roots[:, None]
     others = roots[None, :] - roots[:, None]
     np.fill_diagonal(others, 1.0)
@@ -118,12 +118,12 @@ def oustaloup(power: float, band: tuple[float, float], order: int) -> tuple[Floa
     return roots, residues, gain
 
 
-#: Signal inside the approximation: its coefficients, by kind and index of a state, an input or an output.
+#: Linear combination of states, inputs and outputs of the approximation: coefficients by (kind, index).
 _Signal = dict[tuple[Literal["state", "input", "output"], int], float]
 
 
 def _sum(signals: Iterable[tuple[float, _Signal]]) -> _Signal:
-    """Return the sum of signals, each multiplied by a factor."""
+    """Return the sum of factor * signal over (factor, signal) pairs."""
     total: _Signal = {}
     for factor, signal in signals:
         for source, value in signal.items():
@@ -132,7 +132,7 @@ def _sum(signals: Iterable[tuple[float, _Signal]]) -> _Signal:
 
 
 def _dense(signals: Sequence[_Signal], kind: str, width: int) -> Floats:
-    """Return the coefficients of states, inputs or outputs in signals as a matrix with one row per signal."""
+    """Return the coefficients of one kind ("state", "input", "output") in signals as a matrix, one row per signal."""
     matrix = np.zeros((len(signals), width))
     for i, signal in enumerate(signals):
         for (source, j), value in signal.items():
@@ -144,9 +144,9 @@ def _dense(signals: Sequence[_Signal], kind: str, width: int) -> Floats:
 def _filter_signal(
     states: list[_Signal], signal: _Signal, power: float, band: tuple[float, float], order: int
 ) -> _Signal:
-    """Add Oustaloup's filter for s^power to a signal, one state per pole, and return the filtered signal.
+    """Apply Oustaloup's filter for s^power to a signal, with one state per pole, and return the filtered signal.
 
-    `states` are the derivatives of the states. The derivatives of the filter's states are appended.
+    `states` has the time derivative of each state; those of the states of the filter are appended.
     """
     roots, residues, gain = oustaloup(power, band, order)
     parts = [(gain, signal)]
@@ -158,8 +158,11 @@ def _filter_signal(
 
 
 def _delay_input(states: list[_Signal], source: int, delay: float) -> _Signal:
-    """Add Padé's approximation of a delay [s] to an input, in observer form, and return the delayed signal."""
-    # Coefficients of sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k, x = -s tau above and + below.
+    """Apply Padé's approximation of a delay [s] to the input with index `source`, and return the delayed signal.
+
+    The states are in observer form, and their time derivatives are appended to `states`.
+    """
+    # Numerator and denominator are sum (2n-k)! n! / ((2n)! k! (n-k)!) x^k with x = -s tau and x = s tau.
     f, n = math.factorial, PADE_ORDER
     c = [f(2 * n - k) * f(n) / (f(2 * n) * f(k) * f(n - k)) for k in range(n + 1)]
     below = [c[k] * delay**k / (c[n] * delay**n) for k in range(n)]
@@ -180,7 +183,7 @@ def approximate(model: Model, *, band: tuple[float, float], order: int = 5) -> A
     Parameters
     ----------
     model
-        The model; its equations are coupled, with all signals but the outputs as inputs.
+        The model; its equations are coupled, with all signals except the outputs as inputs.
     band
         Frequency band (low, high) of the approximation [rad/s], 0 < low < high.
     order
@@ -232,20 +235,26 @@ def state_space_matrices(
     Parameters
     ----------
     model
-        A linear model. A model of integer orders is represented exactly.
+        A linear model. Integer orders are represented exactly.
     delays
         Delays of inputs [s] by name, which are approximated.
     reach, count
-        Frequency band [rad/s] and order of the filters that approximate fractional orders.
+        Frequency band (low, high) [rad/s] and order of the filters that approximate fractional orders.
+
+    Raises
+    ------
+    ModelError
+        If an input order is above the order of its equation, or the equations form an algebraic loop.
     """
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
     states: list[_Signal] = []
     sources: dict[str, _Signal] = {o: {("output", i): 1.0} for i, o in enumerate(outputs)}
     for i, name in enumerate(inputs):
         sources[name] = _delay_input(states, i, delays[name]) if delays.get(name) else {("input", i): 1.0}
-    # D^alpha y = sum of c D^nu s becomes y = sum of c s^-ceil(eta) (filter for the rest) s. The integrators of an
-    # equation form one chain that adds up what every term feeds in (observer form): none runs away by itself, and what
-    # a model does at rest and far below the band stays exact.
+    # With eta = alpha - nu, the equation D^alpha y = sum of c D^nu x over signals x becomes
+    # y = sum of c s^-ceil(eta) s^(ceil(eta) - eta) x, where a filter approximates the fractional power. The integrators
+    # of an equation form one chain, to which all terms are added (observer form). No integrator is unstable by itself,
+    # and the model is exact at steady state and far below the band.
     filters: dict[tuple[str, float], _Signal] = {}
     read: list[_Signal] = []
     for item in model.equations:
@@ -283,7 +292,7 @@ def state_space_matrices(
 
 
 def _with_errors(model: Model, system: Approximation) -> Approximation:
-    """Return the approximation with its gain and phase errors, stability, and warnings."""
+    """Return the approximation with its gain and phase errors, stability and warnings set."""
     low, high = system.band
     omega = np.geomspace(low, high, COMPARISON_FREQUENCIES)
     exact = frequency_response(model, omega, sensor=False)
@@ -327,8 +336,8 @@ def to_control(model: Model, *, band: tuple[float, float], order: int = 5) -> An
     Returns
     -------
     control.StateSpace
-        System with named inputs and outputs. Its attribute ``approximation`` is the :class:`Approximation`, which has
-        the errors.
+        System with named inputs and outputs. Its attribute ``approximation`` is the :class:`Approximation` with the
+        errors.
 
     Warns
     -----

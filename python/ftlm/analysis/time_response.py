@@ -19,18 +19,18 @@ from ftlm.errors import FtlmError
 from ftlm.model.model import Model, check_model
 from ftlm.utils.validation import Floats, as_floats
 
-#: Default number of time points.
+#: Number of time points if the user gives none.
 DEFAULT_TIME_POINTS = 401
-#: Step of the difference quotient along each direction of the covariance, in standard deviations. It is far above the
-#: refinement tolerance (1e-6), and small enough for a significant parameter to keep its sign.
+#: Step of the difference quotient along each eigenvector of the covariance, in standard deviations. The change of the
+#: response is then far above the tolerance of the simulation (1e-6), and significant parameters keep their signs.
 DEVIATION_STEP_RATIO = 0.1
-#: Variance of a direction, relative to the largest in normalized units, below which it is neglected.
+#: Variance along an eigenvector of the correlation matrix, relative to the largest, below which it is neglected.
 MIN_VARIANCE_RATIO = 1e-12
 
 
 @dataclass(frozen=True)
 class Response:
-    """Responses of every output to a unit step, or a unit impulse, of every input.
+    """Responses of all outputs to a unit step, or a unit impulse, of each input.
 
     Parameters
     ----------
@@ -39,13 +39,12 @@ class Response:
     outputs, inputs
         Signal names.
     time
-         Time points [s], shape (N,). For an impulse they are centers of sampling intervals, and the
-        values are means over the intervals. The means are finite even if orders below 1 make the response infinite at
-        0.
+        Time points [s], shape (N,). For an impulse they are centers of sampling intervals, and the values are means
+        over the intervals. The means are finite even if orders below 1 make the response infinite at 0.
     values
-        Responses of shape (outputs, inputs, N).
+        Responses, shape (outputs, inputs, N), in SI units of output over input.
     deviation
-        Standard deviation of the values from the covariance of the model, to first order; None without a covariance.
+        Standard deviation of the values from the covariance of the model, to first order; None if it is not available.
     """
 
     kind: str
@@ -68,12 +67,17 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
     kind
         ``"step"`` or ``"impulse"``.
 
+    Returns
+    -------
+    Response
+        Response with its standard deviation.
+
     Raises
     ------
     DataError
         If the time points are not uniform from 0.
     ModelError
-        An input that saturates or has a dead zone.
+        If an input has a saturation or dead zone.
     ConvergenceError
         If the response of an unstable model overflows.
     """
@@ -92,9 +96,10 @@ def response(model: Model, time: ArrayLike | None = None, *, kind: str = "step")
 
 
 def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
-    """Return the standard deviation of a response to first order; None without a covariance.
+    """Return the standard deviation of a response to first order, shape (outputs, inputs, N).
 
-    The response is simulated for a change of one standard deviation along each eigenvector of the covariance.
+    The response is simulated for small parameter changes along each eigenvector of the covariance. The result is None
+    without a finite covariance, with friction, or if a changed model is not valid.
     """
     matrix, numbers = covariance_of(model), parameter_vector(model)
     if matrix is None or model.structure.has_friction:
@@ -108,7 +113,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
     scaled = matrix[np.ix_(rows, rows)] / np.outer(size[rows], size[rows])
     weights, directions = np.linalg.eigh(scaled)
     total: Floats = np.zeros(1)
-    # Without its estimate, the model is simulated alone, without the uncertainty band.
+    # A model without an estimate is simulated without an uncertainty band.
     bare = replace(model, estimate=None)
     for weight, direction in zip(weights.tolist(), directions.T, strict=True):
         if weight <= MIN_VARIANCE_RATIO * float(weights[-1]):
@@ -120,7 +125,7 @@ def _deviation(model: Model, time: Floats, *, impulse: bool) -> Floats | None:
                 step_response(with_parameter_vector(bare, numbers + side), time) for side in (shift, -shift)
             )
         except FtlmError:
-            # A change by a tenth of a standard deviation gives no valid model, so there is no band.
+            # The model with parameters changed by a tenth of a standard deviation is not valid.
             return None
         change = (above - below) / (2 * DEVIATION_STEP_RATIO)
         total = total + (np.diff(change) / (time[1] - time[0]) if impulse else change) ** 2

@@ -52,11 +52,11 @@ class RunArguments:
     window
         Data window: the argument ``window`` of :meth:`ftlm.Run.from_arrays`.
     labels, time_label
-        Names of the signals and of the time in error messages.
+        Names of signals and time in error messages.
     known_step
-        Step that the file header states [s].
+        Step in the header of the file [s]; None if the file states none.
     notes, metadata
-        Notes on earlier processing, and metadata on the origin of the data.
+        Notes on earlier processing, and metadata about the origin of the data.
     """
 
     inputs: Mapping[str, object]
@@ -77,11 +77,11 @@ class RunArguments:
     missing: str = "refuse"
 
     def label_of(self, signal: str) -> str:
-        """Return the name of a signal in error messages."""
+        """Return the name that error messages use for a signal."""
         return self.labels.get(signal, f"signal {signal!r}")
 
     def checked_fields(self) -> dict[str, Any]:
-        """Return the fields of the run after validation of names, numbers, time, window, values and spacing.
+        """Validate names, numbers, time, window and values, and return the fields of the run.
 
         Raises
         ------
@@ -103,7 +103,7 @@ class RunArguments:
         clock = self._time_axis(vectors)
         first, last = self._rows(clock.times)
         if last - first < clock.times.size:
-            # Copies: a view would keep the rest in memory, and could be written to.
+            # A view would keep the other rows in memory, and would be writable through its base array.
             vectors = {s: vector[first:last].copy() for s, vector in vectors.items()}
         data = self._values(vectors, units, first, missing)
         times, facts = clock.times[first:last], self.notes + clock.notes
@@ -146,9 +146,10 @@ class RunArguments:
     def _insert_missing_samples(
         self, times: Floats, data: dict[str, Floats], missing: MissingPolicy, first: int
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Return times and data with rows inserted where a regular time grid has gaps.
+        """Return times [s] and data with rows of NaN inserted in the gaps of a regular time grid.
 
-        They are returned unchanged if the existing rows do not lie on a regular grid.
+        Times and data are returned unchanged if the rows do not lie on a regular grid. Raise DataError if inputs are
+        unknown in a gap and `missing` is not "hold". Rows in messages are counted from `first`.
         """
         grid = grid_positions(times)
         if grid is None or grid[0].size == grid[0][-1] + 1:
@@ -173,7 +174,10 @@ class RunArguments:
     def _fill_input_gaps(
         self, data: dict[str, Floats], behavior: Mapping[str, Intersample]
     ) -> tuple[dict[str, Floats], tuple[str, ...]]:
-        """Return data with missing input samples filled, and notes on the missing samples of all signals."""
+        """Return data with missing input samples filled, and notes on the missing samples of all signals.
+
+        Raise DataError if an output has fewer than three samples, or the first sample of an input is missing.
+        """
         notes, out = [], dict(data)
         for name, values in data.items():
             is_missing = missing_mask(values)
@@ -214,7 +218,7 @@ class RunArguments:
             raise DataError(f"{parameter('step')} and {parameter('time')}: {reason}; pass exactly one of them")
 
     def _time_axis(self, vectors: Mapping[str, Floats]) -> _TimeAxis:
-        """Return the time axis; raise DataError if the signals differ in length."""
+        """Return the time axis; raise DataError if step, time or time unit is invalid, or lengths differ."""
         lengths = {self.label_of(s): vector.size for s, vector in vectors.items()}
         if self.time is None:
             if self.time_unit != "s":
@@ -246,7 +250,10 @@ class RunArguments:
         return clock
 
     def _rows(self, times: Floats) -> tuple[int, int]:
-        """Return the (start, stop) rows inside the data window."""
+        """Return the index of the first row inside the data window, and the index after its last row.
+
+        Raise DataError if the window is invalid or contains fewer than three rows.
+        """
         first, last = 0, times.size
         if self.window is not None:
             first, last = window_rows(times, self.window, "window", self.time_label)
@@ -261,9 +268,10 @@ class RunArguments:
     def _values(
         self, vectors: Mapping[str, Floats], units: Mapping[str, tuple[str, float]], first: int, missing: MissingPolicy
     ) -> dict[str, Floats]:
-        """Return the signals in SI units, with NaN at missing samples.
+        """Return the signals converted to SI units by (SI unit, factor) pairs, with NaN at missing samples.
 
-        Raise DataError for missing samples that are not allowed, and for values that are not finite.
+        Raise DataError for missing samples that `missing` does not allow, and for infinite or too large values. Rows in
+        messages are counted from `first`.
         """
         data: dict[str, Floats] = {}
         for signal, vector in vectors.items():
@@ -284,7 +292,7 @@ class RunArguments:
 
 @dataclass(frozen=True)
 class _TimeAxis:
-    """Sample times [s], the step if the user gave it, the resolution of the times [s], and notes."""
+    """Sample times [s], the step [s] if the user gave it, the rounding error of the times [s], and notes."""
 
     times: Floats
     step: float | None
@@ -293,7 +301,10 @@ class _TimeAxis:
 
 
 def describe_resampling(since: Floats, step: float, first: int, how: str) -> str:
-    """Return a sentence on a resampling: new step, old intervals and method."""
+    """Return a sentence on a resampling to `step` [s]: range of the original intervals, widest interval and method.
+
+    `since` are the original sample times [s]. Rows are counted from `first`, and `how` describes the method.
+    """
     intervals = np.diff(since)
     return (
         f"resampled to {step:.12g} s from intervals of {intervals.min():.6g} to {intervals.max():.6g} s, the widest "

@@ -86,7 +86,7 @@ def arguments_from_frame(
 
 
 def _stated_units(frame: object, columns: Mapping[str, Hashable]) -> dict[str, str]:
-    """Return the units by signal that the attributes of a frame or of its columns state; unknown units are omitted."""
+    """Return the units in the attributes of a frame or of its columns, by signal; unknown units are omitted."""
     whole = getattr(frame, "attrs", {}).get("units")
     units_by_column = dict(whole) if isinstance(whole, Mapping) else {}
     for column in set(columns.values()).intersection(_columns_of(frame)):
@@ -116,7 +116,7 @@ def _columns_of(frame: object) -> list[Hashable]:
 
 
 def _index_of(frame: object) -> tuple[Hashable, object] | None:
-    """Return name and values of the row index of a frame; None unless there is exactly one index."""
+    """Return name and values of the row index of a frame, or of the only dimension of an xarray dataset; else None."""
     sizes = getattr(frame, "sizes", None)
     if isinstance(frame, Mapping) and isinstance(sizes, Mapping):
         only = next(iter(sizes), None)
@@ -128,12 +128,12 @@ def _index_of(frame: object) -> tuple[Hashable, object] | None:
 
 
 def _is_time_index(name: Hashable, values: object) -> bool:
-    """Whether an index is a time axis, because of its name or because it contains dates."""
+    """Whether an index is a time axis: its name is t, time or seconds, or it contains dates or time differences."""
     return (isinstance(name, str) and is_time_name(name)) or as_seconds(values, "time (the index)") is not None
 
 
 def frame_of(run: Run) -> Any:
-    """Return a run as a pandas DataFrame indexed by time."""
+    """Return a run as a pandas DataFrame indexed by time [s]; raise ModelError if pandas is not installed."""
     pandas = optional_module("pandas", "pandas", "pandas")
     index = pandas.Index(run.start + run.time, name=CSV_TIME)
     frame = pandas.DataFrame({name: run[name].copy() for name in run.signals}, index=index)
@@ -142,7 +142,7 @@ def frame_of(run: Run) -> Any:
 
 
 def dataset_of(run: Run) -> Any:
-    """Return a run as an xarray dataset indexed by time."""
+    """Return a run as an xarray dataset indexed by time [s]; raise ModelError if xarray is not installed."""
     xarray = optional_module("xarray", "xarray", "xarray")
     signals = {}
     for name in run.signals:
@@ -160,16 +160,17 @@ def _frame_attributes(run: Run) -> dict[str, Any]:
 CSV_MARK = "# ftlm-run "
 CSV_VERSION = 1
 UTF8_BOM = b"\xef\xbb\xbf"
-#: Bound on the first line: a file without line breaks would otherwise be read into memory whole.
+#: Maximum length of the first line; without it, a file without line breaks would be read into memory as a whole.
 MAX_HEADER_BYTES = 1 << 20
-#: Note in files of runs with nonuniform samples, which only hold the resampled grid.
+#: Note in files of runs with nonuniform samples: the files contain only the samples on the uniform grid.
 OWN_TIMES_OMITTED_NOTE = "written on its grid: the times at which outputs were read stayed behind"
 
 
 class Header(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Header that ftlm writes into run files, ``VERSION JSON`` with these fields as keys.
+    """Header of a run file written by ftlm: the text ``VERSION JSON``; the keys of the JSON object are the fields.
 
-    It is the first line of a csv file, or metadata of a parquet file.
+    It is the first line of a csv file, or metadata of a parquet file. Fields are those of :class:`ftlm.Run`; `about` is
+    its metadata, and `missing` has the names of outputs with missing samples.
     """
 
     name: str
@@ -218,7 +219,10 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def read(cls, path: Path, where: str, text: str) -> Header:
-        """Return the header from its text; raise DataError if it is corrupt or of a later version."""
+        """Return the header from its text; raise DataError if it is corrupt or has another version.
+
+        `where` is the position of the header in the file, for messages. The start time is set to 0.
+        """
         version, _, body = text.partition(" ")
         if version.strip() != str(CSV_VERSION):
             raise DataError(
@@ -239,7 +243,7 @@ class Header(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def header_of_line(path: Path, line: bytes) -> Header | None:
-    """Return the header in the first line of a text file; None if ftlm did not write it."""
+    """Return the header in the first line of a text file; None if the line is not a header of ftlm."""
     text = line.removeprefix(UTF8_BOM).decode("utf-8", errors="replace")
     return (
         Header.read(path, "line 1", text.removeprefix(CSV_MARK)) if f"{text.rstrip()} ".startswith(CSV_MARK) else None
@@ -273,7 +277,7 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool) -> Non
 
 
 def digest(columns: Mapping[str, Floats], header: str) -> str:
-    """Return the SHA-256 digest of the columns of a run and its header; the isolated reader computes the same."""
+    """Return the SHA-256 digest of the header and the columns of a run; the isolated reader verifies it."""
     digest = hashlib.sha256(header.encode())
     for name, values in columns.items():
         digest.update(f"\0{name}\0{len(values)}\0".encode())
@@ -288,10 +292,10 @@ def _columns(run: Run) -> dict[str, Floats]:
 def _source_time(run: Run) -> Floats:
     """Return the time of every sample on the time axis of the measured file [s].
 
-    Times are rounded to nine digits below the sampling interval, unless a float cannot hold these digits.
+    Times are rounded to 1e-9 of the sampling interval or finer, unless a float cannot represent so many digits.
     """
     exact = run.start + uniform_times(run.length, run.step)
-    # Nine digits below the step suffice; the header holds the exact step.
+    # A resolution of 1e-9 of the step suffices, because the header contains the exact step.
     digits = 9 - math.floor(math.log10(run.step))
     if not 0 <= digits <= 15 or np.abs(exact).max() * 10.0**digits >= 2.0**53:
         return exact

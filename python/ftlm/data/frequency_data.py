@@ -14,7 +14,7 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, real_number
 
-#: Accepted frequency units and their angular frequency [rad/s]; lower-case m means milli.
+#: Angular frequency [rad/s] of one unit, by accepted frequency unit; lower-case m means milli.
 FREQUENCY_UNITS: dict[str, float] = {
     "rad/s": 1.0,
     "Hz": 2 * math.pi,
@@ -27,7 +27,7 @@ FREQUENCY_UNITS: dict[str, float] = {
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class FrequencyData:
-    """Frequency response that was measured from one input to one output; :meth:`from_arrays` builds it.
+    """Measured frequency response from one input to one output; :meth:`from_arrays` creates it from arrays.
 
     Parameters
     ----------
@@ -36,16 +36,16 @@ class FrequencyData:
     response
         Complex response, shape (N,), finite: output over input.
     deviation
-        Standard deviation of the real part and of the imaginary part at each frequency, shape (N,), above 0; None if
-        unknown.
+        Standard deviation of the real part, equal to that of the imaginary part, at each frequency, shape (N,), above
+        0; None if unknown.
     output, input
-        Names of the output and the input; "" stands for the only output or input of the structure.
+        Names of the output and the input; "" means the only output or input of the structure.
     unit
         Unit of the response, such as "Ω".
     name
         Name of the data in reports.
     warnings
-        Assumptions that were made when the file was read.
+        Assumptions of the reader of the file, as sentences.
 
     Raises
     ------
@@ -130,14 +130,14 @@ class FrequencyData:
 
     @property
     def phase(self) -> Floats:
-        """Phase of the response [degrees], shape (N,), unwrapped in the order of the frequencies."""
+        """Phase of the response [degrees], shape (N,), unwrapped from the lowest to the highest frequency."""
         order = np.argsort(self.frequency, kind="stable")
         out = np.empty(order.size)
         out[order] = np.degrees(np.unwrap(np.angle(self.response[order])))
         return out
 
     def slice(self, low: float | None = None, high: float | None = None) -> FrequencyData:
-        """Return the data between two angular frequencies, both included.
+        """Return the data from one angular frequency to another, both included.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ class FrequencyData:
 
     @property
     def pair(self) -> str:
-        """Output and input as text, such as ``y from u``; the name of the data if they have none."""
+        """Output and input as text, such as ``y from u``; the name of the data if one of them is not named."""
         return f"{self.output} from {self.input}" if self.output and self.input else self.name
 
     def __str__(self) -> str:
@@ -186,7 +186,7 @@ class FrequencyData:
 
 
 def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
-    """Return one or several frequency responses as a tuple; raise DataError for other types."""
+    """Return one or several frequency responses as a tuple; raise DataError for other types or an empty sequence."""
     items = (data,) if isinstance(data, FrequencyData) else data
     if not isinstance(items, Sequence) or isinstance(items, str):
         raise DataError(
@@ -201,7 +201,7 @@ def as_frequency_data(data: object) -> tuple[FrequencyData, ...]:
 
 
 def frequency_factor(unit: str) -> float:
-    """Return the angular frequency [rad/s] that corresponds to one unit of frequency; raise DataError if unknown."""
+    """Return the angular frequency [rad/s] of one `unit` of frequency; raise DataError for an unknown unit."""
     if unit not in FREQUENCY_UNITS:
         raise DataError(
             f"{parameter('frequency_unit', unit)} is unknown; the known ones are {', '.join(FREQUENCY_UNITS)}"

@@ -52,12 +52,12 @@ if TYPE_CHECKING:
 class Run:
     """One measured experiment: regular samples of named inputs and outputs in SI units.
 
-    A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create it and check the data once. Invalid
+    A run is immutable. `Run.from_arrays`, `Run.from_frame` and `ftlm.load` create runs and validate the data. Invalid
     data raise a `DataError` that names the signal, the first bad row (counted from 0), the number of bad rows and a
     remedy. Data are repaired, resampled or cut only on request, and `warnings` lists every such change.
 
-    Sample j has the outputs and inputs at t = j·step. Between samples, `intersample` defines an input: ``"zoh"`` (a
-    command, held until the next sample) or ``"foh"`` (a measured signal, linear).
+    Sample j contains inputs and outputs at t = j·step, j = 0, …, N − 1. Between samples, an input is constant
+    (`intersample` ``"zoh"``, a command) or linear (``"foh"``, a measured signal).
 
     Attributes
     ----------
@@ -73,8 +73,8 @@ class Run:
         Original samples at nonuniform times; None if all samples lie on the uniform grid. With nonuniform samples, the
         grid has interval means of zero-order-hold inputs and linear interpolations of all other signals.
     unmasked_run : Run or None
-        Original run, if outputs of this run are masked; its first samples determine the initial state. None without a
-        mask. Runs derived from this one do not inherit it.
+        Original run of a run with masked outputs; its first samples determine the initial state. None without a mask,
+        and for every run derived from this run.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Run:
 
     @classmethod
     def _from_checked(cls, **values: Any) -> Run:
-        """Return a run from validated fields, with read-only arrays and without data of unlisted signals."""
+        """Return a run from validated fields; arrays become read-only, and only data of its signals are kept."""
         run = object.__new__(cls)
         vars(run).update(values)
         samples = run.sample_times
@@ -144,22 +144,22 @@ class Run:
             Time between rows [s], > 0. Exactly one of `step` and `time` is given.
         time : array_like, shape (N,), optional
             Increasing time of every row in `time_unit`, or dates (datetime64, datetime), from which the first is
-            subtracted. It is regular if every row lies within 2 % of a step of its position on a regular grid. A mean
-            step that differs from a short decimal number only by rounding is replaced by this number.
+            subtracted. Every time must lie within 2 % of a step of its position on a regular grid, unless `resample`
+            is given. A mean step that differs from a short decimal only by rounding is replaced by this decimal.
         inputs, outputs : mapping of str to array_like, shape (N,), N ≥ 3
-            Signals by name: lists, NumPy arrays, pandas or polars series of real numbers up to 1e150 in size. `inputs`
-            may be empty; at least one output is required. A name begins with a letter or an underscore and consists of
-            letters, digits, ``_ . [ ]``.
+            Signals by name: lists, NumPy arrays, pandas or polars series of real numbers of magnitude up to 1e150.
+            `inputs` may be empty; at least one output is required. A name begins with a letter or an underscore and
+            consists of letters, digits, ``_ . [ ]``.
         units : mapping of str to str, optional
-            Unit of each signal, from which values are converted to SI. Signals without a unit are not converted.
+            Unit of each signal; values are converted from it to SI. Signals without a unit are not converted.
         intersample : mapping of str to {"zoh", "foh"}, optional
             Intersample behavior of an input; default ``"zoh"``.
         name : str, default "run"
             Name of the run in reports.
         resample : float, optional
             New step [s], to which the run is resampled: interval means of zero-order-hold inputs, linear interpolation
-            of all other signals. `warnings` lists it. Unless every new row is an original one, the original samples are
-            kept in `sample_times`: the output error is simulated with the original inputs and evaluated at the original
+            of all other signals. `warnings` lists this. Unless every new row is an original row, `sample_times` keeps
+            the original samples: the output error is simulated with the original inputs and evaluated at the original
             output times. Equation-error methods use the resampled signals.
         window : pair of float or None, optional
             Times (a, b) [s] since the first row: only rows with a ≤ t < b are used. The window is applied before any
@@ -167,10 +167,10 @@ class Run:
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
             Unit of `time`.
         missing : {"refuse", "weight", "hold"}, default "refuse"
-            Treatment of missing values: NaN, None in a list, masked values, rows that a regular `time`
-            lacks. ``"weight"``: missing outputs stay NaN and get no weight in output-error estimation and validation;
-            other methods raise. ``"hold"``: in addition, missing inputs hold their last value (linear interpolation
-            for ``"foh"``). `warnings` lists the missing samples.
+            Treatment of missing values: NaN, None in a list, masked values, gaps in a regular `time`. ``"refuse"``:
+            DataError. ``"weight"``: missing outputs stay NaN and get no weight in output-error estimation and
+            validation; other methods raise. ``"hold"``: in addition, missing inputs take their last value (linear
+            interpolation for ``"foh"``). `warnings` lists the missing samples.
 
         Returns
         -------
@@ -180,8 +180,8 @@ class Run:
         ------
         DataError
             If a signal is not one-dimensional, not real numbers, empty, shorter than three rows, not finite or too
-            large; if lengths differ; if a name, unit or behaviour is unknown or used twice; if time is not finite,
-            repeated, decreasing, jittered or has a gap; if `step` is not positive.
+            large; if lengths differ; if a name is invalid or used twice; if a unit or intersample behavior is unknown;
+            if time is not finite, repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
         arguments = RunArguments(
             as_mapping("inputs", {} if inputs is None else inputs),
@@ -220,22 +220,22 @@ class Run:
         Parameters
         ----------
         frame : frame
-            Columns are taken as ``frame[column]``.
+            Table whose columns are read as ``frame[column]``.
         time : hashable, optional
-            Time column, or the name of the frame's index. Default without `step`: the index if it holds dates or is
-            called t, time or seconds; for a dataset its only dimension.
+            Time column, or the name of the frame's index. Default without `step`: the index (for a dataset its only
+            dimension) if it contains dates or is called t, time or seconds.
         step : float, optional
             Time between rows [s], > 0.
         inputs, outputs : mapping of str to column, or list of str
-            Columns by signal name; a list names columns that keep their names.
+            Column of each signal; a list contains the names of columns that are also the names of the signals.
         units
-            As in `Run.from_arrays`. By default the units in ``frame.attrs["units"]`` by column, or in the ``attrs`` of
-            a column (``units`` or ``unit``).
+            As in `Run.from_arrays`. Default: the unit of the column in ``frame.attrs["units"]``, or in the ``attrs`` of
+            the column itself (``units`` or ``unit``).
         intersample, name, resample, window, missing
             As in `Run.from_arrays`.
         time_unit : {"s", "ms", "us", "min", "h"}, optional
-            Unit of the time column; default the unit in its name, as in ``time [ms]`` (with a warning), else s. A
-            contradicting name raises an error.
+            Unit of the time column; default the unit in its name, as in ``time [ms]`` (with a warning), else s. A name
+            with a different unit raises DataError.
 
         Returns
         -------
@@ -308,9 +308,9 @@ class Run:
 
     @property
     def missing_samples(self) -> dict[str, NDArray[np.bool_]]:
-        """Mask of missing samples by name, for every output that has any.
+        """Boolean mask of missing samples, by name of every output that has missing samples.
 
-        For nonuniform `sample_times`, samples are counted at these times.
+        The samples are those of `sample_times` if it is not None, otherwise those of the uniform grid.
         """
         data = self._data if self.sample_times is None else self.sample_times.data
         masks = {name: missing_mask(data[name]) for name in self.outputs}
@@ -319,7 +319,7 @@ class Run:
     def with_interpolated_gaps(self) -> Run:
         """Return a copy with linearly interpolated missing samples, for plots and data checks.
 
-        Estimation never uses it.
+        Estimation does not use this copy.
         """
         if not any(missing_mask(self._data[name]).any() for name in self.outputs):
             return self
@@ -327,7 +327,7 @@ class Run:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Metadata of the run, such as name, seed, input, parameters and faults of a rig. The dictionary is a copy."""
+        """Metadata, such as name, seed, input, parameters and faults of the rig. The dictionary is a copy."""
         return copy.deepcopy(self._metadata)
 
     def __getitem__(self, name: str) -> Floats:
@@ -364,7 +364,7 @@ class Run:
         )
 
     def window(self, start: float | None, stop: float | None) -> Run:
-        """Return the rows with start ≤ t < stop.
+        """Return a run of the rows with start ≤ t < stop.
 
         Parameters
         ----------
@@ -394,18 +394,18 @@ class Run:
         return self._with(_data=data, start=begin, sample_times=readings)
 
     def split(self, duration: float) -> list[Run]:
-        """Return consecutive runs that together have all rows, with equal lengths up to one row.
+        """Split this run into consecutive runs whose lengths differ by at most one row.
 
         Parameters
         ----------
         duration : float
-            Shortest duration of a piece [s], > 0; a piece has at least three rows. A run shorter than two such pieces
-            is returned whole.
+            Minimum duration of each returned run [s], > 0. Each has at least three rows. A run shorter than twice this
+            minimum is returned whole.
 
         Returns
         -------
         list of Run
-            Runs whose names contain the number of the piece, without the notes of the whole run.
+            Runs with ``piece k of n`` added to their names, and without the notes of this run.
 
         Raises
         ------
@@ -426,7 +426,7 @@ class Run:
 
         Zero-order-hold inputs ("zoh") take their mean over each new interval, which is exact. Inputs with "foh" and all
         outputs are interpolated linearly, without an anti-alias filter. `warnings` records the resampling. Unless every
-        new row is an original one, output-error fits and comparisons use the original outputs at their own times,
+        new row is an original row, output-error fits and comparisons use the original outputs at their original times,
         because interpolated values are not measurements.
 
         Parameters
@@ -454,10 +454,10 @@ class Run:
         return self._with(_data=data, step=new_step, notes=(*self.notes, fact), sample_times=readings)
 
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
-        """Return this run with the mean or the least-squares line of some signals subtracted.
+        """Return this run with the mean or the least-squares line of signals subtracted from them.
 
-        If a run does not end at its initial value, its mean contains part of the response. An offset in the structure
-        (``+ c``) estimates a constant offset without this bias. `warnings` records what was subtracted.
+        If an output does not return to its initial value, its mean contains part of the response. An offset in the
+        structure (``+ c``) estimates a constant offset without this bias. `warnings` records the subtracted trend.
 
         Parameters
         ----------
@@ -491,7 +491,7 @@ class Run:
         return self._with(_data=data, notes=tuple(facts), sample_times=readings)
 
     def with_input_nonlinearities(self, limits: Sequence[InputNonlinearity]) -> Run:
-        """Return this run with known saturations and dead zones applied to its inputs."""
+        """Return this run with the given saturations and dead zones, which must be fixed, applied to its inputs."""
         data, readings = dict(self._data), self.sample_times
         for limit in limits:
             data[limit.signal] = limit.apply(data[limit.signal])
@@ -500,19 +500,19 @@ class Run:
         return self._with(_data=data, sample_times=readings)
 
     def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
-        """Return this run with new samples of some of its signals.
+        """Return this run with some of its signals replaced by new samples.
 
         Parameters
         ----------
         samples : mapping of str to array
             New samples by name, shape (N,), in SI units. Only outputs may have missing (NaN or masked) samples.
         read : mapping of str to array, optional
-            New samples at the original times, for a run with `sample_times`.
+            New samples by name at the times of `sample_times`; ignored if the run has none.
 
         Raises
         ------
         DataError
-            If a name is not a signal of this run, its values are not N numbers, or values of an input are not finite.
+            If a name is not a signal of this run, the number of values differs, or a value of an input is not finite.
         """
         checked = self._checked_samples("samples", samples, self.length)
         readings = self.sample_times
@@ -522,11 +522,11 @@ class Run:
         return self._with(_data={**self._data, **checked}, sample_times=readings)
 
     def with_unmasked_run(self, run: Run) -> Run:
-        """Return this run, whose outputs are masked, with a reference to the original run for the initial state."""
+        """Return this run with `unmasked_run` set to the original run, whose first samples give the initial state."""
         return self._with(unmasked_run=run)
 
     def _checked_samples(self, argument: str, values_by_name: object, length: int) -> dict[str, Floats]:
-        """Return validated new samples of some signals by name; raise DataError if they do not fit this run."""
+        """Return new samples by signal as float arrays; raise DataError for a wrong name, length or value."""
         checked: dict[str, Floats] = {}
         for name, values in as_mapping(argument, values_by_name).items():
             if name not in self:
@@ -577,7 +577,7 @@ class Run:
         )
 
     def with_intersample(self, mapping: Mapping[str, str]) -> Run:
-        """Return this run with another intersample behavior of some inputs.
+        """Return this run with another intersample behavior for some inputs.
 
         Parameters
         ----------
@@ -591,7 +591,7 @@ class Run:
         Raises
         ------
         DataError
-            If a name is not an input or a behaviour is neither "zoh" nor "foh".
+            If a name is not an input or a value is neither "zoh" nor "foh".
         """
         behaviour = {**self._intersample, **check_intersample(mapping, self.inputs)}
         data = self._data if self.sample_times is None else self.sample_times.resample(behaviour, self.step)
@@ -634,7 +634,7 @@ class Run:
         )
 
     def select(self, names: Iterable[str]) -> Run:
-        """Return this run with only some of its signals.
+        """Return this run with only the given signals.
 
         Parameters
         ----------
@@ -671,7 +671,7 @@ class Run:
         Raises
         ------
         DataError
-            If a name is not an output of this run, or all its samples are equal.
+            If a name is not an output of this run, or all samples of the output are equal or missing.
         """
         for name in names_to_columns("names", names):
             if name not in self.outputs:
@@ -695,7 +695,7 @@ class Run:
                 raise bad_rows(thing, what, 0, values.size, way_out)
 
     def plot(self, *signals: str) -> Figures:
-        """Return plots of signals over time, outputs first, which notebooks show; see also ``ftlm.plot.run``.
+        """Return plots of the given signals (default all) over time, outputs first; see also ``ftlm.plot.run``.
 
         Raises
         ------
@@ -729,24 +729,24 @@ class Run:
         return advise(self, structure)
 
     def inspect(self) -> Inspection:
-        """Return range, noise, quantization and initial rest of every signal of this run.
+        """Return statistics of every signal, such as range, noise, quantization and whether it starts at zero.
 
         Returns
         -------
         Inspection
-            Statistics that print as a table.
+            Statistics of all signals, printed as a table.
         """
         from ftlm.validation.data_advice import inspect_run
 
         return inspect_run(self)
 
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write this run to a csv file that `ftlm.load` reads back bit for bit, without `inputs` and `outputs`.
+        """Write this run to a csv file, which `ftlm.load` reads back bit for bit and without further arguments.
 
         The first line is a comment, ``# ftlm-run 1`` and a JSON object with name, step, start, inputs, outputs, units,
-        intersample and warnings, and ``about`` for a run of a rig. A header ``t_s,…`` and the samples follow, with
-        ``nan`` for missing outputs. Only the samples on the grid are written, not `sample_times`. The file is written
-        under a temporary name and renamed, so that readers never see an incomplete file.
+        intersample and warnings. A run with metadata also has ``about``. A header ``t_s,…`` and the samples follow,
+        with ``nan`` for missing outputs. Only the samples on the grid are written, not `sample_times`. The file is
+        written under a temporary name and renamed, so that readers never see an incomplete file.
 
         Parameters
         ----------
@@ -788,7 +788,7 @@ class Run:
     def to_frame(self) -> Any:
         """Return the run as a pandas DataFrame: one column per signal in SI units, indexed by ``t_s`` [s].
 
-        `Run.from_frame` converts it back. Its ``attrs`` contain units, inputs, outputs, intersample and name.
+        `Run.from_frame` converts the frame back. Its ``attrs`` contain units, inputs, outputs, intersample and name.
 
         Returns
         -------
@@ -843,14 +843,14 @@ def _restore_run(values: Mapping[str, Any]) -> Run:
     return Run._from_checked(**values)
 
 
-#: Cached results per set of runs: those of the single equations and of the whole structure.
+#: Maximum number of cached results per set of runs, enough for each equation and the whole structure.
 MAX_CACHED_RESULTS = 8
 
 
 def check_compatible(runs: Iterable[Run]) -> None:
-    """Raise DataError if runs differ in inputs, outputs or units.
+    """Raise DataError if there is no run, or if runs differ in inputs, outputs or units.
 
-    Steps, lengths, intersample behavior and the sequence of signals may differ.
+    Runs may differ in step, length, intersample behavior and sequence of signals.
     """
     every = list(runs)
     if not every:
@@ -880,7 +880,7 @@ class Runs(tuple[Run, ...]):
     _cache: dict[str, tuple[Any, ...]]
 
     def __new__(cls, runs: Run | Iterable[Run]) -> Runs:
-        """Create the tuple after validation of the runs."""
+        """Return the tuple of validated runs; raise DataError as :func:`as_runs` does."""
         try:
             every = [runs] if isinstance(runs, Run) else list(runs)
         except TypeError:
@@ -902,9 +902,9 @@ class Runs(tuple[Run, ...]):
         return Runs, (tuple(self),)
 
     def get_or_compute(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
-        """Return the cached result for a key, or compute and cache it.
+        """Return the cached result for a key; if there is none, compute it by `make` and cache it.
 
-        The oldest entry is removed when the cache is full.
+        The oldest result is removed when the cache is full.
         """
         entry = self._cache.get(key)
         if entry is None:
@@ -915,7 +915,7 @@ class Runs(tuple[Run, ...]):
 
 
 def as_runs(runs: Run | Iterable[Run]) -> Runs:
-    """Return one or several runs as validated :class:`Runs`; an instance is returned unchanged.
+    """Return one or several runs as validated :class:`Runs`; an instance of :class:`Runs` is returned unchanged.
 
     Raises
     ------

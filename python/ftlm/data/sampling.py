@@ -32,12 +32,12 @@ ZERO_ORDER_HOLD: Intersample = "zoh"
 
 
 def uniform_times(rows: int, step: float) -> Floats:
-    """Return uniform sample times from 0 [s], shape (rows,)."""
+    """Return uniform sample times [s] that start at 0, shape (rows,); `step` is in seconds."""
     return np.arange(rows, dtype=np.float64) * step
 
 
 def make_read_only(values: Floats) -> Floats:
-    """Return a read-only view of an array, without a copy."""
+    """Return a read-only view of an array, which itself becomes read-only; a contiguous array is not copied."""
     owner = np.ascontiguousarray(values)
     if owner.flags.writeable:
         owner.setflags(write=False)
@@ -52,7 +52,7 @@ def is_constant(values: Floats) -> bool:
 
 
 def check_intersample(kinds: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
-    """Return the intersample behavior of every input; raise DataError for an unknown input or value."""
+    """Return the given intersample behaviors, by input; raise DataError for an unknown input or behavior."""
     checked: dict[str, Intersample] = {}
     for signal, kind in as_mapping("intersample", {} if kinds is None else kinds).items():
         if signal not in inputs:
@@ -70,7 +70,7 @@ def check_intersample(kinds: Mapping[str, str] | None, inputs: tuple[str, ...]) 
 
 
 def check_step(step: object, argument: str) -> float:
-    """Return a sampling interval [s]; raise DataError if it is not positive and finite."""
+    """Return a sampling interval [s] as a float; raise DataError unless it is a number from 1e-30 to 1e30."""
     value = as_number(step)
     if value is None:
         raise DataError(f"{parameter(argument, step)} is not a number; give the time between rows in s")
@@ -80,7 +80,7 @@ def check_step(step: object, argument: str) -> float:
 
 
 def as_number(value: object) -> float | None:
-    """Return a real number as a float, infinity on overflow, or None if the value is not a number."""
+    """Return a real number as a float, infinity on overflow; None if the value is a bool or not a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         return None
     try:
@@ -92,7 +92,7 @@ def as_number(value: object) -> float | None:
 def as_vector(values: object, thing: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
     """Return a float64 copy of a vector and its original dtype; raise DataError if it is not a vector of numbers.
 
-    With `gaps`, masked values and None become NaN.
+    With `gaps`, masked values and None become NaN. `thing` names the vector in error messages.
     """
     if gaps and isinstance(values, (list, tuple)):
         values = [np.nan if value is None else value for value in values]
@@ -119,15 +119,16 @@ def as_vector(values: object, thing: str, *, gaps: bool = False) -> tuple[Floats
 
 
 def as_seconds(values: object, thing: str) -> tuple[Floats, str] | None:
-    """Return dates or time differences as seconds, and a note; None for other types.
+    """Return dates or time differences as seconds, and a note on the subtracted date; None for other types.
 
-    The first date is subtracted from dates.
+    The first date is subtracted from all dates; time differences are only converted, with an empty note. Missing dates
+    and spans above 292 years raise DataError. `thing` names the time in error messages.
     """
     try:
         array = as_array(thing, values)
         first = array.flat[0] if array.dtype.kind == "O" and array.size else None
         if isinstance(first, datetime.date):
-            # Dates with a time zone are in universal time then, as pandas knows and NumPy does not.
+            # Dates with a time zone become UTC: a pandas series converts itself, other objects are converted here.
             plain = getattr(values, "dtype", None) is not None and array.dtype != getattr(values, "dtype", None)
             array = np.asarray(
                 values if plain else [_to_universal_time(moment) for moment in array.tolist()], "datetime64[ns]"
@@ -147,7 +148,7 @@ def as_seconds(values: object, thing: str) -> tuple[Floats, str] | None:
 
 
 def _to_universal_time(moment: Any) -> Any:
-    """Return a date with a time zone converted to UTC; other values are returned unchanged."""
+    """Return a date with a time zone as UTC without a time zone; return other values unchanged."""
     zone = getattr(moment, "tzinfo", None)
     return moment if zone is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
@@ -173,7 +174,7 @@ def _short(value: object) -> str:
 
 
 def check_lengths(lengths: Mapping[str, int]) -> None:
-    """Raise DataError if columns differ in length; the message names those that deviate from the most frequent one."""
+    """Raise DataError if lengths differ; the message names the first column without the most frequent length."""
     counts = list(lengths.values())
     expected = max(set(counts), key=lambda count: (counts.count(count), count))
     wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
@@ -186,7 +187,7 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
 
 
 def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Floats], Floats], str]:
-    """Return the mean or the least-squares line of a signal as a function of time [s], and as text."""
+    """Return the mean or least-squares line of a signal, as a function of time since its start [s] and as text."""
     is_present = ~np.isnan(values)
     mean = float(np.mean(values[is_present]))
     if not linear:
@@ -200,11 +201,10 @@ def fit_trend(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[F
 
 
 def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str | None = None) -> None:
-    """Raise DataError if values are not finite or their squares overflow.
+    """Raise DataError if values are not finite, or above 1e150 in magnitude, where squares overflow.
 
-    `thing` names the signal in the message, and ``offset`` is the number of the first row.
-
-    With `gaps`, NaN is accepted. ``instead`` is an additional remedy in the message on NaN.
+    In the message, `thing` names the signal, rows are counted from `offset`, and `instead` is a remedy for NaN. With
+    `gaps`, NaN is accepted.
     """
     with np.errstate(invalid="ignore"):
         if values.size == 0 or (values.min() >= -MAX_SAMPLE_VALUE and values.max() <= MAX_SAMPLE_VALUE):
@@ -231,13 +231,13 @@ def check_values(values: Floats, thing: str, offset: int, *, gaps: bool = False,
 
 
 def masked_rows_error(thing: str, what: str, is_bad: NDArray[np.bool_], remedy: str, offset: int = 0) -> DataError:
-    """Return the error on the rows at which a mask is True; ``offset`` is the number of the first row."""
+    """Return a DataError that names the first row where `is_bad` is True; rows are counted from `offset`."""
     rows = np.flatnonzero(is_bad)
     return bad_rows(thing, what, offset + int(rows[0]), rows.size, remedy)
 
 
 def check_increasing(clock: Floats, thing: str, offset: int) -> None:
-    """Raise DataError if sample times are not strictly increasing."""
+    """Raise DataError if sample times are not strictly increasing; rows are counted from `offset`."""
     steps = np.diff(clock)
     if (steps > 0).all():
         return
@@ -255,7 +255,21 @@ def regular_step(
 ) -> tuple[float, tuple[str, ...]]:
     """Return the step [s] of regular sample times, rounded to a short decimal, and notes on their jitter.
 
-    Raise DataError if the times are not regular.
+    Parameters
+    ----------
+    clock
+        Sample times [s], strictly increasing.
+    thing, offset
+        Name of the time in messages, and number of the first row.
+    resolution
+        Rounding error of the times [s].
+    stated_step
+        Step in the header of the file [s], which is then returned; None if it states none.
+
+    Raises
+    ------
+    DataError
+        If there is a gap, the jitter exceeds 2 % of a step, or the mean step contradicts the stated step.
     """
     count = clock.size - 1
     since = clock - clock[0]
@@ -299,7 +313,11 @@ def regular_step(
 
 
 def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
-    """Return the step with the fewest decimals that is consistent with the sample times, or the mean step."""
+    """Return the decimal with the fewest digits that agrees with the mean step, or the mean step if there is none.
+
+    A decimal agrees if `count` steps of this length differ from `count` mean steps by at most `rounding` [s]. If its
+    relative difference from the mean step is at most 1e-9, a total difference up to `observed` [s] is accepted.
+    """
     for digits in range(12):
         short = float(f"{mean:.{digits}e}")
         drift = abs(short - mean) * count
@@ -309,7 +327,11 @@ def _short_decimal(mean: float, count: int, rounding: float, observed: float) ->
 
 
 def window_rows(clock: Floats, window: object, argument: str, thing: str = "time") -> tuple[int, int]:
-    """Return the (start, stop) rows of a data window; raise DataError if the window is invalid."""
+    """Return the index of the first row inside a data window, and the index after its last row.
+
+    `window` is a pair of times [s] since the first row, or None for an open end. Raise DataError if it is invalid or
+    contains no row.
+    """
     if not isinstance(window, Sequence) or isinstance(window, str) or len(window) != 2:
         raise DataError(
             f"{parameter(argument, window)} is not a pair (start, stop) of seconds; use None for an open end"
@@ -355,7 +377,10 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
 
 
 def check_rows(since: Floats, step: float) -> int:
-    """Return the number of samples at a new step [s]; raise DataError if there are too many or too few."""
+    """Return the number of samples at a new step [s]; raise DataError if it is below 3 or above 50 million.
+
+    `since` are the original sample times [s since the first].
+    """
     spans = float(since[-1]) / step
     if spans + 1 > _MAX_RUN_SAMPLES:
         raise DataError(f"{parameter('resample', step)} gives more than {_MAX_RUN_SAMPLES} rows; use a larger step")
@@ -368,7 +393,7 @@ def check_rows(since: Floats, step: float) -> int:
 
 
 def rows_coincide(since: Floats, step: float) -> bool:
-    """Whether every row at a new step is an original sample on a regular grid, so that nothing is interpolated."""
+    """Whether the sample times `since` [s] are regular and every row at the new step [s] is an original sample."""
     own = float(since[-1]) / (since.size - 1)
     regular = np.abs(since - uniform_times(since.size, own)).max() <= _MAX_JITTER_SHARE * own
     return bool(regular) and abs(step / own - round(step / own)) * since.size <= _MAX_JITTER_SHARE and step > 0.5 * own
@@ -377,7 +402,7 @@ def rows_coincide(since: Floats, step: float) -> bool:
 def resample_uniform(
     since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
 ) -> dict[str, Floats]:
-    """Return signals resampled to another step [s].
+    """Return signals with sample times `since` [s], resampled to a uniform step [s]; see :func:`check_rows` for errors.
 
     Zero-order-hold inputs take interval means, and other signals are interpolated linearly.
     """
@@ -386,7 +411,7 @@ def resample_uniform(
 
 
 def describe_resampled_signals(behaviour: Mapping[str, Intersample], *, keep_times: bool) -> str:
-    """Return text on how each signal is resampled; `keep_times` means that outputs keep their original times."""
+    """Return text on how each signal is resampled; with `keep_times`, original output samples are kept as well."""
     signals = [signal for signal, kind in behaviour.items() if kind == ZERO_ORDER_HOLD]
     means = f"held: {', '.join(signals)}, by means over the new intervals; " if signals else ""
     if keep_times:
@@ -394,17 +419,17 @@ def describe_resampled_signals(behaviour: Mapping[str, Intersample], *, keep_tim
     return f"{means}others linear; no anti-alias filter"
 
 
-#: Treatment of missing samples: raise, give outputs no weight, or hold inputs as well.
+#: Treatment of missing samples: raise an error, give missing outputs no weight, or also fill missing inputs.
 MissingPolicy = Literal["refuse", "weight", "hold"]
 MISSING_POLICIES: tuple[MissingPolicy, ...] = ("refuse", "weight", "hold")
-#: Maximum distance from a grid point, in steps, of samples on a regular grid with gaps.
+#: Maximum distance of a sample from its grid point, in steps, for a regular grid with gaps.
 GRID_TOLERANCE_STEPS = 0.02
-#: Relative tolerance of comparisons of times, as a share of the duration.
+#: Tolerance of comparisons of times, relative to the duration.
 _RELATIVE_TIME_TOLERANCE = 1e-12
 
 
 def check_missing_policy(policy: object) -> MissingPolicy:
-    """Return the option for missing samples; raise DataError for an unknown value."""
+    """Return `policy` if it is a known treatment of missing samples; raise DataError otherwise."""
     for choice in MISSING_POLICIES:
         if policy == choice:
             return choice
@@ -425,7 +450,7 @@ def drop_missing(values: Floats) -> Floats:
 
 
 def interpolate_gaps(values: Floats) -> Floats:
-    """Return values with missing samples interpolated linearly, and set to the nearest value at the ends."""
+    """Return values with NaN replaced by linear interpolation, or by the nearest value at the ends."""
     is_missing = np.isnan(values)
     if not is_missing.any() or is_missing.all():
         return values
@@ -434,7 +459,7 @@ def interpolate_gaps(values: Floats) -> Floats:
 
 
 def fill_input_gaps(values: Floats, kind: Intersample) -> Floats:
-    """Return an input with missing samples filled: by the last value for "zoh", by interpolation for "foh"."""
+    """Return an input with NaN replaced by the last value for "zoh", by linear interpolation for "foh"."""
     if kind != ZERO_ORDER_HOLD:
         return interpolate_gaps(values)
     is_missing = np.isnan(values)
@@ -443,7 +468,7 @@ def fill_input_gaps(values: Floats, kind: Intersample) -> Floats:
 
 
 def grid_positions(times: Floats) -> tuple[NDArray[np.intp], float] | None:
-    """Return the index of each sample on a regular grid with gaps, and the step [s]; None if there is no such grid."""
+    """Return the grid index of each sample and the step [s] of a regular grid with gaps; None without such a grid."""
     since = times - times[0]
     usual = float(np.median(np.diff(since)))
     step = usual
@@ -475,7 +500,7 @@ class NonuniformSamples:
     data: dict[str, Floats]
 
     def indices_within(self, duration: float) -> NDArray[np.intp]:
-        """Return the indices of the samples within a duration [s] from the start."""
+        """Return the indices of the samples with times of at most `duration` [s], up to rounding."""
         return np.flatnonzero(self.times <= duration * (1.0 + _RELATIVE_TIME_TOLERANCE))
 
     def resample(self, behaviour: Mapping[str, Intersample], step: float) -> dict[str, Floats]:
@@ -495,7 +520,10 @@ class NonuniformSamples:
     def cut_window(
         self, behaviour: Mapping[str, Intersample], start: float, stop: float, step: float
     ) -> NonuniformSamples:
-        """Return the samples between two times [s], with an additional sample of the inputs at the start."""
+        """Return the samples with times from `start` to `stop` + `step` [s]; the new times are counted from `start`.
+
+        If there is no sample at `start`, a sample is added there, with values for the inputs and NaN for the outputs.
+        """
         tiny = 1e-9 * step
         rows = np.flatnonzero((self.times >= start - tiny) & (self.times <= stop + step))
         times, data = np.maximum(self.times[rows] - start, 0.0), {n: v[rows] for n, v in self.data.items()}
@@ -517,22 +545,22 @@ class NonuniformSamples:
 
 
 def has_too_few_values(values: Floats) -> bool:
-    """Whether fewer samples than the required number are not missing."""
+    """Whether fewer than three samples are present, that is, not NaN."""
     return int(np.sum(~np.isnan(values))) < MIN_RUN_SAMPLES
 
 
 def describe_missing(thing: str, is_missing: NDArray[np.bool_], what: str) -> str:
-    """Return a sentence on the missing samples of a signal and on their treatment."""
+    """Return a sentence on the number of missing samples of the signal `thing`, with their treatment `what`."""
     first, count = int(np.flatnonzero(is_missing)[0]), int(is_missing.sum())
     rows = "row holds" if count == 1 else "rows hold"
     return f"{thing}: {count} of {is_missing.size} {rows} no value, the first is row {first}; {what}"
 
 
-#: Maximum delay that is searched by default, in samples and as a share of a run.
+#: Maximum delay of a default search: in samples, and as a fraction of the length of the run.
 MAX_DELAY_SAMPLES, MAX_DELAY_SHARE = 60, 1.0 / 12.0
 
 
 def longest_delay(length: int, step: float) -> float:
     """Return the default upper limit of a delay search [s]: 60 samples, or a twelfth of the run if that is less."""
-    # Three digits, since the range is a part of a structure's name.
+    # Three digits, because the limit is printed in the name of a structure.
     return float(f"{min(MAX_DELAY_SAMPLES, length * MAX_DELAY_SHARE) * step:.3g}")

@@ -15,9 +15,9 @@ from ftlm.utils.validation import as_mapping, join_names, nearest
 
 
 def _read_units(kind: str) -> list[tuple[str, str, float, list[str]]]:
-    """Return entries of ``units.csv``, each as name, SI unit, conversion factor and spellings.
+    """Return the entries of ``units.csv`` as (unit, SI unit, conversion factor to SI, spellings) tuples.
 
-    `kind` selects units of signals or of time.
+    `kind` is "signal" or "time".
     """
     with Path(__file__).with_name("units.csv").open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["kind"] == kind]
@@ -25,12 +25,12 @@ def _read_units(kind: str) -> list[tuple[str, str, float, list[str]]]:
 
 
 _SIGNAL_ROWS, _TIME_ROWS = _read_units("signal"), _read_units("time")
-#: SI unit and conversion factor of each accepted signal unit.
+#: (SI unit, conversion factor to SI) of each accepted signal unit.
 SIGNAL_UNITS = {unit: (si, factor) for unit, si, factor, _ in _SIGNAL_ROWS}
-#: Seconds of each unit of time.
+#: Duration [s] of each unit of time.
 TIME_UNITS = {unit: factor for unit, _, factor, _ in _TIME_ROWS}
-#: Unit of each spelling in column headers, case-folded, with both the micro sign and the letter mu, into which
-#: casefold turns it; those of signals without spaces, and "" for known units without conversion.
+#: Unit of each spelling in column headers. Spellings are case-folded, which replaces the micro sign by the letter mu.
+#: Spellings of signal units have no spaces. A known unit without conversion is "".
 _TIME_UNIT_ALIASES = {spelling: unit for unit, _, _, spellings in _TIME_ROWS for spelling in spellings}
 _SIGNAL_UNIT_ALIASES = {spelling: unit for unit, _, _, spellings in _SIGNAL_ROWS for spelling in spellings}
 _BRACKETED_UNIT_PATTERN = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
@@ -42,10 +42,10 @@ _TIME_NAMES = frozenset(("t", "time", "seconds"))
 def split_time_header(name: str) -> tuple[str, str | None]:
     """Return the case-folded name and the unit of a time column from its header.
 
-    The unit is a key of :data:`TIME_UNITS`, None if there is none, or the literal text of square brackets with another
-    unit. Accepted forms: ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms``, ``time in ms``, ``time_ms``.
+    The unit is a key of :data:`TIME_UNITS`, the text in square brackets if it is another unit, or None without a unit.
+    Accepted forms: ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms``, ``time in ms``, ``time_ms``.
     """
-    folded = " ".join(name.split()).casefold()  # runs of spaces would cost their cube below
+    folded = " ".join(name.split()).casefold()  # with runs of spaces, the patterns below would take cubic time
     bracketed = _BRACKETED_UNIT_PATTERN.fullmatch(folded)
     if bracketed and bracketed[2]:
         return bracketed[1], _TIME_UNIT_ALIASES.get(bracketed[2].rstrip("."), bracketed[2])
@@ -56,15 +56,15 @@ def split_time_header(name: str) -> tuple[str, str | None]:
 
 
 def parse_unit(word: str) -> str | None:
-    """Return the key of :data:`SIGNAL_UNITS` for a unit in a file.
+    """Return the key of :data:`SIGNAL_UNITS` for the text of a unit in a file.
 
-    It is "" for a unit without conversion, and None for an unknown one.
+    The key is "" for a known unit without conversion, and None for an unknown unit.
 
     Short symbols are case-sensitive (m and M differ), words are not. ``deg.``, ``N m`` and ``º`` are normalized.
     """
     if len(word) > _MAX_UNIT_CHARACTERS:
         return None
-    # The ordinal sign and the ring are typed for the degree; Ω and µ have two signs each.
+    # The ordinal sign and the ring are used as degree signs, and Ω and µ have two code points each.
     text = unicodedata.normalize("NFC", word.replace("º", "°").replace("˚", "°")).replace("μ", "µ").replace(" ", "")
     text = text.rstrip(".").replace("⁻¹", "^-1").replace("³", "3")
     if text in SIGNAL_UNITS:
@@ -74,12 +74,12 @@ def parse_unit(word: str) -> str | None:
 
 
 def is_time_name(name: str) -> bool:
-    """Whether a column name means time: t, time or seconds, with or without a unit."""
+    """Whether a column name is t, time or seconds, with or without a unit."""
     return split_time_header(name)[0] in _TIME_NAMES
 
 
 def time_unit_of(name: str, label: str, choice: str | None) -> tuple[str, tuple[str, ...]]:
-    """Return the unit of a time column, and notes for the run.
+    """Return the unit of a time column, and notes on it for the run.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def time_unit_of(name: str, label: str, choice: str | None) -> tuple[str, tuple[
 
 
 def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> dict[str, tuple[str, float]]:
-    """Return the SI unit and the conversion factor of every signal; raise DataError for an unknown signal or unit."""
+    """Return (SI unit, conversion factor) of every signal; raise DataError for an unknown signal or unit."""
     units_by_signal = as_mapping("units", {} if units is None else units)
     for signal, unit in units_by_signal.items():
         if signal not in signals:
@@ -133,11 +133,10 @@ def check_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> di
 
 
 def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
-    """Return the unit of the coefficient of a term D^order signal, such as ``s^-1.8 rad/A``.
+    """Return the unit of the coefficient of D^order signal in the equation of D^alpha output, such as ``s^-1.8 rad/A``.
 
-    The equation determines D^alpha of the output.
-
-    Empty if the unit of a signal is unknown or the coefficient is dimensionless.
+    `units` has the units of signals by name. The result is empty if the unit of a signal is unknown or the coefficient
+    is dimensionless.
     """
     seconds = round(order - alpha, 4)
     time = "" if seconds == 0 else f"s^{seconds:g}"
@@ -152,7 +151,7 @@ def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal
 
 
 def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[str, float] | None:
-    """Return the exponents of SI units and of seconds in an expression's unit; None if a signal's unit is unknown.
+    """Return the unit of an expression as exponents by unit; None if the unit of a signal is unknown.
 
     A sum has the unit of its first term with a signal. Functions other than abs and sqrt are dimensionless.
     """
@@ -179,7 +178,7 @@ def expression_unit(units: Mapping[str, str], expression: Expression) -> dict[st
 
 
 def _multiply_units(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
-    """Return the product of two units, each as powers by name."""
+    """Return the product of two units, each given as exponents by unit."""
     powers = {unit: first.get(unit, 0.0) + second.get(unit, 0.0) for unit in dict.fromkeys([*first, *second])}
     return {unit: power for unit, power in powers.items() if round(power, 9)}
 
@@ -189,9 +188,8 @@ def nonlinear_coefficient_unit(
 ) -> str:
     """Return the unit of the coefficient of a non-linear term, such as ``s^-2 rad^-2``.
 
-    The term is D^order of an expression, in the equation of D^alpha of the output.
-
-    Empty if the unit of a signal is unknown or the coefficient is dimensionless.
+    The term is D^order of an expression, in the equation of D^alpha output. The result is empty if the unit of a signal
+    is unknown or the coefficient is dimensionless.
     """
     own, inner = units.get(output, ""), expression_unit(units, expression)
     if not own or inner is None:
@@ -211,7 +209,7 @@ def nonlinear_coefficient_unit(
 
 
 def _unit_power(unit: str, power: float) -> str:
-    """Return a power of a unit as text."""
+    """Return a power of a unit as text, such as ``(rad/s)^2``."""
     compound = "/" in unit or "·" in unit
     if power == 1:
         return f"({unit})" if compound else unit

@@ -32,7 +32,7 @@ SECONDS_LIMIT = 60
 SIZE_LIMIT = 1 << 30
 MAX_ARRAYS = 10_000
 MAX_GROUP_DEPTH = 8
-#: Remedy that the parent completes with the parameter of the interface in use.
+#: Remedy to which the parent process adds the option that selects a sheet.
 SHEET_CHOICE_HINT = "say which sheet"
 SAVE_AGAIN = "save it again with save('FILE.mat', '-v7')"
 NUMERIC_MATLAB_CLASSES = frozenset(
@@ -41,7 +41,7 @@ NUMERIC_MATLAB_CLASSES = frozenset(
 
 
 class UnreadableError(Exception):
-    """Error for a file that cannot be read, with the reason and a remedy; a damaged file has no remedy."""
+    """Error for a file that cannot be read: reason `why`, and remedy `way_out`, which is "" for a damaged file."""
 
     def __init__(self, why: str, way_out: str = "") -> None:
         super().__init__(why)
@@ -81,7 +81,10 @@ def check_version(path: str) -> None:
 
 
 def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header of a .mat file and its matrices; at most `budget` bytes are read as float64."""
+    """Return the header of a .mat file and its numeric matrices.
+
+    Raise UnreadableError if the matrices take more than `budget` bytes as float64.
+    """
     numpy: Any = importlib.import_module("numpy")
     matlab: Any = importlib.import_module("scipy.io")
     # SciPy only warns when it skips data; turn such warnings into errors.
@@ -116,7 +119,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
         )
     if len(names) > MAX_ARRAYS:
         raise UnreadableError(f"it holds {len(names)} variables, more than {MAX_ARRAYS}", "save a part of it")
-    # With mat_dtype=True SciPy drops imaginary parts; the stored type loses nothing.
+    # With mat_dtype=True, SciPy drops imaginary parts; the stored types keep them.
     wanted = [*kinds, *structs]
     loaded = matlab.loadmat(path, mat_dtype=False, variable_names=wanted) if wanted else {}
     for name in structs:
@@ -150,7 +153,7 @@ def read_matlab(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def struct_fields(struct: Any) -> list[tuple[str, Any]]:
-    """Return (name, array) of every field of a struct; [] if it is none."""
+    """Return (name, array) of every field of a struct; [] if the value is not a single struct."""
     if getattr(struct, "size", 0) != 1 or struct.dtype.names is None:
         return []
     return [(field, struct[field].ravel()[0]) for field in struct.dtype.names]
@@ -179,7 +182,7 @@ def list_variables(matlab: Any, path: str) -> list[tuple[str, tuple[int, ...], s
 
 
 def check_size(rows: int, columns: int) -> None:
-    """Raise UnreadableError if a table declares too many columns or bytes."""
+    """Raise UnreadableError if a table declares more than `MAX_ARRAYS` columns, or `SIZE_LIMIT` bytes of float64."""
     if columns > MAX_ARRAYS or 8 * rows * columns > SIZE_LIMIT:
         raise UnreadableError(
             f"it declares {rows} rows of {columns} columns, more than {SIZE_LIMIT} bytes or {MAX_ARRAYS} columns",
@@ -188,7 +191,10 @@ def check_size(rows: int, columns: int) -> None:
 
 
 def read_feather(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header of a feather file (version 2, Arrow's IPC format) and its columns."""
+    """Return the header of a feather file (version 2, Arrow's IPC format) and its columns.
+
+    Raise UnreadableError for version 1 and for columns above the size limit.
+    """
     arrow: Any = importlib.import_module("pyarrow")
     ipc: Any = importlib.import_module("pyarrow.ipc")
     with open(path, "rb") as stream:
@@ -206,7 +212,7 @@ def read_feather(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def read_parquet(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header of a parquet file and its columns."""
+    """Return the header of a parquet file and its columns; raise UnreadableError if they exceed the size limit."""
     parquet: Any = importlib.import_module("pyarrow.parquet")
     file = parquet.ParquetFile(path, page_checksum_verification=True)
     check_size(file.metadata.num_rows, file.metadata.num_columns)
@@ -214,7 +220,10 @@ def read_parquet(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
-    """Return the header and the columns of an Arrow table."""
+    """Return the header and the numeric and date columns of an Arrow table; others are listed as skipped.
+
+    Raise UnreadableError if row count or digest of a run written by ftlm is wrong.
+    """
     numpy: Any = importlib.import_module("numpy")
     types: Any = importlib.import_module("pyarrow.types")
     compute: Any = importlib.import_module("pyarrow.compute")
@@ -237,7 +246,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
             digest.update(numpy.ascontiguousarray(values, dtype="<f8").tobytes())
         else:
             arrays.header["skipped"][name] = str(kind)
-    # Runs written by ftlm store row count and digest.
+    # Files of runs written by ftlm contain their row count and a digest.
     check = (table.schema.metadata or {}).get(b"ftlm-check")
     if check is not None and check != f"{table.num_rows} {digest.hexdigest()}".encode():
         entry = check.split(b" ")[0].decode("utf-8", errors="replace")[:20]
@@ -248,7 +257,7 @@ def arrow_columns(table: Any) -> tuple[dict[str, Any], list[Any]]:
 
 
 def _arrow_units(schema: Any) -> dict[str, str]:
-    """Return the units by column that fields, or the attributes of a pandas frame, state."""
+    """Return the units by column from the metadata of Arrow fields, or from the attributes of a pandas frame."""
     try:
         whole = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}")).get("units", {})
         units = {str(name): str(unit) for name, unit in whole.items()}
@@ -263,7 +272,7 @@ def _arrow_units(schema: Any) -> dict[str, str]:
 
 
 class Arrays:
-    """List of arrays whose total size is limited in bytes."""
+    """Arrays of one file with their header; `budget` limits their total size as float64 [bytes]."""
 
     def __init__(self, budget: int = SIZE_LIMIT) -> None:
         self.header: dict[str, Any] = {"arrays": [], "skipped": {}}
@@ -271,7 +280,10 @@ class Arrays:
         self.left = budget
 
     def fits(self, name: str, shape: tuple[int, ...], kind: Any) -> bool:
-        """Whether an array of this shape and type is read; any other is recorded as skipped."""
+        """Whether an array of this shape and dtype is read; if not, record the reason in the header.
+
+        Raise UnreadableError if the array exceeds the limit of size or number of arrays.
+        """
         why = None
         if kind.hasobject:
             why = "pickled objects, which are not read"
@@ -293,7 +305,7 @@ class Arrays:
         return True
 
     def add(self, name: str, values: Any, unit: str = "") -> None:
-        """Append an array; each field of a structured array becomes a column."""
+        """Append an array with its header entry; each field of a structured array becomes a column."""
         numpy: Any = importlib.import_module("numpy")
         if values.dtype.names:
             for field in values.dtype.names:
@@ -324,7 +336,7 @@ class Arrays:
 
 
 def read_numpy(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the arrays of a NumPy file; pickled objects are never loaded."""
+    """Return the header of a NumPy file (.npy or .npz) and its arrays; pickled objects are never loaded."""
     arrays = Arrays(budget)
     if path.lower().endswith(".npy"):
         with open(path, "rb") as stream:
@@ -350,7 +362,7 @@ def read_numpy(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def numpy_array(stream: Any, name: str, arrays: Arrays) -> Any:
-    """Return one NumPy array, or None if it is skipped; its size is checked before the data are read."""
+    """Return one NumPy array, or None if it is skipped; raise UnreadableError if its size is wrong or too large."""
     form: Any = importlib.import_module("numpy.lib.format")
     version = form.read_magic(stream)
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
@@ -365,13 +377,13 @@ def numpy_array(stream: Any, name: str, arrays: Arrays) -> Any:
     if len(content) != size:
         raise UnreadableError(f"{name!r} ends after {len(content)} of {size} bytes")
     if stream.read(1):
-        # Its header may be damaged, and the numbers then be shifted.
+        # The header may be damaged, and the numbers would then be shifted.
         raise UnreadableError(f"{name!r} has more than the {size} bytes that its header declares")
     return numpy.frombuffer(content, kind).reshape(shape, order="F" if order else "C")
 
 
 def read_hdf5(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
-    """Return the matrices of an HDF5 file, including MATLAB 7.3; external links are not followed."""
+    """Return the header of an HDF5 file (including MATLAB 7.3) and its arrays; external links are not followed."""
     hdf5: Any = importlib.import_module("h5py")
     arrays = Arrays(budget)
     with hdf5.File(path, "r") as file:
@@ -380,7 +392,7 @@ def read_hdf5(path: str, budget: int) -> tuple[dict[str, Any], list[Any]]:
 
 
 def _gather(hdf5: Any, group: Any, prefix: str, arrays: Arrays, depth: int) -> None:
-    """Append the arrays of an HDF5 group and its subgroups to `arrays`."""
+    """Append the arrays of an HDF5 group and its subgroups to `arrays`, with names that begin with `prefix`."""
     for key in group:
         name, link = f"{prefix}{key}", group.get(key, getlink=True)
         if not isinstance(link, hdf5.HardLink):
@@ -413,7 +425,7 @@ def _gather(hdf5: Any, group: Any, prefix: str, arrays: Arrays, depth: int) -> N
 
 
 def has_numbers(item: Any) -> bool:
-    """Whether an HDF5 dataset has a NumPy type without Python objects."""
+    """Whether an HDF5 dataset has a NumPy dtype, and this contains no Python objects."""
     try:
         return not item.dtype.hasobject
     except (TypeError, ValueError):
@@ -421,7 +433,11 @@ def has_numbers(item: Any) -> bool:
 
 
 def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
-    """Return the header of a workbook's sheet and its cells as text."""
+    """Return the header of a sheet in a workbook, and its cells as tab-separated UTF-8 text.
+
+    `sheet` is the name of the sheet; None selects the only sheet that is not empty. Raise UnreadableError if there is
+    no such sheet.
+    """
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
@@ -476,7 +492,7 @@ def cell_text(cell: Any) -> str:
     if isinstance(cell, int | float):
         return repr(cell)
     if isinstance(cell, datetime.timedelta):
-        # A duration keeps its unit this way; a plain number would get the unit of the header.
+        # A duration is written with its unit; a plain number would get the unit in the header of its column.
         seconds, rest = divmod(abs(cell) // datetime.timedelta(microseconds=1), 1_000_000)
         return f"{'-' if cell < datetime.timedelta() else ''}PT{seconds}.{rest:06}S"
     if isinstance(cell, datetime.datetime):
@@ -496,7 +512,10 @@ READERS_BY_FORMAT = {
 
 
 def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) -> int:
-    """Write the arrays or cells of one file, or an error, to `out`; return the number of bytes of numbers."""
+    """Write the answer for one file to `out`: header with arrays or cells, or an error.
+
+    Return the number of bytes of arrays and cells. `budget` limits the size of the arrays as float64 [bytes].
+    """
     matlab = path.lower().endswith(".mat")
     damaged = f"the file is damaged; get an intact copy or {SAVE_AGAIN if matlab else 'save it again'}"
     cells, payload = b"", []
@@ -522,8 +541,8 @@ def answer(kind: str, path: str, out: BinaryIO, budget: int, sheet: str | None) 
 
 
 def main(arguments: list[str]) -> None:
-    """Read the files that the arguments name, and write one answer for each to standard output."""
-    # One thread and no memory pool: both would reserve memory that counts against the limit.
+    """Read the files of the command line KIND OPTIONS FILE…, and write one answer per file to standard output."""
+    # More threads and a memory pool would reserve memory that counts against the limit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"
     limit_resources(MEMORY_LIMIT, SECONDS_LIMIT)

@@ -18,7 +18,7 @@ from ftlm.utils.parameters import layout_parameter
 from ftlm.utils.validation import Floats
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
-#: Separators before a unit at the end of a column name without brackets.
+#: Separators before a unit that ends a column name without brackets.
 _BEFORE_UNITS = (" / ", ",", " in ")
 #: Thousands separators, as regular-expression character classes.
 THOUSANDS_SEPARATORS = {"point": "[.]", "comma": "[,]", "space": "[ \u00a0\u202f]", "apostrophe": "['\u2019]"}
@@ -32,7 +32,10 @@ _MISSING_VALUE_TEXTS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", 
 
 @functools.cache
 def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
-    """Return the regular expression of a number with grouped thousands; its first group is the decimals."""
+    """Return the regular expression of a number with grouped thousands; its first group matches the decimals.
+
+    `mark` is the thousands separator, and `comma` whether the decimal mark is a comma.
+    """
     point = "," if comma else "[.]"
     return re.compile(
         rf"\s*[+-]?[1-9]\d{{0,2}}(?:{THOUSANDS_SEPARATORS[mark]}\d{{3}})+({point}\d*)?(?:[eE][+-]?\d{{1,3}})?\s*",
@@ -41,7 +44,7 @@ def _grouped_number_pattern(mark: str, comma: bool) -> re.Pattern[str]:
 
 
 def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
-    """Return the thousands separator of a number if decimals make it unambiguous, otherwise None."""
+    """Return the thousands separator of a number if its decimals make the separator unambiguous, otherwise None."""
     if len(cell) < len("1.234,"):
         return None
     for mark in THOUSANDS_SEPARATORS:
@@ -52,7 +55,7 @@ def detect_thousands_separator(cell: str, *, comma: bool) -> str | None:
 
 
 def may_group(cell: str, mark: str, *, comma: bool) -> bool:
-    """Whether a cell may be a number whose thousands a given separator groups."""
+    """Whether a cell may be a number with the thousands separator `mark`."""
     return _grouped_number_pattern(mark, comma).fullmatch(cell) is not None
 
 
@@ -90,7 +93,10 @@ def is_gap(cell: str) -> bool:
 
 
 def split_cells(lines: list[str], separator: str | None, source: str, first: int) -> list[list[str]]:
-    """Return the cells of each line; separators within quotes do not split a cell."""
+    """Return the cells of each line; separators within quotes do not split a cell.
+
+    `first` is the number of the first line, for messages. Raise DataError for unbalanced quotes.
+    """
     if separator is None:
         return [line.split() for line in lines]
     if not any('"' in line for line in lines):
@@ -107,7 +113,7 @@ def split_cells(lines: list[str], separator: str | None, source: str, first: int
 def split_unit(name: str) -> tuple[str, str]:
     """Split a column name into the name without unit and the unit; the unit is "" if there is none.
 
-    Any text in brackets counts as a unit; without brackets only known units, as in ``Strom / A`` or ``Current, A``.
+    Any text in brackets counts as a unit. Without brackets, only known units do, as in ``Strom / A`` or ``Current, A``.
     """
     # No regular expression here: its time would grow with the cube of the number of spaces.
     text = name.rstrip()
@@ -131,14 +137,14 @@ def split_slash_unit(name: str) -> tuple[str, str]:
 
 
 def _bracket_content(cell: str) -> str | None:
-    """Return the content of a cell that is in brackets, otherwise None."""
+    """Return the content of the brackets if a cell consists of one pair of brackets, otherwise None."""
     text = cell.strip()
     whole = len(text) > 1 and text[0] in "[(" and text[-1] in "])" and not any(c in "[]()" for c in text[1:-1])
     return text[1:-1].strip() if whole else None
 
 
 def is_unit(cell: str) -> bool:
-    """Whether a cell may be part of a row of units."""
+    """Whether a cell may be part of a row of units: it is empty, a known unit, or a short text in brackets."""
     bracketed = _bracket_content(cell)
     word = cell.strip() if bracketed is None else bracketed
     short = bracketed is not None and len(word) <= 12
@@ -151,7 +157,7 @@ def is_time_unit(word: str) -> bool:
 
 
 def unit_of(cell: str) -> str:
-    """Return the unit in a cell of a row of units, without its brackets."""
+    """Return the unit in a cell of a row of units, without brackets."""
     bracketed = _bracket_content(cell)
     return cell.strip() if bracketed is None else bracketed
 
@@ -189,7 +195,7 @@ def _match_timestamp(cell: str) -> re.Match[str] | None:
 
 @dataclass(frozen=True)
 class Timestamps:
-    """Column of timestamps, as numbers parsed from text.
+    """Dates and times of a column, as numbers parsed from text.
 
     Parameters
     ----------
@@ -202,7 +208,7 @@ class Timestamps:
     first
         Text of the first cell.
     notation
-        Notation of the text: separator of the date, whether it has a time zone, and whether it has AM/PM.
+        Notation of the text: separator of the date, whether there is a time zone, and whether there is AM/PM.
     """
 
     parts: npt.NDArray[np.int64]
@@ -234,7 +240,7 @@ class Timestamps:
 
     @classmethod
     def concatenate(cls, pieces: Sequence[Timestamps]) -> Timestamps | None:
-        """Return the blocks of a column concatenated; None if they differ in notation."""
+        """Return consecutive blocks of a column as one; None if they differ in notation."""
         if len({piece.notation for piece in pieces}) > 1:
             return None
         parts, clock = (np.concatenate([getattr(p, name) for p in pieces]) for name in ("parts", "clock"))
@@ -270,20 +276,20 @@ class Timestamps:
         return np.asarray((days - days[0]) * 86400.0 + (since - since[0]) / _NANOSECONDS_PER_SECOND)
 
     def inferred_date_order(self, dates: str | None) -> str:
-        """Return the inferred order of day and month if the times depend on it, otherwise ""."""
+        """Return the inferred order ("dmy" or "mdy") if the times depend on the inference, otherwise ""."""
         if not self.mark or dates is not None or (self.parts == self.parts[0]).all():
             return ""
         order = self._detect_date_order()
         return "" if order == "ymd" else order
 
     def _detect_date_order(self) -> str:
-        """Return the order of day and month that the numbers of the dates imply; "" if it is ambiguous."""
+        """Return the order of year, month and day that the numbers of the dates imply; "" if it is ambiguous."""
         first, second, last = self.parts.max(axis=0)
         if first > 31:
             return "ymd"
         if second > 12 >= first:
             return "mdy"
-        # Dates with points begin with the day; for others the numbers may decide. Equal dates need no order.
+        # Dates with points begin with the day; other dates may have conclusive numbers. Equal dates need no order.
         is_day_first = self.mark == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all()
         return "dmy" if is_day_first else ""
 
@@ -305,7 +311,7 @@ class Timestamps:
 
 
 def _time_of_day_ns(hour: str, minute: str, second: str, fraction: str, half: str, zone: str) -> int:
-    """Return the time of day [ns]; in UTC if it has a time zone."""
+    """Return the time of day [ns] from its texts; in UTC if there is a time zone."""
     hours, offset = int(hour or 0), 0
     if half:
         hours = hours % 12 + (12 if half in "Pp" else 0)
@@ -317,6 +323,6 @@ def _time_of_day_ns(hour: str, minute: str, second: str, fraction: str, half: st
 
 
 def _duration_ns(sign: str, whole: str, fraction: str) -> int:
-    """Return a duration [ns]."""
+    """Return a duration [ns] from the texts of its sign, seconds and decimals."""
     nanoseconds = int(whole) * _NANOSECONDS_PER_SECOND + int(fraction.ljust(9, "0") or 0)
     return -nanoseconds if sign else nanoseconds

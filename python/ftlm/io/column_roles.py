@@ -16,7 +16,10 @@ from ftlm.utils.validation import CSV_TIME, join_names
 
 @dataclass
 class ColumnSelection:
-    """Selection of columns, with units and layout, from arguments, a columns file and the ftlm header."""
+    """Selection of the columns of a run, with units and layout, from arguments, a columns file or the ftlm header.
+
+    `time` and `step` [s] are alternatives. `inputs` and `outputs` have the name or position of a column by signal.
+    """
 
     time: Hashable | None
     step: float | None
@@ -27,9 +30,9 @@ class ColumnSelection:
     layout: Layout
 
 
-#: Words of column names by what they say of a column: voltage is an input of motors and an output of cells; a reference
-#: neither enters a plant nor leaves it; a command and its measurement differ in a word; degrees of temperature are no
-#: angles.
+#: Words in column names, by the role or quantity that they indicate. A voltage is an input of motors and an output of
+#: cells. A reference is neither input nor output of a plant. Names of a command and its measurement differ in one word.
+#: Degrees of a temperature are not angles.
 _WORDS_BY_ROLE = {
     kind: frozenset(words.split())
     for kind, words in {
@@ -49,18 +52,17 @@ _WORDS_BY_ROLE = {
 
 
 def words_of(column: str) -> set[str]:
-    """Return the case-folded words of a column name, without unit and digits."""
+    """Return the case-folded words of a column name, without its unit and without digits."""
     bare = re.sub(r"(?<=[a-zäöüß])(?=[A-Z])", " ", split_unit(column)[0])
     return set(re.split(r"[\W\d_]+", bare.casefold())) - {""}
 
 
 def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the columns that are probably inputs, and those that are probably outputs, by their names.
+    """Return the columns whose names suggest an input, and those whose names suggest an output.
 
-    Both lists are empty if the names are ambiguous.
-
-    If the other columns have both roles, references are omitted, and so are commands whose quantity is also measured. A
-    single column is an output, unless it has the name of an input.
+    Both lists are empty if the names are ambiguous. If the other columns include inputs and outputs, references are
+    omitted, and so are commands whose quantity is also measured. A single column is an output, unless its name suggests
+    an input.
     """
     if len(columns) == 1 and not words_of(columns[0]) & _WORDS_BY_ROLE["input"]:
         return [], list(columns)
@@ -74,17 +76,20 @@ def guess_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         and not (_tokens(c) & _WORDS_BY_ROLE["command"] and _tokens(c) - _WORDS_BY_ROLE["command"] in quantities)
     ]
     roles, every = _roles_by_words(plant), _roles_by_words(columns)
-    # A reference and an output are those of a closed loop.
+    # If the only other columns are outputs, a reference is the input of a closed loop.
     return every if not roles[1] or (every[0] and not roles[0]) else roles
 
 
 def _tokens(column: str) -> frozenset[str]:
-    """Return the case-folded words of a column name with their digits, such as ``im1``."""
+    """Return the case-folded words of a column name, including digits, such as ``im1``."""
     return frozenset(re.split(r"[\W_]+", column.casefold()))
 
 
 def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the columns whose names have words of inputs, and those with words of outputs."""
+    """Return the columns whose names contain words of inputs, and those whose names contain words of outputs.
+
+    A single remaining column gets the role that no other column has. Both lists are empty if roles are ambiguous.
+    """
     words_by_column = {column: words_of(column) for column in columns}
     inputs, outputs, both = (
         [c for c, words in words_by_column.items() if words & _WORDS_BY_ROLE[role]]
@@ -101,7 +106,7 @@ def _roles_by_words(columns: Sequence[str]) -> tuple[list[str], list[str]]:
         elif follows and not drives:
             drives, rest = rest, []
     if follows and not drives and not rest:
-        # A free response.
+        # Outputs without any input are a free response.
         return [], follows
     return (drives, follows) if drives and follows else ([], [])
 
@@ -113,7 +118,7 @@ def known_unit(text: str, column: str = "") -> str:
 
 
 def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
-    """Return valid, unique signal names by column; `columns` has a fallback name for each, "u" or "y"."""
+    """Return a valid, unique signal name for each column; the values of `columns` are fallback names, "u" or "y"."""
     names: dict[str, str] = {}
     for column, role in columns.items():
         bare = re.sub(r"\W+", "_", split_unit(column)[0].rpartition("/")[2]).strip("_")
@@ -127,7 +132,7 @@ def signal_names(columns: Mapping[str, str]) -> dict[str, str]:
     return names
 
 
-#: Names with a meaning in equation texts.
+#: Names that have a meaning in equation texts, and are therefore not used for signals.
 _RESERVED_NAMES = frozenset(("d", "sign", "sat", "dead", "delay", "alpha", "a0", "b0", "c", CSV_TIME))
 
 
@@ -139,14 +144,14 @@ def has_numbers(column: Column) -> bool:
 def assume_roles(
     selection: ColumnSelection, columns: Sequence[Column], signals: tuple[Sequence[str], Sequence[str]] | None = None
 ) -> tuple[Assumption, ...]:
-    """Set inputs and outputs of a selection in place if it has neither, and return the assumptions made.
+    """Set inputs and outputs of a selection in place if it has neither, and return the assumption on them.
 
     Parameters
     ----------
     selection
         Column selection to complete.
     columns
-        Columns of the file without its time.
+        Columns of the file except the time.
     signals
         Inputs and outputs of an equation. If the file has all of them, they are selected without an assumption.
         Otherwise roles are guessed from words in the column names, such as input or torque, output or angle. Inputs and
@@ -166,7 +171,7 @@ def assume_roles(
             return ()
     unread = [c.name for c in columns if c.name and not has_numbers(c)]
     if len(own) == 1 and any(words_of(name) & _WORDS_BY_ROLE["input"] for name in unread):
-        # An input without numbers is an error in the file: the output is not a free response.
+        # If the input has no numbers, the file is faulty, and the output must not be taken for a free response.
         return ()
     drives, follows = guess_roles(list(own))
     names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
@@ -182,7 +187,7 @@ def assume_roles(
 
 
 def add_file_units(selection: ColumnSelection, pool: Pool) -> None:
-    """Add the units that a file states for the selected columns to the selection, unless it has other units."""
+    """Add the units in a file to a selection, in place, for selected columns without a unit."""
     for name, spec in (selection.inputs | selection.outputs).items():
         column = pool.find(spec, f"signal {name!r}")
         unit = known_unit(column.file_unit, column.name_with_unit)

@@ -36,7 +36,7 @@ from ftlm.utils.parameters import Placeholder, layout_parameter, parameter
 from ftlm.utils.validation import bad_rows
 
 _BLOCK_BYTES = 8 << 20
-#: Size of the sample for the layout detection: characters, and minimum number of lines.
+#: Size of the beginning of a text from which the layout is detected: characters, and minimum number of lines.
 _SAMPLE_CHARACTERS, _MIN_SAMPLE_LINES = 1 << 16, 8
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF32 = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
@@ -44,7 +44,7 @@ _MAX_UNPACKED_BYTES = 1 << 30
 
 
 def _fill_hint() -> str:
-    """Return the remedy for cells without a number, for messages."""
+    """Return the remedy in error messages on cells without a number."""
     return (
         f"fill or remove these rows yourself, or let them be missing with {parameter('missing', 'weight')} or "
         f"{parameter('missing', 'hold')}"
@@ -53,7 +53,23 @@ def _fill_hint() -> str:
 
 @dataclass
 class _BadCells:
-    """Cells of one column that are not numbers, for the error message."""
+    """Cells of one column that are not numbers, for the error message.
+
+    Parameters
+    ----------
+    line, row, cell
+        Line number, row number and text of the first such cell.
+    count
+        Number of such cells.
+    blank
+        Whether all of them are empty or mean a missing value.
+    comma, sheet
+        Whether the decimal mark is a comma, and whether the file is a workbook.
+    moments
+        Whether some of them are dates or times of day.
+    other
+        First cell of the column, if the cells are dates or times in another notation; otherwise "".
+    """
 
     line: int
     row: int
@@ -105,7 +121,11 @@ class _BadCells:
 
 @dataclass
 class _Rows:
-    """Rows of a table that were read so far, with invalid cells and timestamps by column."""
+    """Rows of a table that have been read, with invalid cells and timestamps by column index.
+
+    `ragged` is the number of lines with a wrong number of cells; `ragged_line` and `ragged_cells` describe the first.
+    `footer` has the numbers of the lines below the table, and `blocks` the values of the rows, shape (rows, columns).
+    """
 
     dialect: TableDialect
     sheet: bool = False
@@ -121,7 +141,7 @@ class _Rows:
 
 
 def read_text(path: Path, layout: Layout) -> FileTable:
-    """Read one text file, optionally compressed by gzip, and return its columns as a table."""
+    """Read one text file, optionally compressed by gzip, and return its columns; raise DataError on failure."""
     try:
         with open(path, "rb") as stream:
             if path.suffix.lower() != ".gz" and stream.read(2) != b"\x1f\x8b":
@@ -145,7 +165,7 @@ def _read_gzip(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
 
 
 class _SizeLimitedStream:
-    """Stream that raises DataError when more bytes are read than the size limit."""
+    """Stream of an unpacked file that raises DataError when more than `_MAX_UNPACKED_BYTES` are read."""
 
     def __init__(self, path: Path, stream: gzip.GzipFile) -> None:
         self._path, self._stream = path, stream
@@ -168,7 +188,10 @@ class _SizeLimitedStream:
 def parse_text(
     path: Path, stream: BinaryIO | _SizeLimitedStream, layout: Layout, sheet: str | None = None
 ) -> FileTable:
-    """Return the columns in a text stream, or in a sheet given as tab-separated lines, as a table."""
+    """Return the columns in a text stream, or in a sheet given as tab-separated lines, as a table.
+
+    `path` and the name of the `sheet` are used in messages. Raise DataError if the text has no valid table.
+    """
     source = path.name if sheet is None else f"{path.name}, sheet {sheet!r}"
     header = header_of_line(path, stream.readline(MAX_HEADER_BYTES)) if sheet is None else None
     stream.seek(0)
@@ -209,9 +232,9 @@ def _with_gaps(
     *,
     sheet: bool,
 ) -> TableDialect:
-    """Return the dialect adjusted for empty rows directly below the header.
+    """Return the dialect, adjusted for rows of empty cells directly below the header.
 
-    In text they are kept as rows; in a sheet they are skipped with a note.
+    In text such rows are rows of the table. In a sheet they are skipped, and an assumption lists them.
     """
     if dialect.separator != "\t" or dialect.names is None:
         return dialect
@@ -233,7 +256,7 @@ def _with_gaps(
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
-    """Return the assumption on missing names, extended if a comment above the rows has as many words as columns."""
+    """Return the assumption on missing names, extended by the comment above the rows if it has one word per column."""
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
         return assumption
@@ -243,9 +266,10 @@ def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
 def _sample(
     blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
 ) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
-    """Return the blocks read so far, the first lines with content, and the comment above them.
+    """Return the first blocks, the lines from which the layout is detected, and the last comment above these lines.
 
-    The lines are those from which the layout is detected.
+    Blocks are (number of the first line, lines), and lines are (number, text) without blank lines and comments. `mark`
+    begins a comment.
     """
     head: list[tuple[int, list[str]]] = []
     sample: list[tuple[int, str]] = []
@@ -271,7 +295,11 @@ def _has_content(line: str, mark: str) -> bool:
 
 
 def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
-    """Parse the lines of one block, and append their rows."""
+    """Parse the lines of one block, and append their rows to `rows`.
+
+    `first` is the number of the first line, and `mark` begins a comment. Raise DataError for a second table, a repeated
+    header or an ambiguous comment.
+    """
     dialect = rows.dialect
     content = []
     for at, line in enumerate(lines, first):
@@ -303,21 +331,21 @@ def _read_block(rows: _Rows, first: int, lines: list[str], mark: str, source: st
             "and give both files as two runs, or remove that line if the record continues"
         )
     if not rows.ragged:
-        # float() accepts underscores between digits; numbers in files must not have them.
+        # float() accepts underscores between digits, which numbers in files must not have.
         plain = not dialect.comma and dialect.mark is None and not any("_" in line for _, line in content)
         rows.blocks.append(_numbers(rows, cells, [at for at, _ in content], plain=plain))
     rows.count += len(cells)
 
 
 def _is_footer(line: str, dialect: TableDialect, source: str, at: int) -> bool:
-    """Whether a line after an empty one is a footer: it begins with a word and is not a row."""
+    """Whether a line after an empty line is a footer: its first cell is a word, and it is not a row of the table."""
     cells = split_cells([line], dialect.separator, source, at)[0]
     numbers = [is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells]
     return bool(cells[0].strip()) and not numbers[0] and (len(cells) != dialect.width or not any(numbers))
 
 
 def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
-    """Raise DataError if a line below a footer is a row again."""
+    """Raise DataError if a line below a footer is a row of numbers, that is, part of a second table."""
     dialect = rows.dialect
     cells = split_cells([line], dialect.separator, source, at)[0]
     if len(cells) == dialect.width and all(is_number(c, comma=dialect.comma, mark=dialect.mark) for c in cells):
@@ -328,7 +356,7 @@ def _check_footer(rows: _Rows, line: str, at: int, source: str) -> None:
 
 
 def _check_remark(line: str, at: int, dialect: TableDialect, source: str) -> None:
-    """Raise DataError if a line may be a comment or a row that begins with #N/A."""
+    """Raise DataError if a line that begins with # may also be a row, for example one that begins with #N/A."""
     cells = line.split(dialect.separator)
     numbers = any(is_number(cell, comma=dialect.comma, mark=dialect.mark) or is_timestamp(cell) for cell in cells)
     error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
@@ -394,7 +422,8 @@ def _ragged_rows_error(rows: _Rows, source: str) -> DataError:
 def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path) -> tuple[str, tuple[Assumption, ...]]:
     """Return the encoding of a text, and assumptions about it.
 
-    It is the given one, or that of a byte-order mark or of zero bytes, or UTF-8, else cp1252 or latin-1.
+    The first criterion that applies is used: the option of the layout, a byte-order mark, zero bytes as in UTF-16,
+    valid UTF-8, valid cp1252, or latin-1. Raise DataError for bytes that are not text.
     """
     if layout.encoding is not None:
         return layout.encoding, ()
@@ -432,7 +461,7 @@ def _encoding(stream: BinaryIO | _SizeLimitedStream, layout: Layout, path: Path)
 
 
 def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield (number of the first line, lines) for blocks of a few megabytes."""
+    """Yield (number of the first line, lines) for blocks of about 8 MB; raise DataError if the text is invalid."""
     decoder = codecs.getincrementaldecoder("utf-8-sig" if encoding == "utf-8" else encoding)()
     carry, number_, newline = "", 1, ""
     while True:
@@ -442,7 +471,7 @@ def _line_blocks(path: Path, stream: BinaryIO | _SizeLimitedStream, encoding: st
         except UnicodeError as error:
             raise _undecodable(path, error, number_ + carry.count("\n"), encoding) from None
         if not block:
-            # Old programs end a text with Ctrl-Z.
+            # Old programs write Ctrl-Z at the end of a text.
             data = data.removesuffix("\x1a")
         if not newline:
             newline = "\r" if "\r" in data and "\n" not in data else "\n" if data else ""
@@ -497,7 +526,11 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
 
 
 def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
-    """Store a column whose cells are not all numbers: as timestamps, or its invalid cells for the error message."""
+    """Store the timestamps of a column, or its invalid cells, in `rows`, because not all its cells are numbers.
+
+    `index` is the column, and `lines` are the line numbers of its cells. If all invalid cells mean missing values, the
+    column of `values` gets the numbers, with NaN for missing values.
+    """
     comma, mark = rows.dialect.comma, rows.dialect.mark
     if is_timestamp(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
         moments = Timestamps.read(column)
@@ -507,9 +540,9 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     bad = [row for row, cell in enumerate(column) if not is_number(cell, comma=comma, mark=mark)]
     dated = [row for row in bad if is_timestamp(column[row])]
     if dated and 2 * len(dated) > len(column):
-        # In a column of mostly dates, the numbers are the invalid cells.
+        # In a column that consists mostly of dates, the other cells are invalid.
         bad = [row for row in range(len(column)) if not is_timestamp(column[row])] or bad
-    # If all cells are timestamps, report the first one with another notation.
+    # If all cells are timestamps, those with another notation are invalid.
     ways = (
         [row for row in bad if Timestamps.read([column[0], column[row]]) is None] if len(dated) == len(column) else []
     )

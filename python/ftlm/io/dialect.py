@@ -39,7 +39,7 @@ _MAX_SKIPPED_LINES = 1 << 40
 @check_arguments
 @dataclass(frozen=True)
 class Layout:
-    """Layout options of a text file or sheet; options that are None are detected and reported as assumptions.
+    """Layout options of a text file or sheet. Options that are None are detected and reported as assumptions.
 
     Parameters
     ----------
@@ -52,11 +52,11 @@ class Layout:
     thousands : {"none", "point", "comma", "space", "apostrophe"}, optional
         Thousands separator in text. It is detected only if decimals make it unambiguous, as in ``1.234,5``.
     skip : int, optional
-        Number of lines (rows of a sheet) above the table, without its header.
+        Number of lines (rows of a sheet) above the header of the table.
     header : {0, 1, 2}, optional
-        Number of header lines: none, names, names and units.
+        Number of header lines: 0 for none, 1 for names, 2 for names and units.
     dates : {"ymd", "dmy", "mdy"}, optional
-        Order of year, month and day in dates that are ambiguous.
+        Order of year, month and day in ambiguous dates.
     sheet : str, optional
         Name of the sheet in a workbook.
 
@@ -112,7 +112,7 @@ class Layout:
 
     @classmethod
     def of(cls, layout: object) -> Layout:
-        """Return the layout that an argument denotes: None, a layout, or a mapping of its fields."""
+        """Return a layout from None (no option set), a layout or a mapping of its fields; raise DataError otherwise."""
         if layout is None:
             return cls()
         if isinstance(layout, Layout):
@@ -131,7 +131,7 @@ class Layout:
         return cls(**layout)
 
     def under(self, other: Layout) -> Layout:
-        """Return the merged options of two layouts; options of the other layout take precedence."""
+        """Return the options of both layouts; where both set an option, that of `other` is used."""
         return replace(self, **other.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
@@ -139,9 +139,9 @@ class Layout:
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
     def check_used(self, path: str, kind: str, names: tuple[str, ...]) -> None:
-        """Raise DataError if an option is set that a file format does not use.
+        """Raise DataError if an option is set that is not in `names`, the options that a file format uses.
 
-        `names` are the options that the format uses.
+        In the message, `path` names the file and `kind` the format.
         """
         unused = [option for option in self.to_dict() if option not in names]
         if unused:
@@ -150,20 +150,20 @@ class Layout:
 
 @dataclass(frozen=True)
 class Assumption:
-    """Assumption that was made when a file was read, because the file does not state an option.
+    """Assumption that the reader made because the file does not state an option.
 
     Parameters
     ----------
     option : str
-        Option of :class:`ftlm.Layout` or argument of :func:`ftlm.load` that sets it explicitly; empty if there is none.
+        Option of :class:`ftlm.Layout` or argument of :func:`ftlm.load` that replaces the assumption; empty if none.
     value : str or int
-        Value that was assumed.
+        Assumed value.
     words : str
         Evidence in the file, as text.
     otherwise : str
-        Text on how to override the assumption.
+        Text of the argument that replaces the assumption; empty if there is none.
     counts : bool
-        Whether values or rows depend on the assumption, so that the warnings of the run list it.
+        Whether values or rows of the run depend on the assumption, so that its warnings list the assumption.
     """
 
     option: str
@@ -177,9 +177,9 @@ class Assumption:
 
 
 def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
-    """Return the name of an option value, which is given by its name (``comma``) or by its character (``,``).
+    """Return the name of a value of an option, which is given by name (``comma``) or by character (``,``).
 
-    Raise DataError for an unknown value.
+    `words` are the characters by name. Raise DataError for an unknown value.
     """
     if isinstance(value, str):
         if value in words:
@@ -191,7 +191,7 @@ def _word(option: str, value: object, words: Mapping[str, str | None]) -> str:
 
 
 def _encoding(value: object) -> str:
-    """Return Python's canonical name of a text encoding; raise DataError for an unknown one."""
+    """Return Python's canonical name of a text encoding; raise DataError if Python does not know the encoding."""
     try:
         if not isinstance(value, str):
             raise LookupError
@@ -208,7 +208,7 @@ def _encoding(value: object) -> str:
 _WORDS_BY_SEPARATOR = {character: word for word, character in SEPARATOR_CHARACTERS.items()}
 SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}
 _SEPARATOR_CANDIDATES = (";", "\t", ",", None)
-#: Maximum number of columns of a text file; opening so many takes a few seconds.
+#: Maximum number of columns of a text file; reading such a file takes a few seconds.
 MAX_COLUMNS = 100_000
 _COMMA_THOUSANDS_PATTERN = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _COMMA_PAIRS_PATTERN = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")
@@ -220,16 +220,17 @@ _ROW_INDEX_UNIT = "sequence"
 
 @dataclass(frozen=True)
 class TableDialect:
-    """Layout and position of a table in a text, as detected.
+    """Detected layout and position of a table in a text.
 
     Parameters
     ----------
     separator, comma, mark
-        Cell separator, whether the decimal mark is a comma, and thousands separator.
+        Cell separator (None for white space), whether the decimal mark is a comma, and thousands separator (None if
+        there is none).
     names, units
-        Names and units of the columns; None without a header.
+        Names and units of the columns; None if the header does not have them.
     begin
-        Line number of the first row.
+        Line number of the first row, counted from 1.
     width
         Number of cells per row.
     layout
@@ -251,7 +252,19 @@ class TableDialect:
 
 @dataclass(frozen=True)
 class _Line:
-    """Line of the sample, split into cells by one candidate for the separators."""
+    """Line of the first lines of a text, split into cells with one candidate for the separators.
+
+    Parameters
+    ----------
+    at
+        Line number, counted from 1.
+    cells
+        Texts of the cells.
+    numbers
+        Whether each cell is a number or a timestamp.
+    words
+        Number of other cells that are not empty.
+    """
 
     at: int
     cells: list[str]
@@ -273,7 +286,7 @@ class _Line:
 
     @property
     def is_row_candidate(self) -> bool:
-        """Whether the line may be a row: it has numbers, and at most as many words as numbers."""
+        """Whether the line may be a row of data: it has numbers, and at most as many words as numbers."""
         return self.count > 0 and self.count >= self.words
 
     @property
@@ -347,7 +360,7 @@ def find_table(
 
 
 def _check_width(rows: Sequence[tuple[int, str]], source: str) -> None:
-    """Raise DataError if a line has too many columns for any separator."""
+    """Raise DataError if a line has more than `MAX_COLUMNS` cells with one of the possible separators."""
     for at, line in rows:
         count = max(len(line.split()), *(line.count(mark) + 1 for mark in _SEPARATOR_CANDIDATES if mark is not None))
         if count > MAX_COLUMNS:
@@ -360,9 +373,9 @@ def _check_width(rows: Sequence[tuple[int, str]], source: str) -> None:
 def _split_lines(
     rows: Sequence[tuple[int, str]], separator: str | None, source: str, layout: Layout, *, comma: bool
 ) -> tuple[list[_Line], str | None]:
-    """Return the lines split into cells, and the thousands separator.
+    """Return the lines split into cells, and the thousands separator (None if there is none).
 
-    In a line with unbalanced quotes, the quotes are ignored; an error is raised later when its row is read.
+    If a line has unbalanced quotes, the quotes are ignored here, and reading its row raises an error later.
     """
     cut, parted = [], []
     for at, line in rows:
@@ -386,7 +399,7 @@ def _split_lines(
 
 
 def _dialect_candidates(text: str, layout: Layout) -> Iterator[tuple[str | None, bool]]:
-    """Yield (separator, whether the decimal mark is a comma) for all candidates."""
+    """Yield the candidates (separator, whether the decimal mark is a comma) that the text and the options allow."""
     for separator in _SEPARATOR_CANDIDATES if layout.separator is None else (SEPARATOR_CHARACTERS[layout.separator],):
         if layout.separator is None and separator is not None and separator not in text:
             continue
@@ -401,7 +414,8 @@ def _choose_separator(
 ) -> tuple[str | None, bool, str | None, list[_Line]]:
     """Return separator, whether the decimal mark is a comma, thousands separator, and the split lines.
 
-    They are chosen such that most lines are rows of equal width.
+    The chosen separators give the largest number of rows of equal width. Raise DataError if the options allow no
+    candidate, or if the role of the commas is ambiguous.
     """
     text = "".join(line for _, line in table_rows)
     best: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
@@ -431,9 +445,9 @@ def _decimal_comma(cut: list[_Line]) -> str | None:
 
 
 def _width(cut: list[_Line]) -> int:
-    """Return the most frequent number of cells of the lines that are most likely rows.
+    """Return the most frequent number of cells per line, over the lines that are most likely rows.
 
-    These are lines with only numbers, else lines with numbers, else the first line.
+    These are the lines with only numbers; without such lines, those that may be rows; otherwise the first line.
     """
     for rows in ([line for line in cut if line.has_only_numbers], [line for line in cut if line.is_row_candidate]):
         counts = Counter(line.width for line in rows)
@@ -445,7 +459,11 @@ def _width(cut: list[_Line]) -> int:
 
 
 def _first_row(cut: list[_Line], width: int) -> int:
-    """Return the index of the first row: the first typical line, or a damaged line of the same width before it."""
+    """Return the index of the first row of data in the split lines.
+
+    It is the first line of the given width that has numbers in all columns in which most rows have numbers. Damaged
+    rows just before it are included.
+    """
     rows = [line for line in cut if line.width == width and line.is_row_candidate]
     if not rows:
         return 1 if cut[0].has_only_words else 0
@@ -458,7 +476,7 @@ def _first_row(cut: list[_Line], width: int) -> int:
     if first is None:
         first = next(k for k, line in enumerate(cut) if line is rows[0])
     while first > 0 and cut[first - 1].width == width and cut[first - 1].count:
-        # A line with numbers is a header if a line of units follows it.
+        # A line with numbers is part of a header if the next line contains units.
         if (first < len(cut) and _is_unit_line(cut[first])) or _is_settings_line(cut, first - 1):
             break
         first -= 1
@@ -470,12 +488,12 @@ def _first_row(cut: list[_Line], width: int) -> int:
 
 
 def _is_settings_line(cut: list[_Line], at: int) -> bool:
-    """Whether a line below the names has units and settings, such as start and increment of an oscilloscope."""
+    """Whether a line below the names contains units and settings, such as start and increment of an oscilloscope."""
     line = cut[at]
     words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
     units = [word for word in words if is_unit(word)]
     others = {word.casefold() for word in words if not is_unit(word)}
-    # Settings have columns of their own; numbers in columns that the next line fills, too, belong to a row.
+    # Settings have columns of their own. Numbers in columns where the next line also has numbers belong to a row.
     below = cut[at + 1].numbers if at + 1 < len(cut) else []
     row = any(one and other for one, other in zip(line.numbers, below, strict=False))
     return (
@@ -494,21 +512,26 @@ def _is_unit_line(line: _Line) -> bool:
 
 
 def _has_unit(units: Sequence[str]) -> bool:
-    """Whether one of the texts is a unit and not also a symbol for missing values."""
+    """Whether at least one of the unit texts cannot be mistaken for a symbol of a missing value or a percentage."""
     return any(unit.strip().casefold() not in ("-", "none", "%") for unit in units)
 
 
 def _header(
     cut: list[_Line], top: int, width: int, layout: Layout, source: str, *, own: bool
 ) -> tuple[list[str] | None, list[str] | None, int]:
-    """Return names and units in the header, and the index of the first row."""
+    """Return names, units and the index of the first row; names or units are None if the header lacks them.
+
+    `top` is the detected index of the first row. The result is larger if the layout states header lines that look like
+    rows. Raise DataError if the header does not match the options, mixes words and numbers, or repeats a name.
+    """
     rows = [line for line in cut[top:] if line.width == width]
     spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)
 
     def fit_names(line: _Line) -> list[str]:
-        """Return the names for the width of the rows.
+        """Return the column names in a line, adapted to the width of the rows.
 
-        A column of comments that rows lack is dropped, and an empty last cell of rows gets an empty name.
+        A last column that the rows lack is dropped if it is empty or for comments. A last column that is empty in all
+        rows gets an empty name.
         """
         names = [cell.strip() for cell in line.cells]
         if len(names) == width + 1 and names[-1].casefold() in ("", _COMMENT_COLUMN_NAME):
@@ -524,7 +547,7 @@ def _header(
             if units_above and len(fit_names(cut[top - 2])) == width and cut[top - 2].words:
                 count = 2
             elif len(fit_names(cut[top - 1])) != width and top > 1:
-                # A remark of one cell may stand between names and rows.
+                # A line between names and rows may consist of one cell with a remark.
                 has_names = len(fit_names(cut[top - 2])) == width and cut[top - 2].has_only_words
                 count = 2 if has_names and cut[top - 1].width == 1 else 0
     if count > top and layout.skip is None and count < len(cut):
@@ -567,7 +590,7 @@ def check_distinct(names: list[str], at: int, source: str) -> None:
 
 
 def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool, str | None]) -> None:
-    """Raise DataError if lines of numbers above the table would be skipped."""
+    """Raise DataError if a line with at least two numbers and no words is above the table and would be skipped."""
     comma, mark = marks
     rows = [
         line
@@ -615,7 +638,7 @@ def _check_commas(rows_of_text: Sequence[tuple[int, str]], cut: list[_Line], sou
 
 
 def _check_thousands(cut: list[_Line], source: str) -> None:
-    """Raise DataError if three digits follow every comma, so that it may be a thousands separator."""
+    """Raise DataError if three digits follow every comma, so that commas may be thousands separators."""
     cells = [
         (line.at, cell.strip())
         for line in cut
@@ -631,7 +654,7 @@ def _check_thousands(cut: list[_Line], source: str) -> None:
 
 
 def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool, source: str) -> None:
-    """Raise DataError if header and rows contain commas besides the separator that are not decimal commas."""
+    """Raise DataError if header and rows have equal cell counts when split at commas as well as at the separator."""
     if not comma or separator is None:
         return
     header = cut[top - 1]
@@ -647,7 +670,10 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
 def _layout_assumptions(
     cut: list[_Line], given: Layout, layout: Layout, top: int, units: list[str] | None
 ) -> tuple[Assumption, ...]:
-    """Return the assumptions in a detected layout; the first row is line `top` of the sample."""
+    """Return the assumptions about the options in a detected layout that `given` does not set.
+
+    The first row of data is ``cut[top]``.
+    """
     assumed = []
     if given.separator is None:
         words = f"{SEPARATOR_WORDS[SEPARATOR_CHARACTERS[str(layout.separator)]]} between cells"

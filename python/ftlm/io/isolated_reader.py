@@ -30,7 +30,7 @@ from ftlm.utils.validation import Floats
 
 _READER_PATH = Path(__file__).with_name("binary_reader.py")
 _READER_TIMEOUT_S = 60.0
-#: Remedy of the reader that the parent completes with the parameter of the interface in use.
+#: Remedy in an answer of the reader, to which the option that selects a sheet is added here.
 _SHEET_CHOICE_HINT = "say which sheet"
 
 
@@ -49,7 +49,7 @@ class BinaryFormat:
     label, repair_hint
         Name of the format, and text on how to save such a file again, for error messages.
     has_sheets
-        Whether the file consists of sheets, whose cells are parsed like delimited text.
+        Whether the file consists of sheets. Their cells are parsed like delimited text.
     """
 
     kind: str
@@ -82,7 +82,7 @@ _HDF5_MARK = b"\x89HDF\r\n\x1a\n"
 
 
 def binary_format_of(path: Path) -> BinaryFormat | None:
-    """Return the binary format of a path by its extension; None for text."""
+    """Return the binary format of a path by its extension, None for text; raise DataError for a gzipped binary file."""
     suffixes = [suffix.lower() for suffix in path.suffixes[-2:]]
     if suffixes and suffixes[-1] == ".gz":
         inner = next((kind for kind in BINARY_FORMATS if suffixes[0] in kind.suffixes), None)
@@ -94,7 +94,7 @@ def binary_format_of(path: Path) -> BinaryFormat | None:
 
 
 def _is_hdf5(path: Path) -> bool:
-    """Whether a file is a MATLAB file of version 7.3 (HDF5)."""
+    """Whether a file begins as a MATLAB file of version 7.3, or as an HDF5 file."""
     try:
         with open(path, "rb") as stream:
             head = stream.read(520)
@@ -106,7 +106,8 @@ def _is_hdf5(path: Path) -> bool:
 def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list[FileTable]:
     """Read files of one format in a separate process, and return their tables.
 
-    A crash is reported as an error of the first file without an answer.
+    Raise DataError if the package for the format is missing, a file cannot be read, or the process crashes or does not
+    finish in 60 s. In the last two cases the error names the first file without a complete answer.
     """
     if importlib.util.find_spec(kind.package) is None:
         raise DataError(
@@ -142,7 +143,7 @@ def read_isolated(paths: list[Path], kind: BinaryFormat, layout: Layout) -> list
 
 
 def describe_crash(code: int) -> str:
-    """Return text on the signal that ended a process."""
+    """Return text on the signal that ended a process; `code` is the negative number of the signal."""
     try:
         return f"signal {-code}, {signal.Signals(-code).name}"
     except ValueError:
@@ -150,7 +151,7 @@ def describe_crash(code: int) -> str:
 
 
 def _describe_exit(code: int) -> str:
-    """Return text on the exit of the reader process."""
+    """Return text on how the reader process ended; `code` is its return code."""
     if code >= 0:
         return "ended too early" if code == 0 else f"ended with code {code}"
     return f"crashed ({describe_crash(code)})"
@@ -164,7 +165,10 @@ Size = Annotated[int, msgspec.Meta(ge=0)]
 
 
 class _Array(msgspec.Struct):
-    """Description of an array in the reader's output: numbers in columns, or timestamps."""
+    """Description of an array in the reader's output.
+
+    `since` is the reference time of timestamps [ns since 1970]; None for numbers.
+    """
 
     name: str
     rows: Size
@@ -175,7 +179,7 @@ class _Array(msgspec.Struct):
 
 
 class _Answer(msgspec.Struct):
-    """Header of the reader's answer for one file, which precedes its numbers and cells."""
+    """Header of the reader's answer for one file, before its numbers or cells; see :mod:`ftlm.io.binary_reader`."""
 
     arrays: list[_Array] = []
     skipped: dict[str, str] = {}
@@ -199,7 +203,7 @@ class _ReaderOutput:
         self._at = 0
 
     def count_complete(self, most: int) -> int:
-        """Return the number of files with a complete answer, at most `most`."""
+        """Return the number of further files with a complete answer, at most `most`."""
         count = 0
         while count < most and self._next() is not None:
             count += 1
@@ -222,7 +226,10 @@ class _ReaderOutput:
         return (answer, matrices, self._content[at : self._at]) if self._at <= len(self._content) else None
 
     def table(self, path: Path, layout: Layout) -> FileTable | None:
-        """Return the table of the next file; None if its answer is missing or incomplete."""
+        """Return the table of the next file; None if its answer is missing or incomplete.
+
+        Raise DataError if the answer is an error, or the file has no column of numbers.
+        """
         answer = self._next()
         if answer is None:
             return None
@@ -245,7 +252,10 @@ class _ReaderOutput:
 
 
 def _sheet(path: Path, sheet: str, others: list[str], cells: bytes, layout: Layout) -> FileTable:
-    """Return the table in the cells of a sheet, which the reader sends as tab-separated text."""
+    """Return the table in the cells of a sheet, which the reader sends as tab-separated text.
+
+    If the user did not name the sheet and there are others, which are empty, an assumption lists the sheet.
+    """
     table = parse_text(path, io.BytesIO(cells), layout, sheet)
     if layout.sheet is None and others:
         words = f"sheet {sheet!r}, the only one that is not empty"
@@ -255,10 +265,10 @@ def _sheet(path: Path, sheet: str, others: list[str], cells: bytes, layout: Layo
 
 
 def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
-    """Return the columns of an array, named like a vector, or by matrix name and column number."""
+    """Return the columns of an array: a vector keeps its name, and column k of a matrix V is named V.k."""
     name = array.name
-    # Keep single precision: the step detection needs the true resolution of the times.
-    with np.errstate(over="ignore"):  # what overflows is no single; it is refused as infinite
+    # Single precision is kept, because the step detection needs the actual resolution of the times.
+    with np.errstate(over="ignore"):  # overflow gives infinity, which raises an error later
         values = matrix.astype(np.float32) if array.type == "single" else matrix
     if array.since is not None:
         return [_timestamp_column(path, array.name, array.since, matrix)]
@@ -275,7 +285,7 @@ def _columns(path: Path, array: _Array, matrix: Floats) -> list[Column]:
 
 
 def _timestamp_column(path: Path, name: str, since: int, matrix: Floats) -> Column:
-    """Return the column of an array of timestamps."""
+    """Return the column of an array of timestamps [ns since `since`, which is in ns since 1970]."""
     values = matrix.ravel(order="F")
     thing, is_missing = f"{path.name}: column {name!r}", np.isnan(values)
     if is_missing.any():

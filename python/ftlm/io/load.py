@@ -1,4 +1,4 @@
-"""Loading of runs from files, with selection of columns."""
+"""Loading of runs from files by a selection of columns."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MAX_FILE_BYTES = 1 << 30
 
 
 class _ColumnsFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a columns file (TOML), with the keys of ``columns=``."""
+    """Content of a columns file (TOML): the keys of the argument `columns` of :func:`load`."""
 
     time: str | int | None = None
     step: float | None = None
@@ -81,17 +81,17 @@ def load(
         file name is put in front of it, as in ``STEM/V.3``.
     time : str or int, optional
         Time column, by name or, in a single text file, by position from 0. Without `time` and `step`, the column called
-        t, time or seconds is used (any case, alone or with a unit as in ``time [ms]`` or ``t_ms``). Otherwise, with a
-        warning: a column with a name such as Timestamp or Zeit, the only column of dates, or a first column with a unit
-        of time. Otherwise the first column of every selected matrix is used; these must be equal. Dates and times of
-        day are converted to seconds since the first row.
+        t, time or seconds is used (any case, alone or with a unit as in ``time [ms]`` or ``t_ms``). Otherwise, the time
+        is, with a warning, a column with a name such as Timestamp or Zeit, the only column of dates, or a first column
+        with a unit of time. Otherwise it is the first column of each selected matrix; these columns must be equal.
+        Dates and times of day are converted to seconds since the first row.
     inputs, outputs : mapping of str to column, or list of str, optional
         Column by signal name, or a list of columns that keep their names; at least one output. The unit in a name such
         as ``I (A)`` may be omitted. If neither is given here, by `columns` or by an ftlm header, both are guessed from
         words in the column names as by :func:`ftlm.open_file`; the guess is listed in the `warnings` of the run, and
         ambiguous names raise an error.
     units : mapping of str to str, optional
-        Units of signals, from which values are converted to SI. They replace units that the file states in names such
+        Units of signals, from which values are converted to SI. They replace units in the file, which are in names such
         as ``y [deg]``, in a line of units or in attributes. With "" or without a unit, values are not converted.
     columns : mapping or path of a TOML file, optional
         Arguments in a mapping or file: keys ``time`` or ``step``, and tables ``inputs``, ``outputs``, ``units``,
@@ -142,9 +142,9 @@ def load_selection(
     options: LoadOptions,
     signals: Signals | None = None,
 ) -> Run:
-    """Load the run of a column selection.
+    """Load a run with a selection of columns; errors are those of :func:`load`.
 
-    `signals` are the inputs and outputs of an equation, for columns that are not selected.
+    `signals` are the inputs and outputs of an equation. They are used if the selection has no inputs and outputs.
     """
     run = run_from_tables(read_tables(path, selection.layout), selection, options, signals)
     PACKAGE_LOGGER.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
@@ -153,7 +153,7 @@ def load_selection(
 
 @dataclass(frozen=True)
 class LoadOptions:
-    """Further arguments of :func:`load`, of which `missing` is validated."""
+    """Arguments of :func:`load` that do not select columns; raise DataError for an unknown value of `missing`."""
 
     window: Sequence[float | None] | None = None
     resample: float | None = None
@@ -165,7 +165,7 @@ class LoadOptions:
         check_missing_policy(self.missing or "refuse")
 
     def missing_policy(self, header: Header | None) -> MissingPolicy:
-        """Return the treatment of missing samples: the given one, otherwise that which the ftlm header implies."""
+        """Return the treatment of missing samples: `missing` if given, otherwise the default for the ftlm header."""
         if self.missing is None and header is not None and header.missing:
             return "weight"
         return check_missing_policy(self.missing or "refuse")
@@ -178,9 +178,9 @@ Signals = tuple[Sequence[str], Sequence[str]]
 def run_from_tables(
     tables: list[FileTable], selection: ColumnSelection, options: LoadOptions, signals: Signals | None = None
 ) -> Run:
-    """Return the run of the selected columns of file tables.
+    """Return a run with the selected columns of file tables; errors are those of :func:`load`.
 
-    Columns that are not selected are chosen as in :func:`load`.
+    If the selection lacks a time, inputs or outputs, they are chosen as in :func:`load`, and `selection` is changed.
     """
     header = tables[0].header
     policy = options.missing_policy(header)
@@ -192,7 +192,7 @@ def run_from_tables(
     roles = _assume_roles(selection, pool, signals) if header is None else ()
     _check_disjoint_roles(selection, pool)
     if not selection.outputs:
-        # A column with text among its numbers is not taken as a signal by its name.
+        # A column that contains text does not become a signal by its name.
         words = next((f"; {c.problem}" for c in pool.columns if c.problem is not None and not c.blank), "")
         raise DataError(
             "no output is named, and the roles of the columns are not clear from their names; name the signals with "
@@ -249,7 +249,7 @@ def run_from_tables(
 
 @dataclass(frozen=True)
 class _TimeColumn:
-    """Time column: values, unit, label in error messages, column name, and notes."""
+    """Time column: values, unit, label in error messages, column name, and notes. No values if the step is given."""
 
     times: object = None
     unit: str = "s"
@@ -287,7 +287,7 @@ def _clock(selection: ColumnSelection, pool: Pool, columns: list[Column], option
 
 
 def _assume_roles(selection: ColumnSelection, pool: Pool, signals: Signals | None) -> tuple[Assumption, ...]:
-    """Choose inputs and outputs by column names if the selection has none, and return the assumptions."""
+    """Set inputs and outputs of a selection by column names if it has none, and return the assumptions."""
     if selection.inputs or selection.outputs:
         return ()
     matrices = list(dict.fromkeys(c.matrix for c in pool.columns if c.matrix is not None))
@@ -303,7 +303,7 @@ def base_name(path: Path) -> str:
 
 
 def _check_disjoint_roles(selection: ColumnSelection, pool: Pool) -> None:
-    """Raise DataError if a column is both an input and an output, because its model would be trivial."""
+    """Raise DataError if a column is an input and an output, because the model of this output would be trivial."""
     driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in selection.inputs.items()}
     twice = [
         (driven[id(column)], name)
@@ -327,7 +327,10 @@ def time_header(clock: Column) -> str:
 
 
 def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
-    """Return (file, HDF5 group) for each path; the group is "" for the whole file."""
+    """Return (file, HDF5 group) for each path; the group is "" for the whole file.
+
+    Raise DataError if a file is missing or given twice, or the files exceed 1 GiB in total.
+    """
     entries = [argument] if isinstance(argument, (str, os.PathLike)) else argument
     if not isinstance(entries, Sequence) or not all(isinstance(entry, (str, os.PathLike)) for entry in entries):
         raise DataError(f"path is a {type(argument).__name__}; pass the path of a file, or a list of paths")
@@ -348,7 +351,7 @@ def _paths(argument: PathLike | Sequence[PathLike]) -> list[tuple[Path, str]]:
 
 
 def _split_group(path: Path) -> tuple[Path, str]:
-    """Split a path such as ``runs.h5/run1`` into the HDF5 file and the group in it."""
+    """Split a path such as ``runs.h5/run1`` into the HDF5 file and the group; the group is "" for other paths."""
     for parent in path.parents:
         if parent.suffix.lower() in HDF5_FORMAT.suffixes and parent.is_file():
             return parent, path.relative_to(parent).as_posix()
@@ -358,7 +361,7 @@ def _split_group(path: Path) -> tuple[Path, str]:
 def run_paths(path: str) -> list[str]:
     """Return the paths of the runs in a file.
 
-    If several groups of an HDF5 file have a time column, each of them is a run.
+    If several groups of an HDF5 file have time columns, each group is a run. Otherwise the only path is `path`.
     """
     if Path(path).suffix.lower() not in HDF5_FORMAT.suffixes or not Path(path).is_file():
         return [path]
@@ -379,7 +382,7 @@ def _size(path: Path) -> int:
 
 
 def read_tables(path: PathLike | Sequence[PathLike], layout: Layout) -> list[FileTable]:
-    """Return the tables of files, with all their columns."""
+    """Return one table per path, with all columns; raise DataError if a file cannot be read."""
     places = _paths(path)
     read: dict[Path, FileTable] = {}
     kinds = {file: binary_format_of(file) for file, _ in places}
@@ -418,7 +421,10 @@ def select_columns(
     intersample: object,
     layout: object,
 ) -> ColumnSelection:
-    """Return the column selection from arguments and a columns file; arguments take precedence."""
+    """Return the column selection from arguments and a columns file; arguments take precedence.
+
+    Arguments are those of :func:`load`. Raise DataError for an invalid argument or file.
+    """
     specification = _columns_file(columns)
     if time is not None and step is not None:
         raise DataError(f"{parameter('time')} and {parameter('step')}: both are given; pass one of them")
@@ -461,7 +467,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
 
 
 def _apply_header(selection: ColumnSelection, header: Header) -> None:
-    """Complete a column selection in place by the ftlm header of a file."""
+    """Complete a column selection in place by the ftlm header of a file; raise DataError if units contradict it."""
     if selection.time is None and selection.step is None:
         selection.time = CSV_TIME
     if not selection.inputs and not selection.outputs:

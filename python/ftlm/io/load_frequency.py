@@ -20,7 +20,7 @@ from ftlm.utils.files import PACKAGE_LOGGER
 from ftlm.utils.parameters import PART_COLUMNS, parameter
 from ftlm.utils.validation import Complex, Floats, join_names, nearest
 
-#: Words of each part of a response, alone or beside the name z, h or g, as in ``zreal`` and ``im(z)``.
+#: Words for each part of a response, alone or combined with the letter z, h or g, as in ``zreal`` and ``im(z)``.
 _PART_WORDS = {
     "real": ("re", "real"),
     "imag": ("im", "imag", "img", "imaginary"),
@@ -52,26 +52,26 @@ _PART_SYNONYMS = {
 }
 _ANGULAR_FREQUENCY_NAMES = frozenset(("w", "omega", "ω", "angularfrequency", "kreisfrequenz", "rad/s"))
 _MINUS_PREFIX_PATTERN = re.compile(r"^(?:-|−|–|neg|minus)")
-#: Ohm sign, a look-alike of the Greek letter.
+#: Ohm sign, which looks like the Greek letter Omega.
 _OHM_SIGN = "\u2126"
 _SI_PREFIX_FACTORS = {"": 1.0, "m": 1e-3, "k": 1e3, "M": 1e6, "µ": 1e-6, "u": 1e-6, "G": 1e9}
 _PHASE_UNITS = ("deg", "rad", "mrad")
 _DIMENSIONLESS_UNITS = ("", "1", "-", "abs", "lin", "linear")
-#: Longer column names are not compared with the names of parts.
+#: Maximum length of column names that are compared with the names of parts.
 _MAX_PART_NAME_CHARACTERS = 60
-#: Minimum number of rows of a sweep; instruments repeat single frequencies as a check.
+#: Minimum number of rows of a sweep. Fewer rows are single frequencies that an instrument repeats as a check.
 MIN_SWEEP_ROWS = 3
-#: Relative tolerance between a magnitude column and real and imaginary part in the same file.
+#: Maximum relative difference of a magnitude column from the magnitude of real and imaginary part in the same file.
 _MAGNITUDE_TOLERANCE = 0.02
 
 
-#: Meaning of the columns in a file of three columns without a header line, as potentiostats export them.
+#: Parts of a response in a file of three columns without a header line, as potentiostats export it.
 HEADERLESS_PARTS = ("frequency", "real", "imag")
 
 
 @dataclass(frozen=True)
 class _ResponseColumn:
-    """Column of a frequency response: part, unit, and whether its name inverts the sign."""
+    """Column of a frequency response: part, unit, whether its name inverts the sign, and its recognized name."""
 
     column: Column
     part: str
@@ -101,11 +101,11 @@ def load_frequency(
     path
         File of any format that :func:`ftlm.load` reads.
     columns
-        Column by part: ``frequency``; ``real`` and ``imag``, or ``magnitude`` and ``phase``; ``deviation``, the
-        standard deviation of the real and of the imaginary part. By default columns are recognized by their names:
-        ``freq``, ``f``, ``omega``; ``Re``, ``Zreal``, ``Z'``; ``Im``, ``Zimag``, ``Z''`` and ``-Z''``, ``-Im(Z)`` (the
-        sign inverted); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``; ``sigma``. Three columns without
-        names are ``frequency``, ``real`` and ``imag``, with a warning.
+        Name or position of the column of each part: ``frequency``; ``real`` and ``imag``, or ``magnitude`` and
+        ``phase``; ``deviation``, the standard deviation of the real and of the imaginary part. By default, columns are
+        recognized by their names: ``freq``, ``f``, ``omega``; ``Re``, ``Zreal``, ``Z'``; ``Im``, ``Zimag``, ``Z''`` and
+        ``-Z''``, ``-Im(Z)`` (the sign inverted); ``|Z|``, ``gain``, ``magnitude``, ``dB``; ``phase``, ``deg``;
+        ``sigma``. Three columns without names are ``frequency``, ``real`` and ``imag``, with a warning.
     frequency_unit
         ``"Hz"``, ``"kHz"``, ``"MHz"``, ``"mHz"`` or ``"rad/s"``. By default the unit in the column name, such as
         ``freq/Hz``, ``f [Hz]`` or ``f_Hz``; without one, rad/s for a column called omega and Hz for others, with a
@@ -115,10 +115,10 @@ def load_frequency(
     phase_unit
         ``"deg"`` or ``"rad"``; by default the unit of the column, or ``"deg"`` with a warning.
     negated
-        Whether the file has the negative imaginary part (or phase); by default if its column name begins with a minus
-        sign.
+        Whether the file has the negative imaginary part (or phase). The default is True if the name of this column
+        begins with a minus sign, otherwise False.
     output, input
-        Names of the output and the input; "" (default) stands for the only ones of the structure.
+        Names of the output and the input; "" (default) means the only output or input of the structure.
     name
         Name of the data in reports; default the name of the file.
     layout
@@ -172,10 +172,10 @@ def load_frequency(
 
 
 def _describe_sweeps(omega: Floats, response: Complex) -> list[str]:
-    """Return a note on how far repeated sweeps differ; [] if the rows are one sweep.
+    """Return a note on the relative difference between repeated sweeps; [] if the rows are one sweep.
 
-    A sweep is a stretch of rows whose frequencies rise or fall. A later sweep is compared with the first one, linearly
-    interpolated over the logarithm of the frequency, in the range that both cover.
+    A sweep is a contiguous block of rows with increasing or decreasing frequencies. In the common frequency range, each
+    later sweep is compared with the first sweep, which is interpolated linearly over the logarithm of the frequency.
     """
     steps = np.sign(np.diff(omega))
     reversals = np.flatnonzero(steps == -np.sign(np.sum(steps))) + 1
@@ -197,7 +197,7 @@ def _describe_sweeps(omega: Floats, response: Complex) -> list[str]:
 
 
 def is_response(pool: Pool) -> bool:
-    """Whether the column names denote a frequency response."""
+    """Whether the column names are those of a frequency response, so that no argument is needed to load it."""
     try:
         _find_parts(pool)
     except DataError:
@@ -206,7 +206,7 @@ def is_response(pool: Pool) -> bool:
 
 
 def _find_parts(pool: Pool) -> dict[str, _ResponseColumn]:
-    """Return the columns of a frequency response by part; raise DataError if a part is ambiguous."""
+    """Return the columns of a frequency response by part; raise DataError if a part is ambiguous or missing."""
     parts: dict[str, _ResponseColumn] = {}
     for column in pool.columns:
         item = _recognize_column(column)
@@ -288,7 +288,7 @@ def _phase_unit(unit: str) -> str | None:
 
 
 def _recognize_column(column: Column) -> _ResponseColumn | None:
-    """Return the part of a response that a column name denotes, such as ``Re(Z)`` or ``dB``; None if unknown."""
+    """Return the part of a response by the name of its column, such as ``Re(Z)`` or ``dB``; None if unknown."""
     whole, file_unit = column.name.strip(), column.file_unit
     own = whole if _unit_kind(whole) else file_unit if _unit_kind(file_unit) else ""
     for text, unit in ((whole, own), _split_name_and_unit(column)):
@@ -330,7 +330,7 @@ def _frequencies(item: _ResponseColumn, option: str | None, notes: list[str]) ->
 
 
 def _ohms(unit: str) -> float | None:
-    """Return the conversion factor of an impedance unit, such as mΩ, to ohm; None for other units."""
+    """Return the factor that converts an impedance unit, such as mΩ, to Ω; None for other units."""
     text = unit.replace(_OHM_SIGN, "Ω")
     for ending in ("ohm", "Ohm", "OHM", "ohms", "Ohms", "Ω", "ω"):
         if text.endswith(ending) and text[: -len(ending)] in _SI_PREFIX_FACTORS:
@@ -339,7 +339,7 @@ def _ohms(unit: str) -> float | None:
 
 
 def _magnitude_scale(item: _ResponseColumn) -> tuple[float, str]:
-    """Return the conversion factor to SI and the SI unit of a magnitude."""
+    """Return (conversion factor to SI, SI unit) of a magnitude; the unit is "" if dimensionless or not stated."""
     if not item.unit or item.unit.casefold() in _DIMENSIONLESS_UNITS:
         return 1.0, ""
     factor = _ohms(item.unit)
@@ -414,7 +414,10 @@ def _polar(
 def _resolve_unit(
     what: str, item: _ResponseColumn, option: str | None, choices: tuple[str, ...], unit: str | None, notes: list[str]
 ) -> str:
-    """Return the unit of a column: given by the user, stated by the file, or assumed, with a note added to `notes`."""
+    """Return the unit of a column: the option of the user, else the unit in the file, else the first of `choices`.
+
+    In the last case, a note is added to `notes`. Raise DataError if the option is unknown or contradicts the file.
+    """
     if option is not None:
         if option not in choices:
             hint = nearest(option, choices)
@@ -443,7 +446,7 @@ def _truth(name: str, value: object) -> bool:
 
 
 def _compare(parts: Mapping[str, _ResponseColumn], response: Complex, notes: list[str]) -> None:
-    """Add a note if a redundant magnitude column disagrees with real and imaginary part."""
+    """Add a note to `notes` if a redundant magnitude column differs from the magnitude of the response by over 2 %."""
     item = parts["magnitude"]
     if item.unit.casefold() == "db" or item.column.problem is not None:
         return

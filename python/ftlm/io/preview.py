@@ -41,7 +41,7 @@ _MAX_LISTED_COLUMNS = 40
 _ARC_CIRCUIT = "R0-p(R1,CPE1)"
 #: Names of time columns that imply seconds.
 _SECONDS_COLUMN_NAMES = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
-#: Part of a column's error message about its first bad cell.
+#: Part of the error message of a column that describes its first bad cell.
 _IN_LINE = re.compile(r"line \d+: .*?(?=, first at)")
 
 
@@ -54,9 +54,9 @@ class FileColumn:
     name : str
         Name in the file.
     role : str
-        ``"time"``, ``"input"``, ``"output"``, or "" for none.
+        ``"time"``, ``"input"``, ``"output"``, or "" for an unused column.
     signal : str
-        Signal name, if the column is an input or an output.
+        Signal name of an input or output; otherwise "".
     unit : str
         Unit in the file; "" if there is none.
     first, low, high : float or None
@@ -90,15 +90,15 @@ class OpenedFile:
     columns : tuple of FileColumn
         Summaries of the columns.
     layout : Layout
-        Layout with all options.
+        Layout of the file, with given and detected options.
     assumed : tuple of Assumption
-        Assumptions, each with the option that sets it explicitly.
+        Assumptions about layout, time and roles, each with the argument that replaces it.
     options : dict
-        Arguments of :func:`ftlm.load` that give the same run explicitly, without assumptions.
+        Arguments of :func:`ftlm.load` that give the same run without assumptions.
     step : float or None
         Sampling interval [s]; None if `problem` is set.
     problem : str
-        Reason why the file cannot be loaded as a run yet, with a remedy; "" if it can.
+        Reason why the file cannot be loaded as a run without further arguments, with a remedy; "" if it can.
     notes : tuple of str
         Warnings of the run.
     """
@@ -115,7 +115,7 @@ class OpenedFile:
     notes: tuple[str, ...] = ()
 
     def load(self) -> Run:
-        """Load the file as a run, with all assumptions as explicit arguments, and return the run."""
+        """Load the file with `options` as arguments, and return the run; raise DataError as :func:`ftlm.load` does."""
         return load(self.path, **self.options)
 
     def command(self, verb: str = "identify") -> str:
@@ -124,8 +124,8 @@ class OpenedFile:
         Parameters
         ----------
         verb
-            Command of `ftlm`: ``identify``, ``inspect`` or ``select``. The structure in it is chosen automatically, for
-            the first output if there are several.
+            Command of `ftlm`: ``identify``, ``inspect`` or ``select``. For ``identify`` and ``select`` the structure is
+            chosen automatically, for the first output if there are several.
         """
         if self.problem:
             return ""
@@ -189,7 +189,7 @@ class OpenedFile:
         return [] if self.problem else [self.command("inspect"), self.command("identify")]
 
     def _flags(self) -> list[str]:
-        """Return the command-line options that correspond to `options`."""
+        """Return the command-line arguments that correspond to `options`, without those that equal a default."""
         options = self.options
         # Options that are detected reliably or equal the default are omitted.
         plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
@@ -230,7 +230,8 @@ def open_file(
     """Return a preview of a file: columns, units, roles, assumptions and a command for the next step.
 
     Unless given, time column and roles are inferred from column names, and units from names or a line of units. The
-    result lists them with the corresponding arguments of :func:`ftlm.load`. Nothing is inferred from the values.
+    result lists these inferences with the corresponding arguments of :func:`ftlm.load`. Nothing is inferred from the
+    values.
 
     Parameters
     ----------
@@ -247,7 +248,8 @@ def open_file(
     Raises
     ------
     DataError
-        If the file is missing, damaged or ambiguous. Other reasons why it cannot be loaded are in `problem`.
+        If the file is missing, damaged or has an ambiguous layout. For other reasons why it cannot be loaded, the
+        result has a `problem`.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
@@ -256,14 +258,14 @@ def open_file(
 
 
 def preview_selection(path: PathLike, selection: ColumnSelection, options: LoadOptions) -> OpenedFile:
-    """Return a preview of a file with a selection of its columns."""
+    """Return a preview of a file with a selection of its columns; see :func:`open_file`."""
     (table,) = read_tables(path, selection.layout)
     return _FilePreview(table, Pool([table]), selection, options).result(os.fspath(path))
 
 
 @dataclass
 class _FilePreview:
-    """Builder of the preview of a file."""
+    """Builder of the preview of a file; :meth:`result` returns it."""
 
     table: FileTable
     pool: Pool
@@ -292,7 +294,7 @@ class _FilePreview:
         return OpenedFile(path, table.kind, rows, columns, table.layout, assumed, options, step, problem, notes)
 
     def _named_signals(self) -> set[str]:
-        """Return the existing columns that the user names as inputs or outputs."""
+        """Return the names of the columns that the user selects as inputs or outputs, if they exist."""
         names = set[str]()
         for spec in (*self.selection.inputs.values(), *self.selection.outputs.values()):
             with contextlib.suppress(DataError):
@@ -300,7 +302,7 @@ class _FilePreview:
         return names
 
     def _time(self, every: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
-        """Return the time column, assumptions about it, and a problem if there is none."""
+        """Return the time column, assumptions about it, and "" or a text on why there is no time column."""
         selection, header = self.selection, self.table.header
         if header is not None and selection.time is None and selection.step is None:
             selection.time = CSV_TIME
@@ -333,7 +335,7 @@ class _FilePreview:
     def _roles(
         self, every: list[Column], clock: Column | None
     ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
-        """Return (role, signal) by column, assumptions, and a problem if the roles are unknown."""
+        """Return (role, signal) by column, assumptions, and "" or a text on why the roles are unknown."""
         selection, header = self.selection, self.table.header
         assumptions = tuple[Assumption, ...]()
         if header is not None and not selection.inputs and not selection.outputs:
@@ -376,7 +378,7 @@ class _FilePreview:
         return (Assumption("time_unit", "s", words, f"{parameter('time_unit', Placeholder('UNIT'))}", False),)
 
     def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
-        """Return the arguments of `load` that give the same run explicitly."""
+        """Return the arguments of :func:`ftlm.load` that give the same run without assumptions."""
         selection = self.selection
         options: dict[str, Any] = {"step": selection.step} if selection.step is not None else {}
         if clock is not None and self.table.header is None:
@@ -397,7 +399,7 @@ class _FilePreview:
 
 
 def _first_bad_cell(column: Column) -> str:
-    """Return the first cell of a column that is not a number, with its line, as text."""
+    """Return text on the first cell of a column that is not a number, with its line; "" if the error has none."""
     match = _IN_LINE.search(str(column.problem))
     return "" if match is None else match[0]
 
@@ -432,7 +434,7 @@ def _figures(column: FileColumn) -> tuple[str, str, str]:
 
 
 def _truncate_text(text: str) -> str:
-    """Return a text with a limited length and with escaped control characters."""
+    """Return at most 60 characters of a text, with an ellipsis if it is longer, and with unprintable ones escaped."""
     return _escape_nonprintable(text[:60]) + ("…" if len(text) > 60 else "")
 
 

@@ -1,4 +1,4 @@
-"""Columns of one or several files under unique names, and detection of the time column."""
+"""Columns of one or several files with unique names, and detection of the time column."""
 
 from __future__ import annotations
 
@@ -51,8 +51,24 @@ _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 class Column:
     """Column of a file: its numbers, or the reason why it is not a column of numbers.
 
-    `blank` is True if all invalid cells are empty (NaN), `timestamps` are the dates of the column, and `file_unit` is
-    its unit in the file.
+    Parameters
+    ----------
+    variable, name
+        Name in the file, and unique name over all files.
+    source
+        Path of the file, with any HDF5 group.
+    values
+        Numbers, shape (N,); None if there are none.
+    problem
+        Error to raise if the column is used as numbers; None for a column of numbers.
+    matrix
+        Name of the matrix of which this is a column; None for a vector.
+    blank
+        Whether all invalid cells are empty, so that they are NaN in `values`.
+    timestamps
+        Dates or times of day of the column; None if it has none.
+    file_unit
+        Unit in the file; "" if there is none.
     """
 
     variable: str
@@ -72,7 +88,7 @@ class Column:
         return f"{bare} [{unit}]" if unit and unit == self.file_unit else self.name
 
     def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
-        """Return the numbers of the column; raise its error if it has none. With `blank`, empty cells are allowed."""
+        """Return the numbers of the column; raise its error if it has other cells. `blank` allows empty cells (NaN)."""
         if blank and self.blank and self.values is not None:
             return self.values
         if self.problem is not None or self.values is None:
@@ -81,13 +97,31 @@ class Column:
 
 
 def dates_problem(thing: str, words: str, rows: int) -> DataError:
-    """Return the error for a column of dates or times of day that is used as numbers."""
+    """Return the DataError for a column of dates or times of day that is used as numbers."""
     return bad_rows(thing, words, 0, rows, f"name it with {parameter('time')}, or choose another column")
 
 
 @dataclass(frozen=True)
 class FileTable:
-    """Columns of one file, with its format, layout and the assumptions made."""
+    """Columns of one file, with its format, its layout and the assumptions of the reader.
+
+    Parameters
+    ----------
+    path
+        Path of the file, with any HDF5 group.
+    columns
+        Columns in the order of the file.
+    text
+        Whether columns may be selected by position, as in a text file.
+    header
+        Header of a run that ftlm wrote; None for other files.
+    skipped
+        Reason why a part of the file was not read, by name.
+    layout, assumed
+        Layout of a text or sheet, and assumptions about it.
+    kind
+        File format, as text.
+    """
 
     path: Path
     columns: list[Column]
@@ -106,7 +140,7 @@ class FileTable:
         return groups if len(groups) > 1 else ()
 
     def in_group(self, group: str) -> FileTable:
-        """Return the columns of an HDF5 group, with their names within the group.
+        """Return a table of the columns in an HDF5 group, with their names within the group.
 
         Raises
         ------
@@ -129,7 +163,7 @@ class FileTable:
 
 
 class Pool:
-    """Columns of all files, with unique names."""
+    """Columns of all files with unique names: a name that several files have gets the file name as a prefix."""
 
     def __init__(self, tables: list[FileTable]) -> None:
         self._tables = tables
@@ -161,7 +195,7 @@ class Pool:
         return tuple(name for name in self._columns if name)
 
     def describe(self) -> str:
-        """Return text on the available columns, for error messages."""
+        """Return text on the available columns and on skipped parts of the files, for error messages."""
         skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
         text = f"the columns are {join_names(self.names)}"
         if skipped:
@@ -169,7 +203,10 @@ class Pool:
         return text
 
     def find(self, spec: object, thing: str) -> Column:
-        """Return the column with a given name or position; raise DataError if there is none."""
+        """Return the column with the name or position `spec`; raise DataError if there is none.
+
+        `thing` is the use of the column in messages. A name may omit its unit, and ``V(:,1)`` means ``V.1``.
+        """
         if isinstance(spec, int) and not isinstance(spec, bool):
             return self._at(spec, thing)
         if not isinstance(spec, str):
@@ -204,16 +241,21 @@ class Pool:
         return columns[position]
 
     def time(self, spec: object, matrices: Iterable[str], signals: Collection[str]) -> tuple[Column, Assumption | None]:
-        """Return the time column, given or detected by name and position, and an assumption if it was detected.
+        """Return the time column, and the assumption about it if it was detected and may be wrong.
 
         Parameters
         ----------
         spec
             Name or position of the column; None to detect it.
         matrices
-            Names of the selected matrices, whose first columns may be the time.
+            Names of the matrices whose first columns are the time if no other column is.
         signals
-            Names of the columns used as signals, which can be the time only if `spec` names them.
+            Names of the columns that are used as signals. They are the time only if `spec` is one of them.
+
+        Raises
+        ------
+        DataError
+            If there is no time column or several candidates, or times of different files differ.
         """
         if spec is not None:
             return self.find(spec, "time"), None
@@ -247,14 +289,15 @@ class Pool:
         return clocks[0], assumed
 
     def _clocks(self, table: FileTable, signals: Collection[str]) -> tuple[list[Column], str]:
-        """Return candidates for the time column of a file, and the reason if the choice is an assumption.
+        """Return candidates for the time column of a file, and the reason for the choice if it is an assumption.
 
-        The most reliable criterion that finds any candidate is used.
+        The first criterion with a candidate is used: t, time or seconds; another name of a time; dates; first column
+        with a unit of time.
         """
         others = [c for c in self._columns.values() if c.source == table.path and c.name not in signals]
         own = [c for c in others if c.matrix is None]
         groups = {name.rpartition("/")[0] for name in signals}
-        # A group of an HDF5 file is a run of its own.
+        # Each group of an HDF5 file is a separate run.
         if groups != {""}:
             own = [c for c in own if {c.name.rpartition("/")[0]} == groups] or own
         sure = [c for c in own if is_time_name(c.variable) or is_time_name(c.variable.rpartition("/")[2])]
@@ -272,7 +315,7 @@ class Pool:
 
 
 def date_order_assumption(clock: Column, dates: str | None) -> Assumption | None:
-    """Return the assumption on the order of day and month in a date column; None if there is none."""
+    """Return the assumption on the order of day and month in a time column; None if no order was assumed."""
     order = "" if clock.timestamps is None else clock.timestamps.inferred_date_order(dates)
     if clock.timestamps is None or not order:
         return None

@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 
 class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Free parameters of an output-error fit, with covariance and noise, from which the next experiment is designed.
+    """Free parameters of an output-error fit, with covariance and noise, as required for experiment design.
 
     Parameters
     ----------
     names
-        Names of the free orders, the free coefficients, then the free delays and limits of inputs.
+        Names of the free orders, then of the free coefficients, then of the free delays and limits of inputs.
     orders
-        Every order of the model as an expression of free orders: for each equation alpha, then each term's order.
+        All orders of the model as expressions of free orders: for each equation alpha, then the order of each term.
     products
-        Coefficients that follow from a coefficient law: (sign, names of the factors) by name.
+        Coefficients that a coefficient law determines, by name: (sign, names of the factors).
     covariance
         Covariance of the free parameters in the order of `names`; None if it is not finite.
     noise
@@ -55,7 +55,7 @@ class FitParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Details of a model's estimation, which are stored with it so that a report requires no other file.
+    """Results of the identification of a model, which its file contains, so that a report requires no other file.
 
     Parameters
     ----------
@@ -64,14 +64,15 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     runs
         Names of the runs.
     values, standard_errors
-        Estimates of orders and coefficients by name, and their standard errors if available.
+        Estimates of orders and coefficients by name, and their standard errors by name, None if not available.
     covariance
-        Covariance of all parameters in the order of the equations: alpha, then order and coefficient of each term, then
-        friction coefficients (fc, fs, vs). None if the estimator gives none. It is singular if laws relate parameters.
+        Covariance of all orders and coefficients. For each equation, its rows are alpha, then order and coefficient of
+        each term, then friction parameters (fc, fs, vs). None if the estimator gives none. It is singular if laws
+        relate parameters.
     fit
-        Fit of the simulation to these runs in percent, by output.
+        Fit of the simulation to the runs of the identification [%], by output.
     information
-        Information criteria, if available.
+        Values of the information criteria by name; None if not available.
     intervals
         95 % profile-likelihood intervals (low, high) by name, with None for an unbounded side. Parameters that are not
         listed have Wald intervals of ± 1.96 standard errors.
@@ -80,10 +81,10 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     findings
         Findings about data, fit and model.
     against
-        Findings against the model at its identification, from which its verdict follows.
+        Findings against the model at its identification, which determine its verdict.
     piece_duration
-        Shortest duration [s] of the pieces, with separate initial values, into which the runs of an unstable plant were
-        split. Comparisons split other runs in the same way. None if whole runs were simulated.
+        Minimum duration [s] of the segments into which the runs of an unstable plant were split, each with its own
+        initial values. Comparisons split other runs in the same way. None if whole runs were simulated.
     """
 
     method: str
@@ -103,7 +104,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 @check_arguments
 @dataclass(frozen=True)
 class Model:
-    """Model: a structure with numerical orders and coefficients.
+    """Model: a structure with fixed orders and coefficients.
 
     Parameters
     ----------
@@ -114,16 +115,16 @@ class Model:
     units
         SI units of the signals by name, as far as known.
     m
-        Number of block pulses of the identification, which comparisons use by default.
+        Number of block pulses in the identification, which is the default for comparisons; None if not applicable.
     about
-        Metadata on the origin of the model, such as method and runs.
+        Metadata about the origin of the model, such as method and runs.
     estimate
-        Standard errors, covariance and warnings of the identification; None for a model defined by hand.
+        Standard errors, covariance and findings of the identification; None for a model without identification.
 
     Raises
     ------
     ModelError
-        If a free order or coefficient has no value, or a value is not finite.
+        If an order, coefficient, delay or limit is free, a coefficient is not finite, or the offset is ``"auto"``.
     """
 
     structure: Structure
@@ -151,7 +152,7 @@ class Model:
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Values of the coefficients by name."""
+        """Values of all coefficients with a name, including friction parameters, by name."""
         values = {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
         for item in self.equations:
             values |= {} if item.friction is None else item.friction.identified_coefficients
@@ -171,7 +172,7 @@ class Model:
     def linearized(self, at: Mapping[str, float]) -> Model:
         """Return the linear model of small deviations from an operating point.
 
-        Every non-linear term is replaced by its first-order expansion. Constants are dropped, so signals of the linear
+        Every non-linear term is replaced by its first-order expansion. Constants are omitted, so signals of the linear
         model are deviations from the operating point.
 
         Parameters
@@ -183,7 +184,8 @@ class Model:
         Raises
         ------
         ModelError
-            If a signal has no value, a name is in no non-linear term, or a term has no derivative at the point.
+            If `at` lacks a signal of a non-linear term or contains another name, or a term has no derivative at the
+            point.
         """
         from ftlm.analysis.model_algebra import linearize
 
@@ -248,7 +250,7 @@ class Model:
 
     @check_arguments
     def poles(self, *, coupling: str = "simulated") -> Complex:
-        """Return the poles [rad/s] of a model of any orders; see :func:`ftlm.analysis.poles`."""
+        """Return the poles [rad/s] on the principal Riemann sheet; see :func:`ftlm.analysis.poles`."""
         from ftlm.analysis.poles import poles
 
         return poles(self, coupling=coupling)
@@ -284,15 +286,15 @@ class Model:
         Returns
         -------
         TimeResponse
-            Response with ``.time``, ``.values`` of shape (outputs, inputs, N), and ``.deviation``, the standard
-            deviation from the covariance or None.
+            Response with ``.time`` [s], ``.values`` of shape (outputs, inputs, N), and ``.deviation``, the standard
+            deviation of the values, or None without a covariance.
 
         Raises
         ------
         DataError
             If the sample times are not uniform from 0.
         ModelError
-            An input with saturation or dead zone.
+            If an input has a saturation or dead zone.
         ConvergenceError
             If the response of an unstable model overflows.
         """
@@ -302,7 +304,7 @@ class Model:
 
     @check_arguments
     def impulse(self, time: ArrayLike | None = None) -> TimeResponse:
-        """Return the response to unit impulses, averaged over each sampling interval; otherwise like :meth:`step`."""
+        """Return the response to unit impulses as means over sampling intervals; otherwise as :meth:`step`."""
         from ftlm.plot.model_charts import time_response
 
         return time_response(self, time, "impulse")
@@ -319,14 +321,14 @@ class Model:
         Returns
         -------
         Bode
-            Result with ``.frequency`` [rad/s] and ``.curves``, which have gain [dB] and phase [degrees].
+            Result with ``.frequency`` [rad/s] and ``.curves``, each with gain [dB] and phase [degrees].
 
         Raises
         ------
         DataError
             If a frequency is negative or not finite.
         ModelError
-            An input with saturation or dead zone.
+            If an input has a saturation or dead zone.
         """
         from ftlm.plot.model_charts import bode
 
@@ -344,14 +346,14 @@ class Model:
             ``control.StateSpace`` or ``control.TransferFunction``. The equations represent its transfer functions.
             Uncontrollable or unobservable parts are removed only if they cancel exactly.
         inputs, outputs
-            Names of the signals. By default the names in the system, where ``u[0]`` becomes ``u``, or ``u0`` if there
-            are several.
+            Names of the signals. The default is the names in the system, where ``u[0]`` becomes ``u``, or ``u0`` if
+            there are several signals.
 
         Raises
         ------
         ModelError
-            If the system is discrete-time or of another type, an output has no dynamics or no input, there are more
-            zeros than poles, an order is above 10, or names are invalid or too few.
+            If the system is discrete-time or of another type, an output has no poles or no input, a transfer function
+            has more zeros than poles, an order is above 10, or names are invalid or of a wrong number.
         """
         from ftlm.analysis.conversion import structure_of
 
@@ -366,7 +368,7 @@ class Model:
 
     @check_arguments
     def series(self, following: Model) -> Model:
-        """Return the exact series connection: the output of this model is the input of `following`.
+        """Return the exact series connection, in which the output of this model is the input of `following`.
 
         Both models must have one output and one input. Their delays are added. Common factors are not canceled.
 
@@ -382,7 +384,7 @@ class Model:
 
     @check_arguments
     def parallel(self, other: Model) -> Model:
-        """Return the exact parallel connection: the sum of both outputs from the same input.
+        """Return the exact parallel connection, the sum of the outputs of both models for the same input.
 
         Both models must have one output and one input. Common factors are not canceled.
 
@@ -428,7 +430,7 @@ class Model:
         return inverse(self)
 
     def to_tf(self) -> Any:
-        """Return an exact python-control TransferFunction of a model of integer orders.
+        """Return an exact python-control TransferFunction of this model, which must have integer orders.
 
         See :func:`ftlm.analysis.to_tf`.
         """
@@ -438,7 +440,7 @@ class Model:
 
     @check_arguments
     def to_ss(self, *, step: float | None = None) -> Any:
-        """Return an exact python-control StateSpace of a model of integer orders; see :func:`ftlm.analysis.to_ss`."""
+        """Return an exact python-control StateSpace if all orders are integers; see :func:`ftlm.analysis.to_ss`."""
         from ftlm.analysis.conversion import to_ss
 
         return to_ss(self, step=step)
@@ -473,6 +475,6 @@ class Model:
 
 
 def check_model(model: object) -> None:
-    """Raise ModelError if an object is not a model."""
+    """Raise ModelError if an object is not a :class:`Model`."""
     if not isinstance(model, Model):
         raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")

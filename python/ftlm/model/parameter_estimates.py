@@ -26,15 +26,15 @@ class Parameter:
     value
         Estimate, or the given value of a fixed parameter.
     standard_error
-        Standard error; NaN if the parameter is fixed or the method gives none, infinite if the parameter is not
-        identifiable.
+        Standard error in the unit of the value; NaN if the parameter is fixed or the method gives none, infinite if the
+        parameter is not identifiable.
     interval
         (low, high) of the 95 % confidence interval, from the standard error or by profile likelihood. A bound is
         infinite if the data do not bound the parameter, and NaN without a standard error.
     unit
         SI unit; empty if the parameter is dimensionless or the unit of a signal is unknown.
     fixed
-        Whether the value was given by the user, not estimated.
+        Whether the user gave the value, so that it is not an estimate.
     """
 
     name: str
@@ -69,11 +69,11 @@ def parameter_estimates(
     Parameters
     ----------
     model
-        Model or circuit, for the units.
+        Model or circuit that gives the units of the parameters.
     values, errors, intervals
-        Values by name; standard errors and 95 % intervals by name for those that have them.
+        Values, standard errors and 95 % intervals by name. Errors and intervals may be missing.
     free
-        Names of the estimated parameters; the others are fixed.
+        Names of the estimated parameters; all other parameters are fixed.
     """
     units = model.units if isinstance(model, Circuit) else parameter_units(model)
     none = (math.nan, math.nan)
@@ -89,9 +89,10 @@ def offset_estimates(
     offsets: Sequence[Mapping[str, Mapping[str, float]]],
     errors: Sequence[Mapping[str, Mapping[str, float]]],
 ) -> dict[str, Parameter]:
-    """Return the offsets of each run as parameters by name.
+    """Return the offsets of all runs as parameters by name, such as ``constant_y[run]``.
 
-    `offsets` and their standard errors have a mapping output -> kind -> value for each run; `errors` may be empty.
+    `offsets` and their standard `errors` have, for each run, the value by output and kind of offset. `errors` may be
+    empty.
     """
     orders = {e.output: e.order.constant for e in model.equations}
     out = {}
@@ -109,7 +110,7 @@ def offset_estimates(
 
 
 def parameter_frame(parameters: Iterable[Parameter], reference_values: Mapping[str, float]) -> Any:
-    """Return a pandas DataFrame of parameters: value, standard error, 95 % interval, unit, nominal value."""
+    """Return a pandas DataFrame of parameters with value, standard error, 95 % interval, unit and nominal value."""
     rows = [
         {
             "parameter": p.name,
@@ -127,7 +128,7 @@ def parameter_frame(parameters: Iterable[Parameter], reference_values: Mapping[s
 
 
 def parameter_units(model: Model) -> dict[str, str]:
-    """Return the units of coefficients, friction, delays and limits by name, as far as known."""
+    """Return the units of coefficients, friction parameters, delays and limits by name; unknown units are omitted."""
     out = {}
     for item in model.equations:
         alpha = item.order.constant

@@ -21,14 +21,14 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import error_text
 
-#: Version of the schema of model files. Files of other versions, which no release wrote, are refused.
+#: Schema version of model files. Files of other versions are rejected; no release wrote such files.
 MODEL_SCHEMA = 13
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
     """Term ``factor * coefficient * D^order signal`` of an equation in a model file.
 
-    `name` is the name of the coefficient as a parameter. A non-linear term is stored with the text of its expression.
+    Fields are those of :class:`ftlm.structure.equation.Term`, with the expression of a non-linear term as text.
     """
 
     signal: str
@@ -51,7 +51,7 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Coulomb friction ``factor * coefficient * sign(D y)`` in a model file, with any Stribeck term."""
+    """Coulomb friction ``factor * coefficient * sign(D y)`` in a model file, with its Stribeck term if it has one."""
 
     coefficient: float
     factor: float = -1.0
@@ -60,7 +60,7 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, rubs: Friction) -> FrictionFile:
-        """Return the file form of a friction."""
+        """Return the file form of the friction of an equation."""
         return cls(float(rubs.coefficient), rubs.factor, rubs.name, rubs.stribeck)
 
     def friction(self) -> Friction:
@@ -69,12 +69,12 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @property
     def count(self) -> int:
-        """Number of friction parameters."""
+        """Number of friction parameters in a covariance: 1, or 3 with a Stribeck term."""
         return 1 if self.stribeck is None else 3
 
 
 class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Equation with numerical orders in a model file."""
+    """Equation of a model file, whose orders are numbers."""
 
     output: str
     order: float
@@ -96,12 +96,12 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
 
     @property
     def count(self) -> int:
-        """Number of parameters of the equation in a covariance: orders, coefficients and friction."""
+        """Number of orders, coefficients and friction parameters of the equation, as in a covariance."""
         return 1 + 2 * len(self.terms) + (0 if self.friction is None else self.friction.count)
 
 
 class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
-    """File form of a model, without data that only the identification requires."""
+    """File form of a model; order grids, laws and nominal values, which only an identification uses, are omitted."""
 
     format: Literal["ftlm-model"]
     schema: int
@@ -167,12 +167,12 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         return Model(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
-#: Model files have a few kilobytes; the default size limit suffices.
+#: JSON format of model files.
 MODEL_FORMAT = JsonFormat("model", "a file written by save()", ModelFile, MODEL_SCHEMA)
 
 
 def write_model(model: Model, path: str | os.PathLike[str], *, force: bool) -> Path:
-    """Write a model to a JSON file, atomically, and return the path; see :meth:`ftlm.Model.save`."""
+    """Write a model to a JSON file atomically, and return the path; for errors see :meth:`ftlm.Model.save`."""
     data = msgspec.json.format(msgspec.json.encode(ModelFile.of(model)), indent=2)
     return write_atomically(path, data + b"\n", force=force)
 
@@ -189,8 +189,8 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     Returns
     -------
     Model
-        Model with bit-identical numbers, without data that only the identification requires (order grids, laws, nominal
-        values).
+        Model with bit-identical numbers. Order grids, laws and nominal values are not stored, because only an
+        identification uses them.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Discretization of a run for a structure: block-pulse means of the signals, and the times of compared samples."""
+"""Discretization of a run for a structure: block-pulse means of signals, and sample times for comparisons."""
 
 from __future__ import annotations
 
@@ -29,18 +29,20 @@ from ftlm.structure.structure import Initial, Offset, Structure, check_offset_re
 from ftlm.utils.parameters import Placeholder, choose_text, parameter, setting
 from ftlm.utils.validation import Floats, check_pulses, nearest
 
-#: Default number of block pulses, that of the paper, for runs with as many samples.
+#: Default number of block pulses (the value of the paper), for runs with at least as many sampling intervals.
 DEFAULT_PULSES = 2048
-#: Maximum number of pulses of a record: 2^24 of one signal are 128 MB.
+#: Maximum number of block pulses of a record: 2^24 pulses of one signal take 128 MB.
 MAX_M = 1 << 24
-#: Maximum relative excess of a negative delay over one sampling interval that is rounding.
+#: Maximum excess of a negative delay over one sampling interval, relative to the interval, that counts as rounding.
 MAX_EARLY_ROUNDING = 1e-9
 COULOMB_PREFIX = "coulomb_"
-#: Placeholder for the column in a line of a columns file.
+#: Placeholder for a column name in error messages that show lines of a file for the option ``columns``.
 QUOTED_COLUMN = '"COLUMN"'
-#: Number of cached series of sensor filters: long ones, and those of at most this many pulses.
+#: Cache of power series of sensor filters: number of long series, maximum pulses of a short series, and number of
+#: short series.
 CACHED_LONG_SERIES, SHORT_SERIES_PULSES, CACHED_SHORT_SERIES = 4, 1 << 13, 32
-#: Initial terms as the core takes them.
+#: Initial conditions as the Rust core takes them: whether they are Caputo's, given exponents of t, index of the offset
+#: option in ("none", "constant", "ramp", "level"), and number of filter states. The last two may be absent.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
 
 
@@ -51,23 +53,23 @@ class Record:
     Parameters
     ----------
     signals
-        Signal names, in the order of the rows.
+        Names of the rows: signals, then the texts of non-linear terms.
     step
         Width of a block pulse [s].
     means
-        Means over the block pulses, of shape (signals, pulses).
+        Means over the block pulses, shape (rows, pulses).
     inputs
-        Whether each signal is an input of the run.
+        Whether each row is an input of the run or a non-linear term.
     sensor
-        Power series of the sensor filter, which is applied to every signal that was not measured through it; None
-        without a filter.
+        Power series of the sensor filter on the block pulses, if the filter is applied to every signal that was not
+        measured through it; otherwise None.
     initial
-        Initial conditions after ``"auto"`` is resolved.
+        Initial conditions of the run, with a decision for ``"auto"``.
     offset
-        Kind of the unknown constant of each equation on this run.
+        Offset option of the structure; ``"none"`` for a level, which is subtracted from the samples.
     states
-        Number of initial states of the sensor filter, which are estimated with the initial terms of every filtered
-        output.
+        Number of initial states of the sensor filter, estimated for each filtered output together with its initial
+        terms.
     """
 
     signals: tuple[str, ...]
@@ -81,7 +83,7 @@ class Record:
 
     @property
     def start(self) -> InitialTuple:
-        """Initial conditions in the form that the core takes."""
+        """Initial conditions, offset and filter states in the form of :data:`InitialTuple`."""
         return initial_tuple(self.initial, self.offset, self.states)
 
     @property
@@ -90,19 +92,19 @@ class Record:
         return int(self.means.shape[1])
 
     def core(self) -> tuple[float, Floats, Floats | None]:
-        """Return (pulse width, means, filter series), the form that the core takes."""
+        """Return (pulse width [s], means, filter series), the form of a record that the Rust core takes."""
         return self.step, self.means, self.sensor
 
     def of(self, name: str) -> Floats:
-        """Return the block-pulse means of a signal."""
+        """Return the block-pulse means of a row, shape (pulses,)."""
         row: Floats = self.means[self.signals.index(name)]
         return row
 
 
 def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """Return the default number of block pulses: 2048, or fewer if the shortest run has fewer samples.
+    """Return the default number of block pulses: 2048, but at most the number of intervals of the shortest run.
 
-    It is a power of two if `power_of_two` is True, as Haar rows require.
+    With `power_of_two`, the number is rounded down to a power of two, which Haar rows require.
     """
     carried = min(run.length for run in runs) - 1
     m = min(DEFAULT_PULSES, carried)
@@ -110,7 +112,11 @@ def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
 
 
 def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """Return `m`; raise ModelError if a run or Haar rows do not allow this number of block pulses."""
+    """Return the number of block pulses `m`, validated.
+
+    Raise ModelError if a run has fewer than `m` sampling intervals, or if `power_of_two` is True and `m` is no power of
+    two.
+    """
     m = check_pulses(m, math.inf)
     for run in runs:
         carried = run.length - 1
@@ -131,13 +137,14 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
 def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smooth: bool = True) -> Record:
     """Return the block-pulse record of a run for a structure, with delays and sensor filter applied.
 
-    It has a row for each signal and each non-linear term. Outputs are interpolated linearly between samples, inputs by
-    the intersample behavior of the run. More pulses than sampling intervals are allowed only without a comparison with
-    measurements. With ``filtered``, the sensor filter is applied to signals that were not measured through it, as the
-    equation error requires. With ``smooth``, signals whose derivatives are in non-linear terms are smoothed.
+    The record has a row for each signal and each non-linear term. Between samples, outputs are linear and inputs follow
+    the intersample behavior of the run. `m` is the number of block pulses. A number above that of the sampling
+    intervals is allowed only without a comparison with measurements. With `filtered`, the sensor filter is applied to
+    signals that were not measured through it, as the equation error requires. With `smooth`, signals are smoothed if a
+    non-linear term contains their derivatives. Missing samples of outputs are interpolated, and must not be fitted.
 
-    A missing signal, a signal whose squares underflow, a delay of an output or a missing sample of an input raises an
-    FtlmError. Missing samples of outputs are interpolated, and must not be fitted.
+    Raise FtlmError for a missing signal, a signal whose squares underflow, a delay of an output or a missing sample of
+    an input.
     """
     initial = resolve_initial_conditions(run, structure)
     run, structure = without_level(run, structure)
@@ -157,19 +164,20 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True, smo
 
 
 def without_level(run: Run, structure: Structure) -> tuple[Run, Structure]:
-    """Return a run from which the output level of a structure is subtracted, and the structure without this level."""
+    """Return the run minus the levels of its outputs, and the structure without offset, for the offset ``"level"``.
+
+    For other offsets, return run and structure unchanged.
+    """
     if structure.offset != "level":
         return run, structure
     return deviations(run, structure)[0], replace(structure, offset="none")
 
 
 def recording(run: Run, structure: Structure, initial: Initial | None = None) -> _core.Recording:
-    """Return a run as an object of the core, from which the core computes block-pulse means for a structure.
+    """Return a run as an object of the Rust core, from which the Rust core computes block-pulse means for a structure.
 
-    ``initial`` replaces the initial conditions of the structure.
-
-    The core applies free delays, saturations and dead zones. A missing signal, a delay of an output or a missing sample
-    of an input raises an FtlmError.
+    `initial` replaces the initial conditions of the structure. The core applies delays, saturations and dead zones.
+    Raise FtlmError for a missing signal, a delay of an output or a missing sample of an input.
     """
     initial = resolve_initial_conditions(run, structure) if initial is None else initial
     run, structure = without_level(run, structure)
@@ -194,7 +202,7 @@ def recording(run: Run, structure: Structure, initial: Initial | None = None) ->
 
 
 def _missing_signals_text(run: Run, structure: Structure) -> str:
-    """Return the message on signals that a run lacks, with options and lines of a columns file that supply them."""
+    """Return the error message on signals that a run lacks, with the options that select columns for them."""
     lacking = [n for n in structure.signals if n not in run and not n.startswith(COULOMB_PREFIX)]
     roles = {"outputs": [n for n in lacking if n in structure.outputs]}
     roles["inputs"] = [n for n in lacking if n not in roles["outputs"]]
@@ -220,7 +228,10 @@ def _missing_signals_text(run: Run, structure: Structure) -> str:
 
 
 def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
-    """Return a signal of a run as a channel object of the core."""
+    """Return a signal of a run, or the sign of its rate (prefix ``coulomb_``), in the form that the Rust core takes.
+
+    Raise DataError if the run lacks the signal, and ModelError for a delay of an output or too large a lead.
+    """
     channel: _core._Channel = {
         "name": name,
         "samples": np.zeros(0),
@@ -233,7 +244,7 @@ def _channel(run: Run, structure: Structure, name: str) -> _core._Channel:
     }
     moving = name.removeprefix(COULOMB_PREFIX)
     if name not in run and moving != name and moving in run:
-        # The sign of the measured rate over each interval; the last row repeats so that rows match.
+        # The sign of the measured rate over each interval. The last value is repeated, so that there are N values.
         rate = np.sign(np.diff(run[moving]))
         return {**channel, "samples": np.append(rate, rate[-1])}
     if name not in run:
@@ -263,7 +274,7 @@ def check_early_input(run: Run, name: str, delay: float) -> None:
 
 
 def _check_known_inputs(structure: Structure) -> None:
-    """Raise ModelError if a delay, saturation or dead zone of the structure is free."""
+    """Raise ModelError if the structure has a free delay, saturation or dead zone."""
     for item in structure.free_inputs:
         what, value = ("delays", "value in seconds") if item.law == "delay" else ("limits", "value")
         raise ModelError(
@@ -279,11 +290,11 @@ def apply_input_nonlinearity(run: Run, structure: Structure) -> Run:
 
 
 def check_derivative_orders(run: Run, structure: Structure, order_values: Mapping[str, float] | None = None) -> None:
-    """Raise ModelError for terms whose order is too high for the samples of their signal.
+    """Raise ModelError for a term whose order is too high for the samples of its signal.
 
-    The order of a signal other than the equation's output must be below the order of the equation plus 1. For a
-    zero-order-hold input it must be at most the order of the equation, because jumps have no derivative.
-    ``order_values`` are the values of free orders that have only one.
+    For an equation of order alpha, the order of a signal other than its output must be below alpha + 1. The order of a
+    zero-order-hold input must be at most alpha, because jumps have no derivative. `order_values` are values of free
+    orders by name; terms with other free orders are not checked.
     """
     for item in structure.equations:
         alpha = item.order.substitute(order_values or {})
@@ -318,8 +329,8 @@ def records(
 ) -> list[Record]:
     """Return the block-pulse records of several runs; see :func:`record`.
 
-    They are cached in `runs` if it is a :class:`Runs`. Records with more pulses than the runs have sampling intervals
-    are large and used once, so they are not cached.
+    If `runs` is a :class:`Runs`, it caches the records. Records with more pulses than sampling intervals are not
+    cached, because they are large and used once.
     """
 
     def build() -> list[Record]:
@@ -340,7 +351,7 @@ def records(
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
-    """Return the sensor filter of a structure as a power series on m block pulses; None without a filter."""
+    """Return the power series of the sensor filter on m block pulses of width `step` [s]; None without a filter."""
     sensor = structure.sensor_filter
     if sensor is None:
         return None
@@ -352,7 +363,7 @@ def _filter_series(
 ) -> Floats:
     """Return the power series of a transfer function on m block pulses of width `step` [s].
 
-    Numerator and denominator are (exponent of s, coefficient) pairs.
+    Numerator and denominator are (coefficient, exponent of s) pairs.
     """
     return make_read_only(_core.filter_series(list(numerator), list(denominator), m, step))
 
@@ -364,7 +375,10 @@ _long_series, _short_series = (
 
 
 def _check_missing(run: Run, structure: Structure) -> None:
-    """Raise DataError if samples are missing in inputs, or in outputs that are filtered before comparison."""
+    """Raise DataError if samples are missing in a measured signal that enters another equation as an input.
+
+    With a sensor filter on all signals, missing samples of outputs raise DataError as well.
+    """
     missing = run.missing_samples
     if not missing:
         return
@@ -403,7 +417,7 @@ def check_no_missing(runs: Sequence[Run], what: str) -> None:
 
 
 def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
-    """Return an equation as (output index, alpha, [(signal index, order), …]), the form that the core takes.
+    """Return a linear equation as (output index, alpha, [(signal index, order), …]), the form that the Rust core takes.
 
     All orders must be numbers.
 
@@ -443,9 +457,10 @@ def check_frictionless(equations: Sequence[Equation], what: str) -> None:
 
 
 def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
-    """Return an equation without friction in the form that the core takes.
+    """Return an equation without its friction as (output index, alpha, [(signal index, order), …]), for Rust.
 
-    Non-linear terms are further rows of the record.
+    `signals` are the rows of the record. A non-linear term has the index of its row; raise ModelError if there is
+    no such row.
     """
     index = {name: i for i, name in enumerate(signals)}
     if any(t.column not in index for t in item.nonlinear_terms):
@@ -455,9 +470,9 @@ def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, li
 
 
 def derived_signals(structure: Structure) -> list[_core._Derived]:
-    """Return the expressions of non-linear terms in the form that the core takes.
+    """Return each expression of a non-linear term as (instructions, [(signal index, order), …]), for Rust.
 
-    The core appends their values to the signals of the structure.
+    The pairs are the channels of the expression. The core appends the values of the expressions to the signals.
     """
     return [
         (
@@ -471,10 +486,11 @@ def derived_signals(structure: Structure) -> list[_core._Derived]:
 def order_grid_tuple(
     item: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
 ) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
-    """Return an equation with grids of orders in the form that the core takes.
+    """Return an equation with grids of orders in the form that the Rust core takes.
 
-    It is (output index, values of alpha, [(signal index, values of the order, whether coefficient and order are free),
-    …]). Every order is a number or a single free order.
+    The result is (output index, values of alpha, [(signal index, values of the order, whether coefficient and order are
+    free), …]). `values` are the grid values of free orders by name. Every order must be a number or a single free
+    order.
     """
 
     def axis(order: Order) -> list[float]:
@@ -485,7 +501,7 @@ def order_grid_tuple(
 
 
 def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
-    """Return the constant of an order and its weight on each of the named free orders."""
+    """Return the constant of an affine order, and its weight of each free order in `names` (0 if absent)."""
     weights = dict(order.weights)
     return order.constant, [weights.get(n, 0.0) for n in names]
 
@@ -493,14 +509,14 @@ def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
 def equation_tuple(
     item: Equation, signals: Sequence[str]
 ) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
-    """Return an equation and its coefficients in the form that the core takes."""
+    """Return an identified linear equation in the form of :func:`structure_tuple`, and its coefficient values."""
     for term in item.terms:
         _check_excess_order(term.signal, term.order.constant, item.output, item.order.constant)
     return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
 
 
 def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) -> InitialTuple:
-    """Return initial conditions, offset and number of filter states in the form that the core takes."""
+    """Return initial conditions, offset and number of filter states in the form of :data:`InitialTuple`."""
     powers = [] if isinstance(initial, str) else list(initial)
     decided = (initial == "caputo", powers)
     if states:
@@ -509,7 +525,7 @@ def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) ->
 
 
 def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
-    """Return an error of the core with signal names in place of signal indices in its message."""
+    """Return a copy of an error of the Rust core, with names in place of signal indices in its message."""
     return ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error)))
 
 
@@ -522,11 +538,18 @@ def prepare(
     gaps: bool = False,
     smooth: bool = True,
 ) -> list[Record]:
-    """Return the block-pulse records of runs for an equation-error estimator.
+    """Return the block-pulse records of runs for an equation-error estimator, with common initial conditions.
 
-    Raise DataError or ModelError for unsuitable data.
+    `m` is the number of block pulses; None for the default. With `gaps`, missing samples of outputs are allowed: the
+    estimator must exclude them.
 
-    Missing samples raise DataError unless ``gaps`` is True. An estimator that excludes missing samples sets ``gaps``.
+    Raises
+    ------
+    DataError
+        If samples are missing, an output is constant, a non-linear term is not finite, or a coefficient is not
+        identifiable because its signal is 0 or equivalent to the offset.
+    ModelError
+        If `m` is invalid, the offset is ``"auto"``, or the data lack a derivative in a non-linear term.
     """
     check_offset_resolved(structure.offset)
     if not gaps:
@@ -538,7 +561,7 @@ def prepare(
     prepared = records(runs, structure, m, smooth=smooth)
     common = common_initial_conditions([r.initial for r in prepared])
     if common is not None:
-        # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
+        # All runs of a fit have the same initial terms; those of a run from rest are estimated as zero.
         prepared = records(runs, replace(structure, initial=common), m, smooth=smooth)
     for run, rec in [] if gaps else zip(runs, prepared, strict=True):
         check_columns(run, structure, dict(zip(rec.signals, rec.means, strict=True)), rec.step)
@@ -566,14 +589,14 @@ def _is_offset(term: Term, item: Equation, prepared: Sequence[Record]) -> bool:
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
-    """Return free coefficients by name from the core's estimates, which include the fixed factor of each term."""
+    """Return the free coefficients by name: the estimates `raw` divided by the known factor of each term."""
     return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
 
 
 def has_nonuniform_samples(run: Run, structure: Structure) -> bool:
     """Whether simulation and measurement are compared at nonuniform sample times.
 
-    False if a delay, saturation or dead zone is free, or if all signals are filtered: the uniform grid is used then.
+    The uniform grid is used instead if a delay, saturation or dead zone is free, or if all signals are filtered.
     """
     return run.sample_times is not None and not structure.free_inputs and not structure.all_filtered
 
@@ -586,7 +609,7 @@ def compared_times(run: Run, structure: Structure) -> Floats:
 
 
 def compared_values(run: Run, structure: Structure, name: str) -> Floats:
-    """Return the recorded values of a signal at the compared times; NaN for missing samples of an output."""
+    """Return the measured values of a signal at the times of :func:`compared_times`; NaN for missing samples."""
     if run.sample_times is None or not has_nonuniform_samples(run, structure):
         return run[name]
     return run.sample_times.data[name][run.sample_times.indices_within(run.duration)]

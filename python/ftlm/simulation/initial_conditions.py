@@ -31,25 +31,26 @@ from ftlm.utils.statistics import (
 )
 from ftlm.utils.validation import Floats
 
-#: Increment of the powers of time.
+#: Increment of the exponents of t in a history.
 POWER_INCREMENT = 0.25
-#: Ratio of a signal's norm to its noise standard deviation, and the highest power, in quarters, that it needs for
-#: biases below a tenth of a standard error (benches/history.py bases).
+#: Ratio of the norm of a signal to its noise standard deviation, and the highest exponent of t, in quarters, at which
+#: biases are then below a tenth of a standard error (benches/history.py bases).
 REFERENCE_SIGNAL_RATIO, REFERENCE_QUARTERS = 2500.0, 6
-#: Factor by which one more quarter reduces the unmodeled past.
+#: Factor by which an exponent higher by a quarter reduces the unmodeled effect of past inputs.
 SIGNAL_RATIO_PER_QUARTER = 2.5
-#: Minimum and maximum number of quarters.
+#: Minimum and maximum of the highest exponent, in quarters.
 MIN_QUARTERS, MAX_QUARTERS = 2, 12
-#: Minimum number of samples of a run per quarter.
+#: Minimum number of samples of a run per quarter of the highest exponent.
 MIN_SAMPLES_PER_QUARTER = 16
-#: Integer powers below this are always included, so that the list is the same for any order up to 3.
+#: Integer exponents below this number are always included, so that the list is the same for all orders up to 3.
 MIN_INTEGER_POWERS = 3
-#: Significance level of the test of Caputo's terms against a full history. The usual 1 or 5 % would miss a weak past,
-#: with intervals too short for its bias. With an offset the level is lower: it explains a nonzero first value by
-#: itself, and a history would make it unidentifiable.
+#: Significance level of the test of Caputo's terms against a full history. The usual 1 or 5 % would miss weak effects
+#: of past inputs, and confidence intervals would not cover the bias. The level is lower with an offset, because the
+#: offset explains a nonzero first value, and a history would make the offset unidentifiable.
 HISTORY_TEST_LEVEL, HISTORY_TEST_LEVEL_WITH_OFFSET = 0.25, 0.02
-#: Weight of the excess in the residual sum of squares, as an alternative to the robust excess. Few outliers must not
-#: require a history, but a least-squares fit must not be worse than one with a history and fewer parameters.
+#: Weight of the excess in the residual sum of squares, as an alternative to the robust excess. A few outliers must not
+#: require a history. On the other hand, a least-squares fit must not be worse than one with a history and fewer
+#: parameters.
 SQUARES_WEIGHT = 0.25
 
 
@@ -62,7 +63,8 @@ class StartSettings:
     quiet_rows
         Minimum number of samples before an input changes that can show rest ("quiet" samples).
     sigmas
-        Number of standard errors within which slope, scatter and level of quiet samples are consistent with noise.
+        Number of standard errors within which slope, standard deviation and mean of quiet samples are consistent
+        with noise.
     noise_error
         Relative standard error of the noise estimate, multiplied by the square root of the number of samples.
     least_noise
@@ -84,7 +86,7 @@ class StartSettings:
         Variance inflation of the mean of the residuals (1 for white noise) above which the structure is regarded as
         incomplete.
     history_margin
-        Difference of :func:`start_score` from which a history is preferred although residuals are colored.
+        Difference of :func:`start_score` above which a history is preferred although the residuals are colored.
     """
 
     quiet_rows: int = 5
@@ -105,19 +107,19 @@ START_SETTINGS = StartSettings()
 
 @dataclass(frozen=True)
 class RestEvidence:
-    """Evidence in the first samples of a run that the plant rested before it.
+    """Evidence in the first samples of a run that the plant was at rest before the run.
 
     Parameters
     ----------
     rows
-        Number of samples in which inputs and outputs are constant before an input changes. 1 if only the outputs rest,
-        at zero. 0 if the inputs never change after the first or second sample, so that rest is an assumption.
+        Number of samples in which inputs and outputs are constant before an input changes. It is 1 if only the outputs
+        are at rest, at zero. It is 0 if no input changes after the second sample, so that rest is an assumption.
     levels
-        Level of each output before the run.
+        Constant value of each output before the run.
     inputs
-        Value of each input before the run.
+        Constant value of each input before the run.
     shows_level
-        Whether outputs or inputs rest at values other than 0.
+        Whether at least one of these values is not 0, within the noise.
     """
 
     rows: int
@@ -132,7 +134,7 @@ _EVIDENCE_BY_RUN: WeakKeyDictionary[Run, dict[tuple[tuple[str, ...], tuple[str, 
 
 
 def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
-    """Return the evidence that the plant rested before the run; None if it may have been in motion."""
+    """Return the evidence that the plant was at rest before the run; None if it may have been in motion."""
     run = run.unmasked_run or run
     evidence = _EVIDENCE_BY_RUN.setdefault(run, {})
     key = structure.outputs, structure.signals
@@ -145,7 +147,10 @@ def rest_evidence(run: Run, structure: Structure) -> RestEvidence | None:
 
 
 def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:
-    """Return evidence from quiet first samples, or from inputs that are constant from the first or second sample on."""
+    """Return evidence of rest from quiet first samples, or from inputs that are constant from the second sample on.
+
+    Quiet samples are those before an input changes. The result is None if there is no such evidence.
+    """
     if run.sample_times is not None and run.missing_samples:
         return None
     if any(np.nanstd(run[n]) == 0.0 for n in outputs):
@@ -179,7 +184,7 @@ def _rest_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> R
 
 
 def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> RestEvidence | None:
-    """Return evidence from outputs that start at zero and move slowly at first, whatever the inputs do."""
+    """Return evidence of rest from outputs that start at zero and change slowly at first, for any inputs; else None."""
     series = [run[n] for n in outputs]
     if run.sample_times is not None or not all(map(is_rest, series)) or not _starts_slowly(series):
         return None
@@ -187,7 +192,7 @@ def _slow_start_evidence(run: Run, inputs: Sequence[str], outputs: Sequence[str]
 
 
 def _starts_slowly(outputs: Sequence[Floats]) -> bool:
-    """Whether all outputs are nearly constant at first, although one of them varies at most later times."""
+    """Whether outputs that change in most samples, at least one, change little between their first two samples."""
     conclusive = False
     for samples in outputs:
         noise = START_SETTINGS.sigmas * math.sqrt(2.0) * noise_at_start(samples)
@@ -201,7 +206,7 @@ def _starts_slowly(outputs: Sequence[Floats]) -> bool:
 
 
 def noise_at_start(samples: Floats) -> float:
-    """Return an upper bound of the noise standard deviation: its estimate plus two standard errors."""
+    """Return an upper bound of the noise standard deviation: the estimate plus two standard errors of the estimate."""
     count = min(samples.size, NOISE_SAMPLES)
     noise = white_noise(samples) * (1.0 + 2.0 * START_SETTINGS.noise_error / math.sqrt(count))
     return max(noise, START_SETTINGS.least_noise * float(np.nanstd(samples)))
@@ -213,7 +218,7 @@ def _rows_of_change(samples: Floats) -> NDArray[np.intp]:
 
 
 def _is_at_rest(rows: Floats, noise: float) -> bool:
-    """Whether slope and standard deviation of some samples are consistent with noise."""
+    """Whether slope and standard deviation of samples are consistent with white noise of standard deviation `noise`."""
     t = np.arange(rows.size) - 0.5 * (rows.size - 1)
     slope, scatter = float(t @ rows) / float(t @ t), float(np.std(rows))
     limits = noise / _slope_weight(rows.size), noise / math.sqrt(2.0 * rows.size)
@@ -221,22 +226,26 @@ def _is_at_rest(rows: Floats, noise: float) -> bool:
 
 
 def _without_outliers(rows: Floats, noise: float) -> Floats:
-    """Return samples without isolated values far from their median."""
+    """Return samples without a few values far from the median; more such values are not outliers and are kept."""
     near = np.abs(rows - np.median(rows)) <= REST_SIGMAS * noise if rows.size else np.ones(0, dtype=bool)
     few = max(1.0, START_SETTINGS.outlier_share * rows.size)
     return rows[near] if np.count_nonzero(~near) <= few else rows
 
 
 def _slope_weight(rows: int) -> float:
-    """Return the noise standard deviation divided by the standard error of the slope of `rows` samples."""
+    """Return the ratio of the noise standard deviation to the standard error of a least-squares slope per sample.
+
+    The line is fitted to `rows` samples.
+    """
     return math.sqrt(rows * (rows**2 - 1) / 12.0)
 
 
 def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
-    """Return the structure with initial conditions and level set for runs that rested before their first sample.
+    """Return the structure with initial conditions and offset for runs whose plant was at rest before the first sample.
 
-    Initial terms and offsets that the user gave are kept. ``"auto"`` is kept if a run may have been in motion. An
-    offset ``"constant"`` becomes ``"level"`` if the plant rested under the constant.
+    Initial terms and offsets that the user gave are kept. ``"auto"`` becomes ``"rest"``, but is kept if a run may have
+    been in motion. The offset becomes ``"level"`` if outputs or inputs were at rest at nonzero values, or if it is
+    ``"constant"`` and no input changes.
     """
     automatic = structure.initial == "auto" and structure.offset in ("none", "level", "constant")
     if not structure.is_linear or not (automatic or (structure.initial, structure.offset) == ("rest", "constant")):
@@ -252,12 +261,11 @@ def resolve_start(runs: Sequence[Run], structure: Structure) -> Structure:
 def deviations(
     run: Run, structure: Structure, output_levels: Mapping[str, float] | None = None
 ) -> tuple[Run, dict[str, float]]:
-    """Return a run minus its levels before the first sample, and the levels of its outputs by name.
+    """Return a run minus the levels of its signals before the first sample, and the levels of its outputs by name.
 
-    `output_levels` are estimated levels of outputs, which replace those of the first samples.
-
-    The level of an input is its value in the quiet samples. It is not subtracted from an input with a saturation or a
-    dead zone.
+    The level of a signal is its constant value before an input changes; without evidence of rest, it is the first value
+    of an output. Estimated `output_levels` replace these values. The level of an input with a saturation or dead zone
+    is not subtracted.
     """
     evidence = rest_evidence(run, structure)
     limited = {limit.signal for limit in structure.limits}
@@ -283,18 +291,21 @@ def starts_at_rest(run: Run, structure: Structure) -> bool:
 
 
 def has_memory(structure: Structure) -> bool:
-    """Whether an order is free or fractional, so that the past has no finite-dimensional state."""
+    """Whether an order is free or fractional, so that no finite-dimensional state represents the past."""
     orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
     return any(o.names or o.constant != round(o.constant) for o in orders)
 
 
 def history(run: Run, structure: Structure) -> History:
-    """Return the powers of t that represent the effect of past inputs on a run, as many as exceed the noise."""
+    """Return the exponents of t that represent the effect of past inputs on a run.
+
+    Their number increases with the signal-to-noise ratio of the outputs.
+    """
     visible = 1.0
     for name in structure.outputs:
         if name in run:
             samples = drop_missing(run[name])
-            # A level that is no offset is a part of the past; one that is takes no power of its own.
+            # Without an offset, the mean is an effect of past inputs. An offset represents the mean itself.
             size = vector_norm(samples - (0.0 if structure.offset == "none" else np.mean(samples)))
             if size:
                 visible = max(visible, size / max(estimate_noise(run[name]), np.finfo(np.float64).eps * size))
@@ -308,7 +319,7 @@ def history(run: Run, structure: Structure) -> History:
 
 
 def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
-    """Return the initial conditions of a structure for a run, with a decision for ``"auto"``."""
+    """Return the initial conditions of a structure for a run, with ``"auto"`` and ``"history"`` resolved."""
     structure = resolve_start([run], structure)
     initial = structure.initial
     if initial == "auto":
@@ -319,37 +330,41 @@ def resolve_initial_conditions(run: Run, structure: Structure) -> Initial:
 
 
 def conditions_in_motion(structure: Structure) -> Initial:
-    """Return the initial conditions for a run that need not begin at rest.
+    """Return the initial conditions for a run that may start in motion.
 
-    They are ``"history"`` for a linear structure with memory, otherwise ``"caputo"``.
+    They are ``"history"`` for a linear structure with free or fractional orders, otherwise ``"caputo"``.
     """
     # A history superposes responses to past inputs, which requires linearity.
     return "history" if has_memory(structure) and structure.is_linear else "caputo"
 
 
 def common_initial_conditions(decisions: list[Initial]) -> Initial | None:
-    """Return, of the initial conditions of several runs, those with the most terms; None if all are equal."""
+    """Return the most general of the initial conditions of several runs; None if all are equal.
+
+    Powers of t are more general than Caputo's initial values, and these are more general than rest.
+    """
     if len(set(decisions)) < 2:
         return None
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
 
 
 def resolve_common_initial_conditions(runs: Sequence[Run], structure: Structure) -> Initial:
-    """Return initial conditions that are common to all runs of a fit, with a decision for ``"auto"``."""
+    """Return initial conditions that are common to all runs of a fit, with ``"auto"`` and ``"history"`` resolved."""
     starts = [resolve_initial_conditions(run, structure) for run in runs]
     return common_initial_conditions(starts) or starts[0]
 
 
 def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Return the sum of squared residuals with few minus with many initial terms, divided by the noise variance.
+    """Return the excess of the Huber loss with few initial terms over that with many, in units of the noise variance.
 
-    If the few terms are sufficient, it has a chi-squared distribution. Its degrees of freedom are the number of
-    additional terms.
+    The excess is summed over outputs; outputs with residuals of rounding size are omitted. If the few terms are
+    sufficient, the sum has a chi-squared distribution. Its degrees of freedom are the number of additional terms.
 
     Parameters
     ----------
     few, many
-        Residuals of each output; infinite if the simulation is not finite, NaN at missing samples.
+        Residuals of each output with few and with many terms; infinite if the simulation is not finite, NaN at missing
+        samples.
     sizes
         Standard deviation of each measured output.
     """
@@ -362,7 +377,10 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
 
 
 def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
-    """Return the misfit between two fits, or a fraction of the excess in the sum of squares if that is larger."""
+    """Return the larger of :func:`misfit` and a quarter of the excess in the sum of squares over the noise variance.
+
+    Arguments are those of :func:`misfit`, with residuals of two separate fits.
+    """
     squares = 0.0
     for one, other, size in zip(few, many, sizes, strict=True):
         is_finite = ~np.isnan(one)
@@ -383,9 +401,9 @@ def output_residuals(measurement: Floats, simulated: Floats) -> Floats:
 def start_score(residuals: Sequence[Floats], terms: int, reference: Sequence[Floats]) -> float:
     """Return the Bayesian information criterion of a fit with `terms` initial terms, up to a constant.
 
-    Lower is better. Other parameters are not counted, so that only fits that share them are compared. The number of
-    samples is divided by the variance inflation of the `reference` residuals, the same for all compared fits, so that
-    a smooth misfit has the same weight in all of them.
+    Lower is better. Other parameters are not counted, so compared fits must have the same other parameters. The number
+    of samples is divided by the variance inflation of the `reference` residuals, which must be the same for all
+    compared fits. A smooth misfit then has the same weight in all of them.
     """
     score, total = 0.0, 0.0
     for own, other in zip(residuals, reference, strict=True):
@@ -403,9 +421,10 @@ def needs_history(
     sizes: Sequence[float],
     terms: tuple[int, int],
 ) -> bool:
-    """Whether residuals with Caputo's initial terms are so large that a history is required.
+    """Whether residuals with Caputo's initial terms are so large that terms for past inputs (a history) are required.
 
-    `few` and `many` are the residuals with Caputo's terms and with a history, `terms` their numbers of terms.
+    `few` and `many` are the residuals of each output with Caputo's terms and with a history. `terms` are the numbers of
+    these terms, and `sizes` the standard deviations of the outputs.
 
     The powers of t of a history can also fit an effect that the structure lacks. The threshold is therefore higher for
     colored residuals.

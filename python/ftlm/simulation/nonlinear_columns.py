@@ -14,13 +14,14 @@ from ftlm.structure.structure import Structure
 from ftlm.utils.parameters import parameter
 from ftlm.utils.validation import Floats
 
-#: Points and degree of the local polynomials that smooth a measured signal before it is differentiated. At 40 dB a
-#: velocity by differences of raw samples starts an output-error fit too far off (measured on a body with drag).
+#: Number of points and degree of the local polynomials that smooth a measured signal before it is differentiated. At a
+#: signal-to-noise ratio of 40 dB, velocities from differences of raw samples give poor initial guesses of an
+#: output-error fit (measured on a body with drag).
 SMOOTHING_POINTS, SMOOTHING_DEGREE = 31, 3
 
 
 def nonlinear_columns(structure: Structure) -> dict[str, Expression]:
-    """Return the expressions of the non-linear terms by row name in a record, in order of appearance."""
+    """Return the expressions of the non-linear terms by the names of their rows in a record, in order of appearance."""
     return {t.column: t.nonlinear for e in structure.equations for t in e.terms if t.nonlinear is not None}
 
 
@@ -30,16 +31,16 @@ def record_signals(structure: Structure) -> tuple[str, ...]:
 
 
 def has_derivative_channels(structure: Structure) -> bool:
-    """Whether a non-linear term contains the derivative of a signal, which the data do not contain."""
+    """Whether a non-linear term contains the derivative of a signal, which is not measured."""
     return any(order > 0 for item in nonlinear_columns(structure).values() for _, order in item.channels)
 
 
 def append_columns(run: Run, structure: Structure, means: Floats, step: float, *, smooth: bool) -> Floats:
-    """Return block-pulse means of the signals, with a further row for each non-linear term.
+    """Return block-pulse means of shape (signals, pulses) with a further row for each non-linear term.
 
-    An expression is evaluated at the means of its signals, which is accurate to second order in the step. Derivatives
-    are those of the raw means, or with ``smooth`` those of local polynomials. A row is NaN where the expression has no
-    value. It is all NaN with a sensor filter, or if it contains the derivative of a zero-order-hold input; see
+    An expression is evaluated at the means of its signals, which is accurate to second order in the `step` [s]. Means
+    are smoothed before differentiation if `smooth` is True. A row is NaN where the expression is not finite. All values
+    are NaN with a sensor filter, or if the expression contains the derivative of a zero-order-hold input; see
     :func:`check_columns`.
     """
     columns = nonlinear_columns(structure)
@@ -63,7 +64,7 @@ def _is_held(run: Run, signal: str, order: float) -> bool:
 
 
 def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], step: float) -> None:
-    """Raise an error if a non-linear term has no value somewhere, for estimators that need all values.
+    """Raise an error if the row of a non-linear term contains NaN, for estimators that need all values.
 
     Raises
     ------
@@ -97,12 +98,11 @@ def check_columns(run: Run, structure: Structure, rows: Mapping[str, Floats], st
 
 
 def differentiate(means: Floats, order: float, step: float, *, smooth: bool) -> Floats:
-    """Return the fractional derivative of a signal from its block-pulse means, to second order in the step.
+    """Return the fractional derivative of a signal from its m block-pulse means, to second order in the `step` [s].
 
-    The signal is zero before its record, and `step` is in seconds.
-
-    The Grünwald-Letnikov weights (1 - q)^order are multiplied by 1 + order/2 (1 - q), which removes their delay of
-    order/2 steps. With ``smooth``, values are smoothed first. The cost is O(m log m).
+    The signal is assumed to be zero before its record. With the backward shift q, the Grünwald-Letnikov weights
+    (1 - q)^order are multiplied by 1 + order/2 (1 - q), which removes their delay of order/2 steps. With `smooth`, the
+    means are smoothed first. The cost is O(m log m).
     """
     values = smooth_locally(means) if smooth else means
     m = values.size
@@ -112,7 +112,7 @@ def differentiate(means: Floats, order: float, step: float, *, smooth: bool) -> 
 
 
 def smooth_locally(values: Floats) -> Floats:
-    """Return values smoothed by local polynomials (Savitzky and Golay 1964); short series are returned unchanged."""
+    """Return values smoothed by local polynomials (Savitzky and Golay 1964); fewer than 31 values stay unchanged."""
     points, half = SMOOTHING_POINTS, SMOOTHING_POINTS // 2
     if values.size < points:
         return values

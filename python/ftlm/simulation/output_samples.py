@@ -1,4 +1,4 @@
-"""Samples of simulated outputs, and the choice of initial conditions that a run requires."""
+"""Simulated output samples, and the choice of the initial conditions of a run by them."""
 
 from __future__ import annotations
 
@@ -43,18 +43,19 @@ from ftlm.utils.resources import stop_flag
 from ftlm.utils.statistics import chi_squared, variance_inflation
 from ftlm.utils.validation import Floats
 
-#: First refinement of the record's grid, doubled until converged. Two pulses per interval are the minimum for a sample
-#: that is independent of a jump of a zero-order-hold input at its time.
+#: Initial number of block pulses per sampling interval, which is doubled until convergence. Two pulses are the minimum
+#: for a sample that is independent of a jump of a zero-order-hold input at its time.
 FIRST_REFINEMENT = 2
-#: Refinement of the fit of initial terms with friction or non-linear terms. The relative error is a few 1e-5.
+#: Number of block pulses per sampling interval for the fit of initial terms with friction or non-linear terms. The
+#: relative error is a few 1e-5.
 INITIAL_STATE_REFINEMENT = 4
 #: Difference below which two orders count as equal.
 ORDER_TOLERANCE = 1e-9
-#: Distance of a power of t from that of an offset below which both are not separately identifiable. An order just above
-#: an integer adds a power that one just below does not, and t^1 in an equation with D^1.0003 acts as a constant force.
+#: Difference of the exponents of an initial term and an offset below which they are not separately identifiable. For
+#: example, an order of 1.0003 gives an initial term t^1, which acts almost like a constant force.
 OFFSET_POWER_TOLERANCE = 0.05
 Terms = Mapping[str, Mapping[float, float]]
-#: Exponent that marks the level of an output among its initial terms. It comes last, and is not a power of t.
+#: Key of the level of an output among its initial terms. It is the last key, and not an exponent of t.
 LEVEL_EXPONENT = math.inf
 
 
@@ -65,15 +66,15 @@ class OutputSamples:
     Parameters
     ----------
     outputs
-        Samples of shape (outputs, N) at the sample times of the run. They are filtered if the output was measured
-        through the sensor filter, and not finite if the model diverges.
+        Samples of shape (outputs, N) at the sample times of the run. The sensor filter is applied to outputs that were
+        measured through it. Samples are not finite if the model diverges.
     initial
         Coefficients of the initial terms, by output and exponent.
     refinement
         Number of block pulses per sampling interval on the finest grid; 1 for an exact simulation.
     change
-        Change of the samples when the step is halved, relative to the largest value of each output; infinite with fewer
-        than three grids.
+        Change of the samples of each output in the last halving of the step, relative to its largest value; infinite
+        with fewer than three grids.
     """
 
     outputs: Floats
@@ -85,8 +86,8 @@ class OutputSamples:
 def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
     """Return the distinct exponents e of the powers t^e that enter an equation, in ascending order.
 
-    The powers are the initial terms and the offset. The initial states of a sensor filter are added with the exponents
-    -1, -2 and so on. All orders must have values.
+    The powers are the initial terms and the offset. `states` initial states of a sensor filter are represented by the
+    exponents -1, -2 and so on. All orders must be fixed.
     """
     alpha = item.order.constant
     exponents = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}
@@ -101,23 +102,23 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: 
 
 
 def nonuniform_sample_times(model: Model, run: Run) -> Floats | None:
-    """Return the times of the compared samples of a run [s] if they are nonuniform, otherwise None."""
+    """Return the times [s] at which simulation and run are compared if they are nonuniform, otherwise None."""
     return compared_times(run, model.structure) if has_nonuniform_samples(run, model.structure) else None
 
 
-#: Whether coefficients are fitted, exponent and coefficient of the initial terms by output, whether levels are fitted.
+#: Initial terms for Rust: whether their coefficients are fitted, (exponent, coefficient) pairs for each output, and
+#: whether levels are fitted.
 InitialTermsTuple: TypeAlias = tuple[bool, list[list[tuple[float, float]]], bool]
 
 
 def output_simulation(
     model: Model, run: Run, initial: Terms | None, times: Floats | None, state_refinement: int
 ) -> tuple[_core.OutputSimulation, InitialTermsTuple]:
-    """Return the simulation object of the core for a model and a run, and its initial terms.
+    """Return the simulation object of the Rust core for a model and a run, and the initial terms for it.
 
-    Samples are uniform, or at given `times` [s].
-
-    `initial` are given initial terms; with None they are fitted to the run. For a non-linear model they are fitted on a
-    grid of `state_refinement` block pulses per sampling interval.
+    Samples are at the uniform sample times of the run, or at given `times` [s]. `initial` are given initial terms; with
+    None, they are fitted to the run. For a non-linear model they are fitted here, with `state_refinement` block pulses
+    per sampling interval.
     """
     structure, signals = model.structure, record_signals(model.structure)
     start = resolve_initial_conditions(run, structure)
@@ -139,11 +140,11 @@ def output_simulation(
 def simulate_samples(
     model: Model, run: Run, every: int, initial: Terms | None, times: Floats | None = None
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Return simulated samples (outputs, N) and the initial terms by output and exponent.
+    """Return simulated samples, shape (outputs, N), and coefficients of initial terms by output and exponent.
 
-    The step is 1/`every` of the sampling interval. The samples are not finite if the simulation diverges.
-
-    Samples are at the uniform sample times of the run, or at given `times` [s].
+    Samples are at the uniform sample times of the run, or at given `times` [s], and not finite if the simulation
+    diverges. The simulation uses `every` block pulses per sampling interval. `initial` are given initial terms; with
+    None, they are fitted to the run.
     """
     core, terms = output_simulation(model, run, initial, times, every)
     samples, initial_terms = core.samples(every, terms, stop_flag())
@@ -155,21 +156,21 @@ def simulate_samples(
 def add_levels(
     model: Model, levels: Mapping[str, float], outputs: Floats, initial: Terms
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Return samples and initial terms to which the levels of the outputs before the run are added.
+    """Return samples and initial terms with the levels of the outputs before the run added.
 
-    The arguments are deviations from these levels.
+    `outputs` and `initial` are deviations from these levels.
     """
     terms = {o: {e: v + levels[o] * (e == LEVEL_EXPONENT) for e, v in own.items()} for o, own in initial.items()}
     return outputs + np.array([levels[o] for o in model.outputs])[:, None], terms
 
 
 def named_terms(model: Model, terms: Sequence[Sequence[tuple[float, float]]]) -> dict[str, dict[float, float]]:
-    """Return the core's initial terms as coefficients by output and exponent."""
+    """Return initial terms, given as (exponent, coefficient) pairs for each output, by output and exponent."""
     return {o: dict(own) for o, own in zip(model.outputs, terms, strict=True)}
 
 
 def check_uniform_samples(run: Run, model: Model) -> None:
-    """Raise ModelError if the samples of a run are nonuniform."""
+    """Raise ModelError if the sample times of a run are nonuniform, which non-linear models do not support."""
     if has_nonuniform_samples(run, model.structure):
         structure = model.structure
         what = "friction" if structure.has_friction else "a non-linear term"
@@ -181,7 +182,11 @@ def check_uniform_samples(run: Run, model: Model) -> None:
 
 
 def with_initial_conditions(model: Model, run: Run) -> Model:
-    """Return the model with initial conditions chosen for a run: Caputo's unless the samples require a history."""
+    """Return the model with initial conditions for a run.
+
+    For a run in motion, ``"auto"`` becomes a history (powers of t for past inputs) if the samples require it, otherwise
+    Caputo's initial values.
+    """
     model = replace(model, structure=resolve_start([run], model.structure))
     start = resolve_initial_conditions(run, model.structure)
     long = replace(model, structure=replace(model.structure, initial=start))
@@ -195,7 +200,7 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
             simulate_samples(each, run, FIRST_REFINEMENT, None, times) for each in (short, long)
         )
     except ModelError:
-        # The equations are singular on this coarse grid, but perhaps not on finer ones.
+        # The equations are singular on this coarse grid, but may be regular on finer grids.
         return long
     terms = sum(map(len, ours.values())), sum(map(len, theirs.values()))
     residuals = [*output_residuals(outputs, few)], [*output_residuals(outputs, many)]
@@ -204,7 +209,7 @@ def with_initial_conditions(model: Model, run: Run) -> Model:
 
 
 def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
-    """Return the (output, exponent) pairs of all initial terms and offsets under given initial conditions."""
+    """Return the (output, exponent) pairs of all initial terms and offsets for given initial conditions."""
     structure = model.structure
     states = structure.filter_states(initial)
     return [
@@ -217,9 +222,10 @@ def initial_names(model: Model, initial: Initial) -> list[tuple[str, float]]:
 
 
 def measured_samples(model: Model, run: Run, every: int) -> Floats:
-    """Return the measured samples to compare with a simulation, of shape (outputs, N).
+    """Return the measured samples to compare with a simulation, shape (outputs, N), with NaN for missing samples.
 
-    They are filtered if the equation holds for filtered signals. Missing samples of an output are NaN.
+    If the equations apply to filtered signals, the sensor filter is applied to outputs that were not measured through
+    it, with `every` block pulses per sampling interval.
     """
     through = model.structure.is_filtered
     if not model.structure.all_filtered or all(map(through, model.outputs)):
@@ -228,27 +234,28 @@ def measured_samples(model: Model, run: Run, every: int) -> Floats:
     return np.stack([run[n] if through(n) else _core.point_samples(rec.of(n))[::every] for n in model.outputs])
 
 
-#: Significance level of the test of rest for runs whose first values are near zero, which is rare in motion and common
-#: at rest. At 0.001 initial conditions that bias orders by five standard errors are missed. At 0.05 one in twenty runs
-#: from rest is rejected.
+#: Significance level of the test of rest for runs whose first values are near zero. Such values are rare for runs in
+#: motion and common for runs from rest. A level of 0.001 misses initial conditions that bias orders by five standard
+#: errors, and a level of 0.05 rejects one in twenty runs from rest.
 REST_TEST_LEVEL = 0.01
 
 
-#: Samples of the first part of a run on which its start is tested: what was before it fades.
+#: Maximum number of first samples of a run with which its initial conditions are tested. Effects of past inputs decay.
 MAX_START_SAMPLES = 1 << 15
 
 
-#: Nonzero initial conditions are reported if a history reduces the residual to this ratio, by at least this drop, and
-#: to at most this value, all in standard deviations of the output. A model with a larger residual from rest than the
-#: last value is not conclusive.
+#: Limits for a report of nonzero initial conditions, for root-mean-square residuals in units of the standard deviation
+#: of the output. The ratio of the residuals with a history and from rest must be at most the first limit, and their
+#: difference at least the second. The residual with a history must be at most the third limit, and the residual from
+#: rest at most the fourth.
 MAX_RESIDUAL_RATIO, MIN_RESIDUAL_DROP, MAX_HISTORY_RESIDUAL, MAX_REST_RESIDUAL = 0.5, 0.01, 0.2, 3.0
 
 
 @dataclass(frozen=True)
 class StartResiduals:
-    """Residuals of a run simulated from rest and with a history, each of shape (outputs, N).
+    """Residuals of a run simulated from rest and with a history (initial terms for past inputs), shape (outputs, N).
 
-    ``terms`` is the number of terms of the history, ``sizes`` are the standard deviations of the outputs.
+    `terms` is the number of initial terms of the history, and `sizes` has the standard deviations of the outputs.
     """
 
     rest: Floats
@@ -258,7 +265,10 @@ class StartResiduals:
 
 
 def is_in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
-    """Whether residuals of a model that starts from rest require a history, over all runs together."""
+    """Whether all runs together require initial terms for past inputs (a history) in place of a start from rest.
+
+    The result is False if a run cannot be simulated.
+    """
     residuals = []
     for run in runs:
         if (one := _start_residuals(structure, run)) is None:
@@ -268,16 +278,16 @@ def is_in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
 
 
 def _requires_history(residuals: Sequence[StartResiduals]) -> bool:
-    """Whether the residuals of all runs together require a history."""
+    """Whether a chi-squared test over all runs requires initial terms for past inputs (a history)."""
     terms = sum(one.terms for one in residuals)
     excess = sum(misfit([*one.rest], [*one.history], one.sizes.tolist()) for one in residuals)
-    # Noise that is coloured is followed by slow terms in any run.
+    # Slow initial terms can fit colored noise in any run, so the excess is reduced by the variance inflation.
     spread = max([1.0, *(variance_inflation(drop_missing(past)) for one in residuals for past in one.history)])
     return terms > 0 and excess / spread > chi_squared(terms, REST_TEST_LEVEL)
 
 
 def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
-    """Return residuals of the first samples of a run from rest and with a history; None if they are not finite."""
+    """Return the residuals of the first samples of a run from rest and with a history; None if they are infinite."""
     if run.length > MAX_START_SAMPLES:
         run = run.window(None, MAX_START_SAMPLES * run.step)
     ends, terms = [], 0
@@ -297,7 +307,7 @@ def _start_residuals(structure: Structure, run: Run) -> StartResiduals | None:
 
 
 def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
-    """Return the names of runs that start near zero although they had nonzero initial conditions."""
+    """Return the names of the runs that start near zero although their samples require nonzero initial conditions."""
     structure = model.structure
     if structure.initial != "auto" or not structure.is_linear or not has_memory(structure):
         return []
@@ -314,7 +324,7 @@ def runs_in_motion(model: Model, runs: Sequence[Run]) -> list[str]:
 
 
 def _is_reportable(residuals: StartResiduals) -> bool:
-    """Whether a history explains a run so much better than rest that a finding is worthwhile."""
+    """Whether terms for past inputs reduce the residuals so much that nonzero initial conditions are reported."""
     # Overflows give infinity. If both values are infinite, there is no finding.
     with np.errstate(over="ignore", invalid="ignore"):
         ends = [end / residuals.sizes[:, None] for end in (residuals.rest, residuals.history)]

@@ -31,20 +31,19 @@ from ftlm.utils.validation import Floats, real_number
 
 
 def comparison_records(runs: Sequence[Run], model: Model, m: int) -> list[Record]:
-    """Return block-pulse records of runs with which simulations are compared.
+    """Return block-pulse records of runs for comparisons with simulations.
 
-    The sensor filter is applied to an output if it was measured through the filter. If a filtered signal is an input of
-    a simulation, the filter is applied to all signals.
+    Outputs are as measured, with or without the sensor filter. If a filtered signal is an input of a simulation, the
+    filter is applied to all other signals.
     """
     return records(runs, model.structure, m, filtered=model.structure.all_filtered)
 
 
 def respond(model: Model, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
-    """Return simulated block-pulse means by output, and initial terms by output and exponent.
+    """Return simulated block-pulse means by output, and coefficients of initial terms by output and exponent.
 
-    `rec` is one of the :func:`comparison_records`.
-
-    The initial terms are fitted to the measured outputs by least squares.
+    `rec` is one of the :func:`comparison_records`. The coefficients are fitted to the measured outputs by least
+    squares.
     """
     structure = model.structure
     series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
@@ -76,12 +75,12 @@ def simulate(
 
     Models of integer orders are simulated exactly, by the matrix exponential of one sampling interval, if the samples
     are uniform and the model has no sensor filter, friction or non-linear term. For all other models, the step is
-    halved until this changes no output by more than ``tolerance`` times its largest value. Inputs follow their
-    intersample behavior (a zero-order hold stays exact), and Richardson extrapolation removes the error terms of powers
-    2, 3 and 4.
+    halved until a further halving changes no output by more than ``tolerance`` times its largest value. Inputs follow
+    their intersample behavior (a zero-order hold stays exact), and Richardson extrapolation removes the error terms
+    with powers 2, 3 and 4 of the step.
 
-    A simulated sample is the value just after the zero-order-hold inputs of its row have changed. It differs from the
-    value just before only if the model has direct feedthrough.
+    A simulated sample is the value just after the zero-order-hold inputs change at its time. It differs from the value
+    just before the change only if the model has direct feedthrough.
 
     Parameters
     ----------
@@ -93,12 +92,13 @@ def simulate(
     tolerance
         Change of the outputs, relative to their largest value, at which the refinement of the step terminates.
     initial
-        Coefficients of the initial terms (powers of t), by output and exponent; by default the run starts at rest. They
-        are valid for this run only. With a sensor filter, the exponents -1 and -2 are an impulse and its derivative,
-        which represent the initial state of the filter. An offset c of the equation is the exponent alpha with the
-        coefficient c / Gamma(alpha + 1). The level of an output is the exponent infinity; inputs are then measured from
-        their values before they change. Initial values y(0), y'(0) by Caputo's definition imply further powers of t if
-        a term of the output has a fractional order. If these powers are missing, an error lists them.
+        Coefficients of the initial terms (powers of t), by output and exponent; by default the run starts at rest. Such
+        coefficients apply to one run only. With a sensor filter, the exponents -1 and -2 are an impulse and its
+        derivative, which represent the initial state of the filter. An offset c of the equation is the exponent alpha
+        with the coefficient c / Gamma(alpha + 1). The exponent infinity is the level of an output; the values of the
+        inputs before they change are then subtracted from the inputs. Initial values y(0), y'(0) by Caputo's definition
+        imply further powers of t if a term of the output has a fractional order. If these powers are missing, an error
+        lists them.
     max_m
         Maximum number of block pulses. If the simulation has not converged with it, ConvergenceError is raised.
 
@@ -137,7 +137,7 @@ def simulate(
         )
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"{setting('tolerance')} {tolerance} is not positive; the default is 1e-6")
-    # The simulation is that of the equations, from rest; a level that is given is added to it.
+    # The equations are simulated for deviations from given levels, which are added to the result.
     levels = {name: terms.get(LEVEL_EXPONENT, 0.0) for name, terms in (initial or {}).items()}
     initial = {n: {e: v for e, v in terms.items() if e != LEVEL_EXPONENT} for n, terms in (initial or {}).items()}
     if any(levels.values()):
@@ -177,10 +177,10 @@ def simulate(
 
 
 def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
-    """Raise ModelError if initial values lack the fractional powers of t that they imply.
+    """Raise ModelError if the initial terms lack fractional powers of t that initial values imply.
 
-    A term D^nu y of Caputo's derivative, integrated alpha times, is I^(alpha - nu) (y - y_i t^i / i! - ...), which
-    contains them.
+    In an equation of order alpha, integrated alpha times, a term with Caputo's derivative D^nu y becomes
+    I^(alpha - nu) (y - sum of y_i t^i / i!), where y_i are the initial values. This contains powers alpha - nu + i.
     """
     alpha = item.order.constant
     values = {round(e): v for e, v in terms.items() if v and e == round(e) and 0.0 <= e < alpha}
@@ -203,13 +203,16 @@ def _check_initial_values(item: Equation, terms: Mapping[float, float]) -> None:
 
 
 def _units(model: Model, run: Run) -> dict[str, str]:
-    """Return the units of inputs and simulated outputs by name, from the run or else from the model."""
+    """Return the units of inputs (from the run, else the model) and outputs (from the model, else the run) by name."""
     inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
     return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
 def _with_missing_outputs(run: Run, model: Model) -> Run:
-    """Return the run with zeros for outputs that it lacks; the simulation does not use them."""
+    """Return the run with zeros for outputs of the model that it lacks and that the simulation does not use.
+
+    Raise DataError if such an output enters another equation as a measured signal.
+    """
     missing = [o for o in model.outputs if o not in run]
     if not missing:
         return run
@@ -225,7 +228,7 @@ def _with_missing_outputs(run: Run, model: Model) -> Run:
 
 @check_arguments
 def explicit_euler(model: Model, run: Run) -> dict[str, Floats]:
-    """Simulate an integer-order model by explicit Euler steps of one sampling interval, the paper's baseline.
+    """Simulate an integer-order model by explicit Euler steps of one sampling interval, as the baseline of the paper.
 
     Parameters
     ----------
@@ -243,7 +246,7 @@ def explicit_euler(model: Model, run: Run) -> dict[str, Floats]:
     Raises
     ------
     ModelError
-        If an order is fractional.
+        If an order is fractional, or the model has friction or a non-linear term.
     """
     signals = model.structure.signals
     run = apply_input_nonlinearity(run, model.structure)

@@ -53,21 +53,20 @@ def simulate_refined(
     max_m: int = MAX_M,
     on_grid: bool = False,
 ) -> OutputSamples:
-    """Simulate samples with successively halved steps and Richardson extrapolation, until they converge.
+    """Simulate a model with successively halved steps and Richardson extrapolation until the samples converge.
 
-    The refinement also stops at `max_m` block pulses.
-
-    Models of integer orders with uniform samples are simulated exactly; see :func:`exact_samples`.
+    The refinement also ends at `max_m` block pulses. Models of integer orders with uniform samples are simulated
+    exactly; see :func:`exact_samples`.
 
     Parameters
     ----------
     initial
-        Coefficients of initial terms by output and exponent. With None they are fitted to the measured outputs, each
-        divided by its standard deviation.
+        Coefficients of initial terms by output and exponent. With None, they are fitted to the measured outputs, which
+        are weighted by their inverse standard deviations.
     tolerance
         Change, relative to the largest value of each output, at which the refinement terminates.
     on_grid
-        Whether a run with nonuniform samples is simulated at the times of its uniform grid.
+        Whether samples are simulated at the uniform grid of the run even if it is compared at nonuniform times.
     """
     if initial is not None:
         return _simulate_refined(model, run, initial, tolerance, max_m, on_grid)
@@ -77,7 +76,7 @@ def simulate_refined(
     shifted, levels = deviations(run, model.structure)
     result = None
     if model.structure.initial == "auto":
-        # A run without evidence of motion may also start from rest at its level.
+        # A run without evidence of rest may still start from rest at a nonzero level.
         rest = replace(model, structure=replace(model.structure, initial="rest"))
         result = _simulate_refined(rest, shifted, None, tolerance, max_m, on_grid)
         model = replace(model, structure=replace(model.structure, initial=conditions_in_motion(model.structure)))
@@ -94,13 +93,13 @@ def _residuals(model: Model, run: Run, simulated: OutputSamples) -> list[Floats]
 
 
 def _has_white_residuals(model: Model, run: Run, simulated: OutputSamples) -> bool:
-    """Whether the residuals of a simulation are white, so that further initial terms explain nothing."""
+    """Whether the residuals of all outputs are finite and white, so that further initial terms are not significant."""
     residuals = [drop_missing(e) for e in _residuals(model, run, simulated)]
     return all(bool(np.all(np.isfinite(e))) and is_white(e) for e in residuals)
 
 
 def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSamples) -> bool:
-    """Whether :func:`start_score` prefers a simulation with few initial terms to one with more."""
+    """Whether :func:`start_score` of a simulation with few initial terms is at most that of one with many terms."""
     if not (np.all(np.isfinite(few.outputs)) and np.all(np.isfinite(many.outputs))):
         return False
     residuals = [_residuals(model, run, s) for s in (few, many)]
@@ -114,9 +113,9 @@ def _explains_as_well(model: Model, run: Run, few: OutputSamples, many: OutputSa
 def _simulate_refined(
     model: Model, run: Run, initial: Terms | None, tolerance: float, max_m: int, on_grid: bool
 ) -> OutputSamples:
-    """Simulate as :func:`simulate_refined`, for a model whose initial conditions are chosen.
+    """Simulate as :func:`simulate_refined`, for a run from which any known level is already subtracted.
 
-    A level of the outputs is subtracted before the simulation and added to the result.
+    A level that is fitted as an initial term is added to the samples.
     """
     if initial is None and model.structure.is_linear:
         model = with_initial_conditions(model, run)
@@ -129,7 +128,7 @@ def _simulate_refined(
         return OutputSamples(exact[0], named_terms(model, exact[1]), 1, np.zeros(len(model.outputs)))
     if initial is None and isinstance(resolve_initial_conditions(run, model.structure), History):
         terms = _fit_past_inputs(core, model, terms, max_m) or terms
-    # Given to the core, initial terms are powers of time alone.
+    # The core takes only powers of time as initial terms; levels are added to its result.
     levels = {o: dict(own).get(LEVEL_EXPONENT, 0.0) for o, own in zip(model.outputs, terms[1], strict=True)}
     powers = (terms[0], [[term for term in own if term[0] != LEVEL_EXPONENT] for own in terms[1]], terms[2])
     (outputs, initial_values), refinement, change = core.refine(
@@ -160,5 +159,5 @@ def _fit_past_inputs(
 def exact_samples(
     core: _core.OutputSimulation, terms: InitialTermsTuple
 ) -> tuple[Floats, list[list[tuple[float, float]]]] | None:
-    """Return exact samples and initial terms of a model with integer orders; None if it must be discretized."""
+    """Return exact samples and initial terms of a model with integer orders; None if the model must be discretized."""
     return core.exact_samples(terms, stop_flag())

@@ -16,19 +16,22 @@ from ftlm.errors import ModelError
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import Complex, Floats, as_floats, check_known
 
-#: Element with its parameters: (letters, name). Group: ("series" or "parallel", parts).
+#: Part of a circuit. An element is (letters, name), and a group is ("series" or "parallel", list of parts).
 Node: TypeAlias = tuple[str, Any]
-#: Impedance, and its derivatives by the parameters.
+#: Impedance [Ω], and the list of its derivatives with respect to the parameters.
 Response: TypeAlias = tuple[Any, list[Any]]
-#: Sum of coefficients by power of s.
+#: Sum of terms coefficient * s^power, as a dictionary of coefficients by power.
 Polynomial: TypeAlias = dict[float, float]
-#: Real part of sqrt(s tau) from which on its hyperbolic functions are 1 to rounding; they overflow at 700.
+#: Real part of sqrt(s tau) above which its hyperbolic tangent is 1 in double precision; sinh and cosh overflow at 700.
 MAX_DIFFUSION_ARGUMENT = 40.0
 _TOKEN_PATTERN = re.compile(r"p\(|[(),-]|[A-Za-z]+_?\d*")
 
 
 def _diffusion(s: Complex, p: Sequence[float], *, blocked: bool) -> Response:
-    """Return the impedance of a finite diffusion layer at s, and its derivatives by ln R and ln tau."""
+    """Return the impedance of a finite diffusion layer with p = (R, tau), and its derivatives by ln R and ln tau.
+
+    With `blocked`, the end of the layer reflects; otherwise it transmits.
+    """
     x = np.sqrt(s * p[1])
     x = np.where(x.real > MAX_DIFFUSION_ARGUMENT, MAX_DIFFUSION_ARGUMENT * (1 + 1j), x)
     tanh, root = np.tanh(x), np.sqrt(s * p[1])
@@ -48,11 +51,11 @@ class Element:
     parameters
         Name suffix and unit of each parameter. The suffix is empty if the parameter has the name of the element.
     impedance
-        Function that returns the impedance at s and its derivatives, by the logarithm of each positive parameter and by
-        an exponent itself.
+        Function of s and the parameters that returns the impedance and its derivatives. They are with respect to the
+        logarithm of each positive parameter, and with respect to an exponent itself.
     ratio
-        Function that returns numerator and denominator of the impedance as sums of powers of s; None if the impedance
-        is not such a ratio.
+        Function of the parameters that returns numerator and denominator of the impedance as sums of powers of s; None
+        if the impedance is not such a ratio.
     """
 
     meaning: str
@@ -62,7 +65,7 @@ class Element:
 
 
 def _power(sign: float, order: float) -> Callable[[Complex, Sequence[float]], Response]:
-    """Return a function of (s, p) that gives the impedance (p s^order)^sign and its derivative by ln p."""
+    """Return a function of s and p = (value,) that returns (value s^order)^sign and its derivative by ln value."""
     return lambda s, p: (z := (p[0] * s**order) ** sign, [sign * z])
 
 
@@ -77,7 +80,7 @@ def _gerischer(s: Complex, p: Sequence[float]) -> Response:
 
 
 SQUARE_ROOT_OF_2 = math.sqrt(2.0)
-#: Elements by letters. Parameters as in impedance.py (doi:10.21105/joss.02349).
+#: Kinds of elements by their letters. Parameters are defined as in impedance.py (doi:10.21105/joss.02349).
 CIRCUIT_ELEMENTS = {
     "R": Element("resistor", (("", "Ω"),), _power(1.0, 0.0), lambda p: ({0.0: p[0]}, {0.0: 1.0})),
     "C": Element("capacitor", (("", "F"),), _power(-1.0, 1.0), lambda p: ({0.0: 1.0}, {1.0: p[0]})),
@@ -122,15 +125,15 @@ class Circuit:
     text
         Circuit as text, such as ``R0-p(R1,CPE1)-W1``: ``-`` joins elements in series, and ``p(…, …)`` joins them in
         parallel. Elements are R, C, L, CPE (parameters Q, alpha), W (sigma: half-infinite diffusion), Wo and Ws (R,
-        tau: open and short Warburg) and G (R, tau: Gerischer), each followed by a different number.
+        tau: open and short Warburg) and G (R, tau: Gerischer). A number after the letters makes each name unique.
     values
         Known parameter values by name (``R0``, ``CPE1_Q``, ``CPE1_alpha``, ``W1_sigma``) in Ω, F, H and s.
 
     Raises
     ------
     ModelError
-        If an element is unknown, two elements have one name, a parenthesis is not closed, or a value has an unknown
-        name.
+        If an element is unknown, two elements have the same name, the text has a syntax error, or a value has an
+        unknown name.
     """
 
     text: str
@@ -141,7 +144,7 @@ class Circuit:
 
     @cached_property
     def tree(self) -> Node:
-        """Circuit as a tree of nested series and parallel groups."""
+        """Circuit as a tree of nested series and parallel groups; see :data:`Node`."""
         text = "".join(c for c in self.text if not c.isspace())
         tokens = _TOKEN_PATTERN.findall(text)
         if "".join(tokens) != text:
@@ -203,7 +206,7 @@ class Circuit:
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """Unit of every parameter by name."""
+        """Unit of every parameter by name; that of ``CPE1_Q`` contains the exponent ``CPE1_alpha`` if it is known."""
         units = {
             name + suffix: unit for kind, name in self.elements for suffix, unit in CIRCUIT_ELEMENTS[kind].parameters
         }
@@ -221,7 +224,7 @@ class Circuit:
         return tuple(n for n in self.names if n not in self.values)
 
     def with_values(self, values: Mapping[str, float]) -> Circuit:
-        """Return the circuit with further known parameter values."""
+        """Return the circuit with further known parameter values by name; they replace existing ones."""
         return replace(self, values={**self.values, **values})
 
     def impedance(self, w: ArrayLike) -> Complex:
@@ -230,6 +233,8 @@ class Circuit:
 
     def polynomials(self) -> tuple[Polynomial, Polynomial]:
         """Return numerator and denominator of the impedance, each as coefficients by power of s.
+
+        All parameters must have values.
 
         Raises
         ------
@@ -275,7 +280,7 @@ class Circuit:
 def impedance_and_derivatives(
     circuit: Circuit, w: Floats, more: Mapping[str, float], node: Node | None = None
 ) -> tuple[Complex, dict[str, Complex]]:
-    """Return the complex impedance [Ω] of a circuit part, and its derivatives by parameter name.
+    """Return the complex impedance [Ω] of a circuit or a part of it, and its derivatives by parameter name.
 
     Derivatives are with respect to the logarithm of a parameter, but with respect to an exponent alpha itself.
 

@@ -27,7 +27,7 @@ class Term:
     Parameters
     ----------
     signal
-        Name of the signal; in an expression, the unit of its first signal.
+        Name of the signal; for an expression, the name of its first signal.
     order
         Order of the derivative that is applied to the signal, or to the whole expression.
     coefficient
@@ -35,7 +35,7 @@ class Term:
     factor
         Known factor of the coefficient, such as a sign.
     name
-        Name that the coefficient had before it got its value.
+        Name of a free coefficient that has been fixed to its value.
     expression
         Expression of a non-linear term.
     """
@@ -55,7 +55,7 @@ class Term:
 
     @property
     def column(self) -> str:
-        """Name of the term's signal in a block-pulse record: the signal, or the text of the expression."""
+        """Name of the term's row in a block-pulse record: the signal, or the text of the expression."""
         return self.signal if self.nonlinear is None else str(self.nonlinear)
 
     @property
@@ -71,11 +71,11 @@ class Term:
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
     def as_text(self, signal: str) -> str:
-        """Return the term as text, with the given text in place of its signal."""
+        """Return the term as text, with `signal` in place of the name of its signal."""
         return self.format({self.signal: signal})
 
     def format(self, inputs: Mapping[str, str]) -> str:
-        """Return the term as text; ``inputs`` maps an input to its text with delay and non-linearity."""
+        """Return the term as text; `inputs` maps the name of an input to its text with delay and non-linearity."""
         if isinstance(self.coefficient, str):
             factor = "" if self.factor == 1 else "-" if self.factor == -1 else f"{self.factor!r} "
             text = f"{factor}{self.coefficient} "
@@ -84,7 +84,7 @@ class Term:
         return text + self.format_operand(inputs)
 
     def format_operand(self, inputs: Mapping[str, str]) -> str:
-        """Return the derivative of the signal or expression as text, without the coefficient."""
+        """Return the term as text without its coefficient; `inputs` is as in :meth:`format`."""
         shape = self.nonlinear
         if shape is None:
             return derivative(self.order, inputs.get(self.signal, self.signal))
@@ -92,13 +92,13 @@ class Term:
         if self.order.names or self.order.constant != 0:
             return derivative(self.order, f"({text})")
         if shape.operation == "add":
-            # A number would be multiplied into a sum without a constant.
+            # The parser multiplies a number into a sum without a constant; a second pair of parentheses prevents this.
             bare = isinstance(self.coefficient, str) or shape.arguments[-1].operation == "constant"
             return f"({text})" if bare else f"(({text}))"
         first = shape.arguments[0]
         product = shape.operation == "multiply" and (first.operation, first.value) == ("channel", 0.0)
         if product and not isinstance(self.coefficient, str):
-            # The first of two names in a product is read as a coefficient.
+            # The parser reads the first of two names in a product as a coefficient; parentheses prevent this.
             return text.replace(first.as_text(inputs), f"({first.as_text(inputs)})", 1)
         return text
 
@@ -112,7 +112,10 @@ Parametric = TypeVar("Parametric", Term, "Stribeck", "Friction")
 def _fix_parameter(
     item: Parametric, values: Mapping[str, float], field: str = "coefficient", name_field: str = "name"
 ) -> Parametric:
-    """Return a term or friction with a free parameter fixed to its value, if there is one; its name is kept."""
+    """Return a term or friction with the free parameter in `field` fixed to its value, if `values` contains it.
+
+    The field `name_field` then stores the name of the parameter.
+    """
     name = getattr(item, field)
     if not isinstance(name, str) or name not in values:
         return item
@@ -144,7 +147,7 @@ class Stribeck:
     factor
         Known factor of the coefficient. It is negative, because friction dissipates energy.
     name, speed_name
-        Names of coefficient and speed before their values were fixed.
+        Names of a free coefficient and a free speed that have been fixed to their values.
     """
 
     coefficient: str | float
@@ -159,7 +162,7 @@ class Stribeck:
         return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
 
     def as_text(self, output: str) -> str:
-        """Return the Stribeck term of an output as text."""
+        """Return the Stribeck term in the equation of an output as text."""
         speed = self.speed if isinstance(self.speed, str) else f"{self.speed!r}"
         return f"- {_format_coefficient(self.coefficient, self.factor)} exp(-(D {output}/{speed})^2) sign(D {output})"
 
@@ -179,7 +182,7 @@ class Friction:
     factor
         Known factor of the coefficient. It is negative, because friction dissipates energy.
     name
-        Name that the coefficient had before it got its value.
+        Name of a free coefficient that has been fixed to its value.
     more
         Optional Stribeck term. The breakaway force is then the sum of both coefficients.
     """
@@ -202,7 +205,10 @@ class Friction:
 
     @property
     def law(self) -> tuple[float, float, float]:
-        """Values (fc, fs, vs) of friction without free parameters; fs = 0 and vs = 1 without a Stribeck term."""
+        """Coulomb coefficient fc, Stribeck coefficient fs and Stribeck speed vs, as (fc, fs, vs).
+
+        Parameters must be fixed. Without a Stribeck term, fs is 0 and vs is 1.
+        """
         more = self.stribeck
         near = (0.0, 1.0) if more is None else (more.strength or 0.0, float(more.speed))
         return (self.strength or 0.0, *near)
@@ -217,7 +223,7 @@ class Friction:
 
     @property
     def identified_coefficients(self) -> dict[str, float]:
-        """Values of fixed friction parameters, by their names before they were fixed."""
+        """Values of friction parameters that were free and have been fixed, by name."""
         more = self.stribeck
         pairs = [(self.name, self.coefficient)]
         if more is not None:
@@ -226,12 +232,12 @@ class Friction:
 
     @property
     def numbers(self) -> list[float]:
-        """Values of a friction without free parameters: coefficient, then coefficient and speed of a Stribeck term."""
+        """Coulomb coefficient, then coefficient and speed of a Stribeck term; no parameter may be free."""
         more = self.stribeck
         return [float(v) for v in (self.coefficient, *(() if more is None else (more.coefficient, more.speed)))]
 
     def with_numbers(self, values: Sequence[float]) -> Friction:
-        """Return the friction with other values, in the sequence of :attr:`numbers`."""
+        """Return the friction with other parameter values, which have the sequence of :attr:`numbers`."""
         coefficient, *near = values
         more = UNSET if self.stribeck is None else replace(self.stribeck, coefficient=near[0], speed=near[1])
         return replace(self, coefficient=coefficient, more=more)
@@ -244,13 +250,13 @@ class Friction:
         return replace(fixed, more=_fix_parameter(_fix_parameter(self.stribeck, values), values, "speed", "speed_name"))
 
     def as_text(self, output: str) -> str:
-        """Return the friction terms of an output as text."""
+        """Return the friction terms in the equation of an output as text."""
         near = "" if self.stribeck is None else f" {self.stribeck.as_text(output)}"
         return f"- {_format_coefficient(self.coefficient, self.factor)} sign(D {output}){near}"
 
 
 def _format_coefficient(coefficient: str | float, factor: float) -> str:
-    """Return a friction coefficient as text, multiplied by the magnitude of its factor."""
+    """Return a friction coefficient as text, multiplied by minus its negative factor."""
     if isinstance(coefficient, str):
         return coefficient if factor == -1 else f"{-factor!r} {coefficient}"
     return f"{-factor * coefficient!r}"
@@ -336,7 +342,7 @@ class Equation:
             self._check_friction(self.friction)
 
     def _check_expression(self, term: Term, shape: Expression) -> None:
-        """Raise ModelError if a non-linear term contains too high a derivative of the output to be simulated."""
+        """Raise ModelError if the order of a non-linear term, or of an output derivative in it, is out of range."""
         words = f"{term} in the equation of {self.output}"
         if term.order.names or self.order.names:
             return
@@ -354,7 +360,7 @@ class Equation:
                 )
 
     def _check_friction(self, friction: Friction) -> None:
-        """Raise ModelError if friction adds energy, or if alpha is so low that the output has no velocity."""
+        """Raise ModelError if friction adds energy, a parameter of it is out of range, or alpha is outside (1, 2]."""
         words = f"friction in the equation of {self.output}"
         terms: list[Friction | Stribeck] = [friction] if friction.stribeck is None else [friction, friction.stribeck]
         for term in terms:
@@ -387,10 +393,9 @@ class Equation:
     def check_input_orders(self, outputs: Sequence[str]) -> None:
         """Raise ModelError if the order of an input is not below alpha, so that the output jumps with the input.
 
-        Only equations with friction or non-linear terms are checked; simulated outputs are exempt.
-
-        Friction depends on the velocity of the output, and a non-linear term on its values within a block pulse, so
-        both require a continuous output.
+        Equations with friction or non-linear terms must pass this check. Friction depends on the velocity of the
+        output, and a non-linear term on the values of the output within a block pulse, so both require a continuous
+        output. Terms whose signals are all among the simulated `outputs` are exempt.
 
         Raises
         ------
@@ -458,11 +463,11 @@ class Equation:
 
     @property
     def is_identified(self) -> bool:
-        """Whether all orders and coefficients are fixed."""
+        """Whether all orders and coefficients, including those of friction, are fixed."""
         return not self.order_names and not self.coefficient_names
 
     def as_text(self, inputs: Mapping[str, str]) -> str:
-        """Return the equation as text; ``inputs`` maps an input to its text with delay and non-linearity."""
+        """Return the equation as text; `inputs` maps the name of an input to its text with delay and non-linearity."""
         right = " + ".join(t.format(inputs) for t in self.terms).replace("+ -", "- ")
         friction = "" if self.friction is None else f" {self.friction.as_text(self.output)}"
         return f"{derivative(self.order, self.output)} = {right}{friction}"
@@ -474,7 +479,7 @@ class Equation:
 def format_equation(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
     """Return an identified equation as text with six significant digits.
 
-    ``inputs`` maps an input to its text, such as ``u(t - 0.035 s)``.
+    `inputs` maps the name of an input to its text, such as ``u(t - 0.035 s)``.
     """
     texts = inputs or {}
     parts = [f"{t.fixed or 0.0:+.6g} {t.format_operand(texts)}" for t in item.terms]

@@ -16,9 +16,9 @@ from ftlm.utils.validation import Floats
 
 Function: TypeAlias = Literal["sin", "cos", "exp", "tanh", "abs", "sqrt"]
 Operation: TypeAlias = Literal["constant", "channel", "add", "multiply", "power"] | Function
-#: Signal and order of its derivative.
+#: Signal or derivative of a signal, as (signal name, order of the derivative).
 Channel: TypeAlias = tuple[str, float]
-#: Functions of an expression: values and derivative.
+#: Functions that an expression may contain, by name, as (function, its derivative).
 EXPRESSION_FUNCTIONS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     "sin": (np.sin, np.cos),
     "cos": (np.cos, lambda x: -np.sin(x)),
@@ -27,9 +27,9 @@ EXPRESSION_FUNCTIONS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]
     "abs": (np.abs, np.sign),
     "sqrt": (np.sqrt, lambda x: 0.5 / np.sqrt(x)),
 }
-#: Limit of whole powers; larger ones overflow for any signal that is not scaled.
+#: Maximum exponent of a power; larger powers overflow for signals that are not scaled.
 MAX_POWER = 100
-#: Limit of the instructions of an expression, against texts that are nested for ever.
+#: Maximum number of instructions of an expression, which excludes excessively long texts.
 MAX_INSTRUCTIONS = 1000
 
 
@@ -39,7 +39,7 @@ class Expression:
     """Expression of signals and their derivatives without free parameters, such as ``abs(D y)*D y``.
 
     The functions :func:`constant`, :func:`channel`, :func:`add`, :func:`multiply`, :func:`power` and :func:`apply`
-    construct expressions in normal form. Parsing the text of an expression gives an equal expression.
+    construct expressions in normal form. The parser converts the text of an expression back to an equal expression.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Expression:
 
     @property
     def is_linear(self) -> bool:
-        """Whether the expression is a sum of constants and of channels with constant factors."""
+        """Whether the expression is affine: a sum of constants and of constants times channels."""
         if self.operation == "multiply":
             return len(self.arguments) == 2 and not self.arguments[0].channels and self.arguments[1].is_linear
         return self.operation in ("constant", "channel") or (
@@ -75,7 +75,7 @@ class Expression:
         )
 
     def program(self, channel_index: Mapping[Channel, int]) -> list[tuple[str, float]]:
-        """Return the expression as postfix instructions for the core; ``channel_index`` numbers the channels.
+        """Return the expression as postfix instructions for Rust; `channel_index` has the index of each channel.
 
         Instructions are ("constant", value), ("channel", index), ("add", 0), ("multiply", 0), ("negate", 0),
         ("power", exponent), and (name of a function, 0).
@@ -95,9 +95,9 @@ class Expression:
         return out
 
     def evaluate(self, values: Mapping[Channel, Floats | float]) -> Any:
-        """Return the values of the expression from numbers or arrays of its channels.
+        """Return the value of the expression for values of its channels, which are numbers or arrays of equal shape.
 
-        They are not finite where the expression is undefined or overflows.
+        The result is NaN or infinite where the expression is undefined or overflows.
         """
         with np.errstate(all="ignore"):
             return self._evaluate({c: np.asarray(v, dtype=np.float64) for c, v in values.items()})
@@ -123,7 +123,10 @@ class Expression:
         return int(self.value) if self.value.is_integer() else self.value
 
     def gradient(self, values: Mapping[Channel, Floats | float]) -> dict[Channel, Any]:
-        """Return the partial derivatives with respect to the channels, by channel; the derivative of abs at 0 is 0."""
+        """Return the partial derivatives with respect to the channels, by channel, at given values of the channels.
+
+        The derivative of abs at 0 is 0.
+        """
         samples = {c: np.asarray(v, dtype=np.float64) for c, v in values.items()}
         with np.errstate(all="ignore"):
             return {c: self._derivative(c, samples) for c in self.channels}
@@ -158,7 +161,7 @@ class Expression:
         return 1.0, self
 
     def as_text(self, signals: Mapping[str, str] | None = None) -> str:
-        """Return the expression as text; ``signals`` maps an input to its text with delay and non-linearity."""
+        """Return the expression as text; `signals` maps an input to its text with delay and non-linearity."""
         texts = signals or {}
         match self.operation:
             case "constant":
@@ -245,12 +248,12 @@ def multiply(*factors: Expression) -> Expression:
 def power(base: Expression, exponent: float) -> Expression:
     """Return a power of an expression.
 
-    The exponent is an integer from 1 to 100. For an absolute value it is any positive number.
+    The exponent must be an integer from 1 to 100; for an absolute value, any number in (0, 100].
 
     Raises
     ------
     ModelError
-        If the exponent is not allowed.
+        If the exponent is out of range, or a constant power overflows.
     """
     if base.operation == "abs":
         if not 0 < exponent <= MAX_POWER:
@@ -275,7 +278,7 @@ def apply(function: str, argument: Expression) -> Expression:
     Raises
     ------
     ModelError
-        If the function is unknown.
+        If the function is unknown, or its value for a constant argument is not finite.
     """
     if function not in EXPRESSION_FUNCTIONS:
         raise ModelError(f"{function}(…) is unknown; use {', '.join(EXPRESSION_FUNCTIONS)}")

@@ -1,8 +1,8 @@
 """Recursive-descent parser of equation texts; syntax errors name the position.
 
-Braces stand for any number of an item, brackets for an optional one, a bar for an alternative. ``delay`` and ``limit``
-are a number or an interval ``low:high``, ``strength`` and ``speed`` a number or a name, ``order`` a number, a name or
-an expression in parentheses. Blanks between names, numbers and symbols do not matter.
+Braces mark a repeated item, brackets an optional item, and a bar an alternative. A ``delay`` or ``limit`` is a number
+or an interval ``low:high``. A ``strength`` or ``speed`` is a number or a name. An ``order`` is a number, a name or an
+expression in parentheses. Blanks between names, numbers and symbols do not matter.
 
 ::
 
@@ -53,29 +53,29 @@ from ftlm.utils.validation import nearest
 IDENTIFIER_PATTERN = r"[^\W\d]\w*"
 #: Input non-linearities with a syntax in equation texts.
 NONLINEARITY_KINDS: tuple[NonlinearityKind, ...] = ("saturation", "dead_zone")
-#: A term that consists of such a name alone is an offset.
+#: Names of offsets, such as c and c1: a term that consists of this name alone is an offset.
 _OFFSET_PATTERN = re.compile(r"c\d*")
 _TOKEN_PATTERN = re.compile(
     rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{IDENTIFIER_PATTERN})|(?P<symbol>[-+*/^(){{}}=,:']))"
 )
-#: Tops of ``d^2 y/dt^2``, ``d2y/dt2`` and ``dy/dt``, with a space between tokens, and most tokens of such a derivative.
+#: Numerator of ``d^2 y/dt^2``, ``d2y/dt2`` or ``dy/dt`` as tokens with spaces, and maximum tokens of a derivative.
 _LEIBNIZ_PATTERN = re.compile(rf"d(?: \^ (\d+)(?: ({IDENTIFIER_PATTERN}))?|(?:(\d+)?({IDENTIFIER_PATTERN}))?)(?= /)")
 MAX_LEIBNIZ_TOKENS = 8
-#: Signs of printed texts, by the symbols of the grammar.
+#: Typographic minus and multiplication signs, mapped to the symbols of the grammar.
 _PRINTED_SIGNS = str.maketrans("−·⋅×", "-***")
 _SUPERSCRIPT_PATTERN = re.compile("[⁰¹²³⁴-⁹]+")
-#: A signal of one letter, perhaps under combining dots, with its subscript.
+#: A signal of one letter with optional combining dots above it, and its optional subscript.
 _DOTTED_PATTERN = re.compile(
     r"(?<![\w\u0307\u0308\u20db])([^\W\d_][\u0307\u0308\u20db]*)((?:_\w*|\d+)?)(?![\w\u0307\u0308\u20db])"
 )
 #: Order of the derivative that a combining dot, two dots and three dots stand for.
 _DOT_ORDERS = {"\u0307": 1, "\u0308": 2, "\u20db": 3}
-#: Letters of alphabets, whose dots are no derivative.
+#: Letters whose two dots belong to the alphabet and do not mean a derivative.
 _UMLAUT_LETTERS = "äëïöüÄËÏÖÜ"
 
 
 def _prime_notation(dotted: re.Match[str]) -> str:
-    """Return a dotted one-letter signal with primes, such as y'' for ÿ; other names are unchanged."""
+    """Return a one-letter signal with primes in place of dots, such as y'' for ÿ; return other names unchanged."""
     name, rest = dotted.groups()
     parts = unicodedata.normalize("NFD", name)
     if name in _UMLAUT_LETTERS or not set(parts[1:]) <= set(_DOT_ORDERS):
@@ -83,11 +83,11 @@ def _prime_notation(dotted: re.Match[str]) -> str:
     return f"{parts[0]}{rest}{chr(39) * sum(_DOT_ORDERS[dot] for dot in parts[1:])}"
 
 
-#: What follows the name of an offset in parentheses, by the kind of offset.
+#: Tokens after the name of an offset in parentheses, by the kind of offset.
 OFFSET_PHRASES = {"ramp": ("+", "ramp", "t"), "auto": ("if", "the", "runs", "ask", "for", "it")}
-#: Functions that an error message names where they are applied to a signal.
+#: Names that are parsed as functions before a parenthesis; for an unsupported one, the error message names it.
 FUNCTION_NAMES = ("sin", "cos", "tan", "tanh", "exp", "log", "ln", "abs", "sqrt", "sign", "atan", "arctan")
-#: Limit of nested parentheses and functions in a non-linear term.
+#: Maximum nesting depth of parentheses and functions in a non-linear term.
 MAX_DEPTH = 30
 #: Maximum power of a polynomial in s that is multiplied out.
 MAX_POLYNOMIAL_POWER = 10
@@ -101,7 +101,7 @@ class ParsedTerm:
 
     ``name`` is None if the coefficient is a number.
 
-    A non-linear term has an expression; ``signal`` is then its first signal.
+    A non-linear term has an expression; ``signal`` is then the first signal of the expression.
     """
 
     factor: float
@@ -123,7 +123,7 @@ UNIT_POLYNOMIAL: SymbolicPolynomial = [(1.0, None, Order())]
 
 
 class EquationParser:
-    """Parser of the text of one equation: terms of both sides, friction, offset, delays and limits of inputs.
+    """Parser of the text of one equation; :meth:`parse` sets its attributes.
 
     Parameters
     ----------
@@ -137,17 +137,17 @@ class EquationParser:
     left, right
         Terms of the left-hand and the right-hand side.
     friction, stribeck
-        Friction of the output on the right-hand side, with its signal.
+        (friction, signal) of the Coulomb and of the Stribeck term on the right-hand side; None without such a term.
     offset
-        ``"constant"``, ``"ramp"`` or ``"auto"``, or None.
+        Kind of the offset: ``"constant"``, ``"ramp"`` or ``"auto"``; None without an offset.
     limits
-        Saturations and dead zones, by signal and kind.
+        Saturation levels and half-widths of dead zones, by (signal, kind): a number, or (lower, upper) bounds.
     plain
-        Names of signals that occur without saturation and dead zone.
+        Names of signals that occur at least once without a saturation or dead zone.
     delays
-        Delays [s] by signal: a number if known, (lower, upper) if it is to be estimated in this interval.
+        Delay [s] of each signal: a number if it is known, (lower, upper) bounds if it is to be estimated.
     is_transfer
-        Whether the text has transfer functions in s.
+        Whether the equation is written with transfer functions in s.
     """
 
     def __init__(self, text: str, signals: Collection[str] = ()) -> None:
@@ -167,7 +167,7 @@ class EquationParser:
         self.is_transfer = False
         self._tokens: list[tuple[str, str, int]] = []
         self._position = 0
-        # Signs of a printed text, and the power of a Python text, of the same length.
+        # Replacements have the length of the originals, so that positions in error messages stay valid.
         readable = text.translate(_PRINTED_SIGNS).replace("**", "^ ")
         at = 0
         while readable[at:].strip():
@@ -193,7 +193,7 @@ class EquationParser:
         return token
 
     def _sees(self, *values: str) -> bool:
-        """Whether the next tokens have the given values."""
+        """Whether the next tokens are the given texts."""
         return all(self._peek(k)[1] == value for k, value in enumerate(values))
 
     def _accept(self, symbol: str) -> bool:
@@ -254,7 +254,7 @@ class EquationParser:
         return terms
 
     def _sum(self, *, is_lhs: bool = False, closed: bool = False) -> list[ParsedTerm]:
-        """Parse a sum up to the first token that cannot continue it, and return its terms."""
+        """Parse a sum up to the first token that cannot continue it; store offset and friction, return other terms."""
         terms: list[ParsedTerm] = []
         for sign in self._signs():
             if self._is_offset():
@@ -374,7 +374,7 @@ class EquationParser:
         self._take()
 
     def _take_printed_offset(self) -> bool:
-        """Parse an offset in parentheses, the form in which a structure prints it; return False for any other term."""
+        """Parse and store an offset in parentheses, as a structure prints it; return False for any other term."""
         for kind, phrase in OFFSET_PHRASES.items():
             if self._sees("(") and self._peek(1)[0] == "name":
                 values = [self._peek(k)[1] for k in range(2, 3 + len(phrase))]
@@ -389,7 +389,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------------ non-linear terms
 
     def _closing_distance(self, offset: int = 0) -> int:
-        """Return the number of tokens up to and including the parenthesis that closes the next one."""
+        """Return the number of next tokens up to and including the one that closes the parenthesis at `offset`."""
         depth = 0
         while True:
             kind, value, _ = self._peek(offset)
@@ -399,11 +399,11 @@ class EquationParser:
                 return offset
 
     def _is_curved(self, end: int) -> bool:
-        """Whether a power or a function is among the next `end` tokens."""
+        """Whether the next `end` tokens contain a power or a function."""
         return any(self._peek(k)[1] == "^" or self._peek(k)[1] in EXPRESSION_FUNCTIONS for k in range(end))
 
     def _is_plain_sum(self) -> bool:
-        """Whether the next parentheses contain a sum without powers and functions that is not a factor of a product."""
+        """Whether the next parentheses contain a sum without powers and functions, and no ``^`` or ``*`` follows."""
         end, depth, signs = self._closing_distance(), 0, 0
         for k in range(end):
             value = self._peek(k)[1]
@@ -412,10 +412,10 @@ class EquationParser:
         return signs > 0 and not self._is_curved(end) and self._peek(end)[1] not in ("^", "*")
 
     def _is_expression_group(self) -> bool:
-        """Whether the next parentheses, after a number, are a factor of a non-linear term and not a sum to expand.
+        """Whether parentheses after a number are a factor of a non-linear term, not a sum to multiply out.
 
-        They are if a power or a product follows, if they contain a constant and a power or function, or if they are
-        doubled.
+        They are a factor if ``^`` or ``*`` follows. They are also a factor if they contain a power or function, and
+        either a constant term or a second pair of parentheses around the whole sum.
         """
         end = self._closing_distance()
         if self._peek(end)[1] in ("^", "*"):
@@ -438,7 +438,7 @@ class EquationParser:
         return False
 
     def _operand(self) -> tuple[Order, str | Expression]:
-        """Parse the operand of a coefficient: return (order, signal), or (order, expression) of a non-linear term."""
+        """Parse a term after its coefficient; return (order, signal), or (order, expression) of a non-linear term."""
         begin = self._position
         operator = self._operator()
         if operator is not None and self._sees("("):
@@ -511,7 +511,7 @@ class EquationParser:
                 return multiply(*factors)
 
     def _power(self) -> Expression:
-        """Parse one factor of a product with its exponent, and return it."""
+        """Parse one factor of a product with its optional exponent, and return it."""
         kind, value, at = self._peek()
         derived = value == "D" or self._leibniz() is not None
         if kind == "number":
@@ -560,7 +560,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------ derivatives and signals
 
     def _derivative(self) -> tuple[Order | None, str]:
-        """Parse a signal or its derivative, and return (order, signal); the order is None without a derivative."""
+        """Parse a signal or its derivative, and return (order, signal); the order of a plain signal is None."""
         derivative = self._leibniz()
         if derivative is not None and derivative[1]:
             self._position += derivative[2]
@@ -624,7 +624,7 @@ class EquationParser:
             delay = -float(self._take()[1])
         elif self._accept("-"):
             delay = self._delay(signal)
-        # The unit of a printed model.
+        # A printed model has the unit s after a delay.
         self._position += self._sees("s")
         self._expect(")")
         self._check_delay(signal, delay)
@@ -646,7 +646,7 @@ class EquationParser:
         return self._value("a delay [s], or LEAST:LARGEST where it is estimated")
 
     def _value(self, expectation: str) -> Value:
-        """Parse a number, or an interval ``low:high`` for an estimate, and return it."""
+        """Parse a number or an interval ``low:high``, and return it; `expectation` is the text of the syntax error."""
         ends = []
         while True:
             sign = -1.0 if self._accept("-") else 1.0
@@ -687,7 +687,7 @@ class EquationParser:
     # ------------------------------------------------------------------------------------------------ friction
 
     def _take_friction(self, sign: float) -> bool:
-        """Parse ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; return False for any other term."""
+        """Parse and store ``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)``; return False for any other term."""
         begin, number, name = self._position, 1.0, None
         if self._peek()[0] == "number":
             number = float(self._take()[1])
@@ -695,7 +695,7 @@ class EquationParser:
         if self._peek()[0] == "name" and self._peek()[1] not in ("D", "sign", "exp"):
             name = self._take()[1]
             self._accept("*")
-        # The factor of Stribeck friction stands before the sign.
+        # The exponential factor of Stribeck friction stands before sign(D y).
         end = self._closing_distance(1) if self._sees("exp", "(") else 0
         has_factor = end > 0 and self._peek(end + (self._peek(end)[1] == "*"))[1] == "sign"
         if not has_factor and not self._sees("sign", "("):
@@ -732,7 +732,7 @@ class EquationParser:
         return True
 
     def _stribeck_factor(self) -> tuple[str, str | float]:
-        """Parse ``exp(-(D y/vs)^2)``, and return the signal and the name or value of the Stribeck speed."""
+        """Parse ``exp(-(D y/vs)^2)``, and return (signal, name or value of the Stribeck speed vs)."""
         self._take()
         for symbol in "(-(":
             self._expect(symbol, "-(D y/vs)^2, as in exp(-(D y/vs)^2)")
@@ -747,7 +747,7 @@ class EquationParser:
         return signal, float(value) if kind == "number" else value
 
     def _velocity(self, expectation: str) -> str:
-        """Parse ``D y``, and return the signal."""
+        """Parse ``D y``, and return the name of the signal; `expectation` is the text of the syntax error."""
         if not self._sees("D") or self._peek(1)[0] != "name":
             raise self._syntax_error(expectation)
         self._take()
@@ -758,7 +758,7 @@ class EquationParser:
     def _is_transfer(self) -> bool:
         """Whether the text has the form ``y = G(s) u`` or ``y/u = G(s)``.
 
-        A single signal is then on one side, and s on the other.
+        The left-hand side is then a signal or a ratio of two signals, and s occurs on the right-hand side.
         """
         values = [value for _, value, _ in self._tokens]
         if values.count("=") != 1:
@@ -768,14 +768,14 @@ class EquationParser:
         if not re.fullmatch(rf"{signal}( / {signal})?", " ".join(values[:at])):
             return False
         last = len(values) - 1
-        # Neither u(s), nor the unit of u(t - 0.1 s), nor a signal of that name.
+        # The s of u(s), the unit in u(t - 0.1 s) and a last token s, which is a signal, do not count.
         return any(
             values[k] == "s" and k != last and values[k - 1] != "(" and values[k - 3 : k - 1] != ["t", "-"]
             for k in range(at + 1, len(values))
         ) or any(values[k : k + 2] == ["(", "s"] and values[k + 2 : k + 3] != [")"] for k in range(at, len(values)))
 
     def _transfer(self) -> None:
-        """Parse transfer functions, and store the terms of the equation multiplied by their common denominator."""
+        """Parse transfer functions, multiply the equation by all denominators, and store the terms of both sides."""
         output = self._transform()
         common = self._transform() if self._accept("/") else None
         self._expect("=")
@@ -804,7 +804,7 @@ class EquationParser:
             self.right += [ParsedTerm(c, n, o, signal) for c, n, o in scaled]
 
     def _transform(self) -> str:
-        """Parse a signal with or without ``(s)`` after it, and return its name."""
+        """Parse a signal, with or without ``(s)`` after it, and return its name."""
         kind, value, _ = self._peek()
         if kind != "name":
             raise self._syntax_error("the name of a signal")
@@ -815,7 +815,7 @@ class EquationParser:
         return value
 
     def _ratio(self, common: str | None) -> tuple[SymbolicPolynomial, SymbolicPolynomial, Value]:
-        """Parse a transfer function up to its signal, and return numerator, denominator and delay."""
+        """Parse a transfer function; return numerator, denominator and delay. `common` is u in the form ``y/u = …``."""
         top, bottom, divides = UNIT_POLYNOMIAL, UNIT_POLYNOMIAL, False
         delay: Value = 0.0
         while True:
@@ -840,9 +840,9 @@ class EquationParser:
 
     @staticmethod
     def _ends_ratio(kind: str, value: str, symbols: list[str], *, is_named: bool) -> bool:
-        """Whether a token ends a transfer function.
+        """Whether a token ends a transfer function: its input name if `is_named`, otherwise the end of its term.
 
-        It is the name of its signal, or without such a name the end of the term.
+        `symbols` are the three tokens after the token.
         """
         if not is_named:
             return kind == "end" or (kind == "symbol" and value in "+-")
@@ -850,7 +850,7 @@ class EquationParser:
         return kind == "name" and value not in ("s", "sqrt") and last
 
     def _exponential(self) -> Value:
-        """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, and return the delay [s] or its bounds."""
+        """Parse ``e^(-0.1 s)`` or ``exp(-0.1 s)``, and return the delay [s] or its (lower, upper) bounds."""
         _, value, at = self._take()
         if value == "e":
             self._take()
@@ -867,7 +867,7 @@ class EquationParser:
         return delay
 
     def _polynomial(self) -> SymbolicPolynomial:
-        """Parse a sum of products of numbers, names and powers of s, and return it."""
+        """Parse a sum of products of numbers, names and powers of s, and return it as a polynomial in s."""
         polynomial: SymbolicPolynomial = []
         for sign in self._signs():
             product = self._factor()
@@ -910,7 +910,7 @@ class EquationParser:
         return product
 
     def _times(self, first: SymbolicPolynomial, second: SymbolicPolynomial) -> SymbolicPolynomial:
-        """Return the product of two polynomials in s; terms of equal power and coefficient are added."""
+        """Return the product of two polynomials in s; terms with the same power and coefficient names are combined."""
         products: dict[tuple[str | None, Order], float] = {}
         for c1, n1, o1 in first:
             for c2, n2, o2 in second:
@@ -926,7 +926,7 @@ class EquationParser:
 
 
 def _add_known(terms: SymbolicPolynomial) -> SymbolicPolynomial:
-    """Return a polynomial in which terms of one order with known coefficients are added."""
+    """Return a polynomial in which terms of equal order with numeric coefficients are combined."""
     sums: dict[object, tuple[float, str | None, Order]] = {}
     for place, (c, name, order) in enumerate(terms):
         key = order if name is None else place

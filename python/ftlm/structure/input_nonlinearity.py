@@ -16,7 +16,7 @@ from ftlm.utils.validation import Floats, real_number
 InputEffect = Literal["delay", "saturation", "dead_zone"]
 #: Static non-linearities of an input.
 NonlinearityKind = Literal["saturation", "dead_zone"]
-#: Value of a fixed parameter, or (lower, upper) bound of an estimated one.
+#: Value of a fixed parameter, or (lower, upper) bounds of an estimated one.
 Value = float | tuple[float, float]
 #: Names of the effects in messages.
 INPUT_EFFECT_LABELS: dict[InputEffect, str] = {"delay": "delay", "saturation": "saturation", "dead_zone": "dead zone"}
@@ -118,7 +118,7 @@ class InputNonlinearity:
         return input_name(self.law, self.signal)
 
     def apply(self, values: Floats) -> Floats:
-        """Return input values after the non-linearity.
+        """Return input values with the non-linearity applied.
 
         Raises
         ------
@@ -131,21 +131,24 @@ class InputNonlinearity:
         return np.asarray(clipped if self.law == "saturation" else values - clipped)
 
     def as_text(self, inner: str, digits: str = "r") -> str:
-        """Return text such as ``sat(u, 0.94)``, where `inner` is the text of the input."""
+        """Return text such as ``sat(u, 0.94)``; `inner` is the text of the input.
+
+        `digits` is a format specification for numbers; ``"r"`` gives all digits.
+        """
         ends = self.value if isinstance(self.value, tuple) else (self.value,)
         texts = [repr(float(v)) if digits == "r" else format(v, digits) for v in ends]
         return f"{INPUT_EFFECT_ABBREVIATIONS[self.law]}({inner}, {':'.join(texts)})"
 
 
 def sort_nonlinearities(limits: Sequence[InputNonlinearity]) -> list[InputNonlinearity]:
-    """Return non-linearities in the order in which they act: dead zones first."""
+    """Return non-linearities in the order in which they act: dead zones, then saturations."""
     return sorted(limits, key=lambda limit: limit.law == "saturation")
 
 
 def replace_nonlinearities(
     limits: Sequence[InputNonlinearity], law: NonlinearityKind, values: Mapping[str, Value]
 ) -> tuple[InputNonlinearity, ...]:
-    """Return the non-linearities by input, with new values for one kind (saturation or dead zone)."""
+    """Return the non-linearities with new values for one kind (`law`), by input, in the order in which they act."""
     others = [limit for limit in limits if limit.law != law or limit.signal not in values]
     new = [
         InputNonlinearity(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()
@@ -156,9 +159,10 @@ def replace_nonlinearities(
 def check_nonlinearities(
     limits: Sequence[InputNonlinearity], delays: Mapping[str, object], late: Mapping[str, object]
 ) -> None:
-    """Raise ModelError if an input has two non-linearities of one kind, or more than one free parameter.
+    """Raise ModelError for a combination of non-linearities and delays of an input that cannot be estimated.
 
-    ``delays`` are the fixed delays and ``late`` the free delays, by input.
+    These are two non-linearities of one kind, more than one free parameter, a free limit with a fixed delay, and a free
+    dead zone with a saturation. `delays` are the fixed delays and `late` the free delays, by input.
     """
     for k, limit in enumerate(limits):
         if any((o.signal, o.law) == (limit.signal, limit.law) for o in limits[:k]):

@@ -17,14 +17,14 @@ from ftlm.utils.validation import real_number
 #: Highest order of an equation, and lowest order of an input term (threefold integration).
 MAX_ORDER = 10.0
 MIN_INPUT_ORDER = -3.0
-#: Upper bound on the order of an input term above its equation's highest order: at higher orders the measured signal
-#: would be differentiated too often for its sampling.
+#: Upper bound on the order of an input term minus the highest order of its equation. Above this bound, samples of the
+#: measured signal do not determine the required derivative.
 MAX_IMPROPER_ORDER = 1.0
 #: Highest order in the default grid of a search, unless the structure contains a higher one.
 MAX_DEFAULT_SEARCH_ORDER = 3.0
 #: Orders are rounded to this resolution; smaller differences mean the same order.
 ORDER_RESOLUTION = 1e-9
-#: Accepted specifications of the values of an order, see :func:`parse_values`.
+#: Accepted specifications of the values of an order; see :func:`parse_values`.
 Values: TypeAlias = float | str | Iterable[float]
 
 
@@ -53,15 +53,15 @@ class Order:
         return Order(constant, tuple(sorted((n, w) for n, w in weights.items() if w)))
 
     def substitute(self, values: Mapping[str, float]) -> Order:
-        """Return the order with values in place of some free orders; the others stay free."""
+        """Return the order with some free orders replaced by values; the other orders stay free."""
         constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
         return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in self.weights if n not in values))
 
     @classmethod
     def parse(cls, text: str | float) -> Order:
-        """Return the order that a number or text denotes.
+        """Return the order for a number or a text.
 
-        Text is a number, a name, or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
+        The text is a number, a name, or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.
 
         Raises
         ------
@@ -86,12 +86,12 @@ class Order:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free orders in the order."""
+        """Names of the free orders on which the order depends."""
         return tuple(name for name, _ in self.weights)
 
     @property
     def is_single(self) -> bool:
-        """Whether the order is a single free order."""
+        """Whether the order equals one free order."""
         return self.constant == 0 and len(self.weights) == 1 and self.weights[0][1] == 1
 
     def at(self, values: Mapping[str, float]) -> float:
@@ -153,8 +153,8 @@ def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
 def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
     """Return the value of a fixed order, or the ascending grid values of a free one.
 
-    `spec` is a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers. Raise ModelError for other
-    input.
+    `spec` is a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers. `name` names the order in
+    error messages. Raise ModelError for other input and for values outside [-3, 10].
     """
     if isinstance(spec, str):
         parts = spec.split(":")
@@ -198,12 +198,12 @@ def _check_range(name: str, value: float) -> float:
     return value
 
 
-#: Bound on the values of one axis of an order grid; more of them are taken for a typing error.
+#: Maximum number of values on one axis of an order grid; a larger number is regarded as a typing error.
 MAX_AXIS_VALUES = 1_000_000
 
 
 def order_axis(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
-    """Return the values of an order from ``low`` to ``high``, both included, in increments of ``step``."""
+    """Return the values low, low + step, … up to `high` of an order; raise ModelError for an invalid interval."""
     low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
     if not (math.isfinite(step) and step > 0):
         raise ModelError(f"order {name}: increment {step:g} is not positive; the paper's is 0.05")

@@ -68,27 +68,27 @@ def equation(
     fixed
         Values of known coefficients by name.
     delay
-        Delay of inputs [s] by name: a number fixes the delay, bounds (lower, upper) let output error estimate it. It
-        may be negative, down to minus one sampling interval, if an input is logged after it acts.
+        Delays of inputs [s] by name: a number fixes the delay, and (lower, upper) are bounds for its estimation by
+        output error. A delay may be negative, down to minus one sampling interval, if an input is logged after it acts.
     saturation, dead_zone
         Symmetric saturation level and half-width of the dead zone of inputs by name, in their units: a number fixes the
-        value, bounds (lower, upper) let output error estimate it. In the text they are written ``sat(u, 0.94)``,
-        ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.
+        value, and (lower, upper) are bounds for its estimation by output error. The syntax in texts is
+        ``sat(u, 0.94)``, ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.
     initial
         Initial conditions, as powers of t in the integrated equation: ``"rest"`` (none), ``"caputo"`` (Caputo's initial
         values), ``"history"`` (unknown past inputs: multiples of 1/4 as exponents, as many as are significant), or
-        given exponents. ``"auto"`` chooses rest if the outputs start at zero, are constant in at least five samples
-        before an input changes, or if the inputs are constant over the run (with a finding). A nonzero level of the
-        outputs is then estimated, and inputs are measured from their first value. Otherwise ``"auto"`` chooses Caputo
-        for integer orders or if the data require no more, else history.
+        given exponents. ``"auto"`` chooses rest in three cases: the outputs start at zero, they are constant in at
+        least five samples before an input changes, or the inputs are constant over the run (with a finding). A nonzero
+        level of the outputs is then estimated, and the first value of each input is subtracted. Otherwise ``"auto"``
+        chooses Caputo for integer orders or if the data require no more, else history.
     sensor_filter
-        Known filter that some signals passed when they were measured; see :class:`ftlm.SensorFilter`.
+        Known filter through which some signals were measured; see :class:`ftlm.SensorFilter`.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, the same as ``+ c`` in the text;
         ``"ramp"``: a constant and a constant times t; ``"level"``: an unknown constant that is added to each output;
         ``"none"``. If a run starts from rest, a constant is a load that acts from the first sample on. If the outputs
-        rest at nonzero values first, it is replaced by a level. Offsets are estimated for each run together with the
-        coefficients, and are not transferred to another run. Default: as in the text.
+        rest at nonzero values first, the constant is replaced by a level. Offsets are estimated for each run together
+        with the coefficients, and are not transferred to another run. Default: as in the text.
     coupling
         Coupling of several equations. ``"measured"`` (default): the measured other outputs are inputs of each equation.
         ``"simulated"`` (default if an equation has friction): all outputs are simulated together.
@@ -136,9 +136,9 @@ def equation(
 
 
 def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
-    """Return one parser per equation text, after all texts are parsed.
+    """Return one parser per equation text, with the text parsed.
 
-    The first name in a product is a coefficient unless it denotes a signal in another place.
+    The first name in a product is a coefficient, unless it denotes a signal elsewhere in the texts.
     """
     parsed = [EquationParser(line).parse() for line in lines]
     items = [item for words in parsed for item in (*words.left, *words.right)]
@@ -149,7 +149,10 @@ def _parse_lines(lines: Sequence[str]) -> list[EquationParser]:
 
 
 def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None) -> Offset:
-    """Return the offset option: the argument if given, otherwise the one that all equation texts share."""
+    """Return the offset option: `offset` if given, otherwise the common option of all equation texts.
+
+    `parsed` has pairs (equation, option in its text). Raise ModelError if the options contradict each other.
+    """
     pairs = [(item.output, has_offset) for item, has_offset in parsed if has_offset]
     if offset is not None:
         if pairs and check_offset(offset) == "none":
@@ -172,7 +175,8 @@ def _offset_of(parsed: Sequence[tuple[Equation, str | None]], offset: str | None
 def _equation_of(words: EquationParser) -> Equation:
     """Return a parsed equation, solved for its leading derivative.
 
-    This is the highest derivative on the left-hand side, or the first one if an order there is a free parameter.
+    The leading derivative is the highest one on the left-hand side, or the first one if an order there is free. Raise
+    ModelError if there is no derivative, or terms of the solved equation would not have one coefficient each.
     """
     linear = [item for item in words.left if item.expression is None]
     derivatives = [item for item in linear if item.order.names or item.order.constant != 0]
@@ -212,7 +216,10 @@ def _equation_of(words: EquationParser) -> Equation:
 
 
 def _division_reason(words: EquationParser, first: ParsedTerm) -> str | None:
-    """Return why the terms of an equation do not have one free coefficient each; None if they do."""
+    """Return, as text, why the solved equation would not have one coefficient per term; None if it would.
+
+    `first` is the leading derivative.
+    """
     linear = [item for item in (*words.left, *words.right) if item.expression is None]
     leading = [i for i in linear if i in words.left and (i.signal, i.order) == (first.signal, first.order)]
     named = next((item.name for item in leading if item.name), None)
@@ -227,9 +234,9 @@ def _division_reason(words: EquationParser, first: ParsedTerm) -> str | None:
 
 
 def _divided_equation(words: EquationParser, first: ParsedTerm) -> str:
-    """Return the text of an equation divided by the coefficient of its highest derivative.
+    """Return, for an error message, the text of an equation divided by the coefficient of its leading derivative.
 
-    Every term has one new coefficient. The text ends with the definition of each new coefficient by the old ones.
+    Every term has one new coefficient. The text ends with the definitions of the new coefficients by the old ones.
     """
     sums: dict[tuple[str, str], list[tuple[float, str | None]]] = {}
     for side, items in ((-1.0, words.left), (1.0, words.right)):
@@ -265,7 +272,7 @@ def _divided_equation(words: EquationParser, first: ParsedTerm) -> str:
 
 
 def _signal_text(words: EquationParser, signal: str) -> str:
-    """Return a signal of a parsed equation with its delay and its limits as text."""
+    """Return the text of a signal with its delay, saturation and dead zone in a parsed equation."""
 
     def value_text(value: Value) -> str:
         return ":".join(f"{v:g}" for v in ((value,) if isinstance(value, (int, float)) else value))
@@ -279,7 +286,7 @@ def _signal_text(words: EquationParser, signal: str) -> str:
 
 
 def _quotient_text(above: Sequence[tuple[float, str | None]], below: Sequence[tuple[float, str | None]]) -> str:
-    """Return the quotient of two sums of numbers times names as text."""
+    """Return the quotient of two sums as text; each term of a sum is a (number, product of names) pair."""
 
     def product_text(factor: float, name: str | None) -> str:
         counts = Counter(name.split("*")) if name else {}
@@ -298,7 +305,10 @@ def _quotient_text(above: Sequence[tuple[float, str | None]], below: Sequence[tu
 
 
 def _friction_of(words: EquationParser, output: str, leading: float) -> Friction | None:
-    """Return the friction of an equation, divided by the factor of its leading derivative; None without friction."""
+    """Return the friction of an equation, divided by the factor of its leading derivative; None without friction.
+
+    Raise ModelError for friction of a signal other than the output, and for Stribeck without Coulomb friction.
+    """
     for pair in (words.friction, words.stribeck):
         if pair is not None and pair[1] != output:
             raise ModelError(
@@ -319,7 +329,7 @@ def _friction_of(words: EquationParser, output: str, leading: float) -> Friction
 
 
 def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlinearity, ...]:
-    """Return the saturations and dead zones of all equations; raise ModelError if an input has different ones."""
+    """Return the saturations and dead zones in all equation texts; raise ModelError if texts differ for an input."""
     limits: dict[tuple[str, NonlinearityKind], Value] = {}
     for key, limit in chain.from_iterable(words.limits.items() for words in parsed):
         if limits.setdefault(key, limit) != limit:
@@ -335,7 +345,7 @@ def _merge_nonlinearities(parsed: Sequence[EquationParser]) -> tuple[InputNonlin
 
 
 def _merge_delays(parsed: Sequence[EquationParser], explicit_delays: Mapping[str, Value]) -> dict[str, Value]:
-    """Return the delays of all equation texts and of the argument, by input; raise ModelError if they contradict."""
+    """Return the delays in all equation texts and in the argument, by input; raise ModelError if an input has two."""
     delays: dict[str, Value] = {}
     for signal, delay in chain.from_iterable(words.delays.items() for words in parsed):
         if delays.setdefault(signal, delay) != delay:

@@ -14,7 +14,7 @@ from ftlm.utils.validation import real_number
 
 
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Sensor filter: a known transfer function that some signals passed when they were measured.
+    """Sensor filter: a known transfer function through which some signals were measured.
 
     The filter may apply to inputs and outputs, because it commutes with every linear equation. If a filtered signal is
     an input of an equation, all other signals, including the measured output, are filtered by software, and the
@@ -27,7 +27,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     signals
         Names of the signals that were measured through the filter, at least one.
     numerator, denominator
-        Numerator and denominator as (coefficient, order) pairs, each a sum of coefficient * D^order.
+        Numerator and denominator, each a sum of coefficient * D^order, as (coefficient, order) pairs.
 
     Raises
     ------
@@ -66,7 +66,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def relative_degree(self) -> int:
-        """Return the relative degree: order of the denominator minus order of the numerator, rounded down."""
+        """Relative degree: order of the denominator minus order of the numerator, rounded down."""
         bottom, top = (
             max((order for coefficient, order in part if coefficient), default=0.0)
             for part in (self.denominator, self.numerator)
@@ -82,7 +82,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @classmethod
     @check_arguments
     def low_pass(cls, signals: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
-        """Return a second-order low-pass filter; by default the filter of the arm's original real-time model.
+        """Return a second-order low-pass filter; the defaults are those of the robot arm's original real-time model.
 
         Parameters
         ----------

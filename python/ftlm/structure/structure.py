@@ -1,4 +1,4 @@
-"""Model structures: coupled equations with laws between parameters, delays, offsets and initial conditions."""
+"""Model structures: coupled equations with delays, offsets, initial conditions, and laws between coefficients."""
 
 from __future__ import annotations
 
@@ -28,22 +28,19 @@ from ftlm.utils.validation import check_choice, check_known, real_number
 
 
 class History(tuple[float, ...]):
-    """Exponents of t of the initial terms that represent unknown past inputs.
-
-    The exponents are selected from the data.
-    """
+    """Exponents of t in the initial terms that represent unknown past inputs, selected from the data."""
 
     __slots__ = ()
 
 
 Initial: TypeAlias = Literal["auto", "rest", "caputo", "history"] | tuple[float, ...]
 Offset: TypeAlias = Literal["none", "level", "constant", "ramp", "auto"]
-#: Accepted words for the initial terms.
+#: Accepted names of initial conditions; see :func:`ftlm.equation`.
 INITIAL_CHOICES = ("auto", "rest", "caputo", "history")
 
 
 def check_initial(initial: str | Iterable[float]) -> Initial:
-    """Return validated initial conditions: a known name, or exponents in (-1, 10]; raise ModelError for others."""
+    """Return initial conditions, a known name or exponents of t in (-1, 10]; raise ModelError for other values."""
     if isinstance(initial, str) and initial in INITIAL_CHOICES:
         return initial  # type: ignore[return-value]
     try:
@@ -60,7 +57,7 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
 
 
 def check_offset(offset: str) -> Offset:
-    """Return a validated offset option; raise ModelError for an unknown one."""
+    """Return `offset` if it is an option of :class:`Structure`; raise ModelError otherwise."""
     if offset in ("none", "level", "constant", "ramp", "auto"):
         return offset  # type: ignore[return-value]
     raise ModelError(f"{setting('offset')} {offset!r} is not known; use 'none', 'level', 'constant', 'ramp' or 'auto'")
@@ -82,17 +79,18 @@ class Hints:
     Parameters
     ----------
     highest_order_range
-        Usual interval of the orders of the equations; None for no preference.
+        (lower, upper) interval in which the highest order of an equation usually lies; None for a default interval.
     nominal_orders
-        Typical values of the free orders by name. They give additional initial guesses if every free order has some.
+        Typical values of free orders by name. They give additional initial guesses if every free order has values.
     order_names_by_coefficient
-        Name of the free order of a term, by its coefficient, when an equation is used without the order law.
+        Names of free orders by the coefficient of their term. :meth:`Structure.equation` uses them for the free orders
+        that replace expressions of an order law.
     min_ratios
-        Physical lower bounds of the ratios in the coefficient law, by name. The default is 1, which holds for a sum of
-        inertias divided by one of them.
+        Physical lower bounds of factors in the coefficient law that are ratios of two coefficients, by name. The
+        default is 1, which holds for a sum of inertias divided by one of them.
     positive_coefficients
         Names of physically positive coefficients that the coefficient law relates to another equation. Least squares
-        can give them wrong signs; an additional initial guess uses the law with positive signs.
+        can give them the wrong sign, so an additional initial guess uses the law with positive values.
     nominal_coefficients
         Nominal values of coefficients by name, which give an additional initial guess.
     """
@@ -128,27 +126,27 @@ class Structure:
     initial
         Initial conditions; see :func:`equation`.
     sensor_filter
-        Known filter that some signals passed when they were measured.
+        Known filter through which some signals were measured.
     coefficient_law
-        Optional law between coefficients: (name, sign, factors) with coefficient = sign * product of factors.
+        Laws between coefficients, each as (name, sign, factors): the named coefficient is sign * product of factors.
     reference
         Nominal values of coefficients by name, which are printed next to the estimates.
     name
         Name of the structure.
     hints
-        Prior knowledge for initial guesses. It is ignored by comparisons of structures and not saved.
+        Prior knowledge for initial guesses. Hints are not saved and do not affect equality of structures.
     offset
         ``"none"``; ``"constant"``: an unknown constant on the right-hand side of each equation; ``"ramp"``: a constant
         and a constant times t; ``"level"``: an unknown constant that is added to each output; ``"auto"``: the
         identification decides between none and a constant. Offsets are estimated for each run, like initial terms, and
-        are not transferred to another run. With ``"none"`` and ``"constant"``, a run that rests at a nonzero level
-        before an input changes gets a level (see `initial`).
+        are not transferred to another run. For a run that rests at nonzero values before an input changes, ``"none"``
+        and ``"constant"`` are replaced by ``"level"`` (see `initial`).
 
     Raises
     ------
     ModelError
-        If there is no equation, an output or coefficient is repeated, or a delay, non-linearity or filter has an
-        unknown signal.
+        If there is no equation, an output or coefficient is repeated, a delay, non-linearity or filter names an unknown
+        signal, or friction is combined with an option that its simulation does not support.
     """
 
     equations: tuple[Equation, ...]
@@ -203,12 +201,12 @@ class Structure:
 
     @property
     def has_friction(self) -> bool:
-        """Whether an equation has friction."""
+        """Whether at least one equation has friction."""
         return any(e.friction is not None for e in self.equations)
 
     @property
     def has_nonlinear_terms(self) -> bool:
-        """Whether an equation has a non-linear term."""
+        """Whether at least one equation has a non-linear term."""
         return any(e.nonlinear_terms for e in self.equations)
 
     @property
@@ -218,7 +216,7 @@ class Structure:
 
     @property
     def integrates(self) -> bool:
-        """Whether an equation contains only derivatives of its output, not the output itself."""
+        """Whether at least one equation contains only derivatives of its output, not the output itself."""
         return not all(
             any(term.signal == item.output and not term.order.names and term.order.constant == 0 for term in item.terms)
             for item in self.equations
@@ -230,7 +228,11 @@ class Structure:
         return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)
 
     def _check_friction(self) -> None:
-        """Raise ModelError if a structure with friction has properties that its simulation does not support."""
+        """Raise ModelError if friction is combined with an option that its simulation does not support.
+
+        These are several equations with measured coupling, a filtered input, a coefficient law on a friction parameter,
+        and a history as initial conditions.
+        """
         rubbing = [self.equations[i].output for i in self.friction_equations]
         words = f"the equation of {rubbing[0]} has friction"
         if len(self.equations) > 1 and self.coupling == "measured":
@@ -257,10 +259,10 @@ class Structure:
             )
 
     def _check_offset(self) -> None:
-        """Raise ModelError if the offset is unknown, or has the same power of t as a given initial term."""
+        """Raise ModelError if the offset is unknown, or if it and a given initial term are the same power of t."""
         check_offset(self.offset)
         if isinstance(self.initial, (str, History)):
-            # An exponent that equals that of the offset is merged with it.
+            # An automatic initial term with the exponent of the offset is merged with the offset.
             return
         for item in self.equations:
             for power in [] if item.order.names else offset_exponents(item.order.constant, self.offset).values():
@@ -286,22 +288,23 @@ class Structure:
         """Whether the sensor filter must be applied to all signals, because the equations hold for filtered signals.
 
         This is the case if a filtered signal is an input of an equation: an external signal, or another output with
-        measured coupling. It is False if an equation has friction; the outputs are then simulated before the filter.
+        measured coupling. It is False for every valid structure with friction, whose outputs are simulated before the
+        filter.
         """
         followed = self.outputs if self.coupling == "simulated" or self.has_friction else ()
         return any(s not in followed and self.is_filtered(s) for s in self.signals)
 
     def filter_states(self, initial: Initial) -> int:
-        """Return the number of unknown initial states of the sensor filter for given initial terms.
+        """Return the number of unknown initial states of the sensor filter under given initial conditions.
 
-        The filter that software applies to a signal starts with the run, so its initial state is unknown. The transient
-        is modeled by responses to an impulse and its derivatives. The number is 0 for rest and for given exponents.
+        The transient from these states is modeled by responses to an impulse and its derivatives. The number is 0
+        without a filter, for ``"rest"`` and for exponents that the user gives.
 
         Raises
         ------
         ModelError
-            If the filter of simulated outputs has zeros or fractional orders, because these responses then do not
-            represent its transient.
+            If the filter of simulated outputs has zeros or fractional orders. Its transient is then not a sum of these
+            responses.
         """
         sensor = self.sensor_filter
         if sensor is None or not (initial == "caputo" or isinstance(initial, History)):
@@ -326,7 +329,7 @@ class Structure:
 
     @property
     def order_names(self) -> tuple[str, ...]:
-        """Names of the free orders: those that are the order of a term first, then those only in expressions."""
+        """Names of the free orders: first those that are the whole order of a term, then those only in expressions."""
         orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms))]
         alone = [o.names[0] for o in orders if o.is_single]
         return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
@@ -344,11 +347,11 @@ class Structure:
         return any(not o.is_single for o in orders) or len(set(names)) < len(names)
 
     def independent_groups(self) -> dict[str, Structure]:
-        """Return, by name, groups of equations that share free orders, each as a structure for an order search.
+        """Return groups of equations that share free orders, each as a structure for an order search, by name.
 
-        Equations related by an order law form one group. Its name is ``"stage"`` if it is the whole structure,
-        otherwise its outputs. Every other equation forms a group by itself, with measured coupling. Equations without
-        free orders are omitted.
+        Equations related by an order law form one group. Its name is ``"stage"`` if the group is the whole structure,
+        otherwise the names of its outputs. Every other equation forms a group by itself, with measured coupling and the
+        name of its output. Equations without free orders are omitted.
         """
         groups: list[tuple[set[str], list[Equation]]] = []
         for item in self.equations:
@@ -372,15 +375,15 @@ class Structure:
         return out
 
     def _of(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:
-        """Return a structure that has only the given equations, without coefficient laws."""
+        """Return a structure of only the given equations, with the given coupling and without coefficient laws."""
         name = f"{self.name}, {', '.join(e.output for e in equations)}"
         return restrict_structure(self, equations, coupling=coupling, coefficient_law=(), name=name)
 
     def equation(self, output: str) -> Structure:
-        """Return one equation as a separate structure, with measured coupling and without order laws.
+        """Return the equation of one output as a structure, with measured coupling and without order laws.
 
-        An order that is an expression becomes a free order named after its term. The order of an input becomes 0 unless
-        it is a number.
+        An order that is an expression of free orders becomes one free order, or 0 for a term of inputs only. Numbers
+        and single free orders are unchanged.
 
         Raises
         ------
@@ -404,7 +407,7 @@ class Structure:
         return self._of((single,), "measured")
 
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
-        """Return the structure with orders fixed (a number) or with grid values; see :func:`parse_values`.
+        """Return the structure with some free orders fixed or with new grid values; see :func:`parse_values`.
 
         Raises
         ------
@@ -435,7 +438,9 @@ class Structure:
         return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
 
     def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
-        """Return the structure with delays of inputs [s]: a number fixes one, (lower, upper) are bounds of an estimate.
+        """Return the structure with other delays of inputs [s].
+
+        A number fixes the delay, and (lower, upper) are bounds between which it is estimated.
 
         A delay may be negative, down to minus one sampling interval, if an input is logged after it acts.
 
@@ -461,9 +466,9 @@ class Structure:
     def with_limits(
         self, *, saturation: Mapping[str, Value] | None = None, dead_zone: Mapping[str, Value] | None = None
     ) -> Structure:
-        """Return the structure with saturations and dead zones of inputs.
+        """Return the structure with other saturations and dead zones of inputs.
 
-        A number fixes the limit, (lower, upper) are bounds of an estimate.
+        A number fixes the limit, and (lower, upper) are bounds between which it is estimated.
 
         Parameters
         ----------
@@ -487,12 +492,12 @@ class Structure:
 
     @property
     def free_inputs(self) -> tuple[FreeInputParameter, ...]:
-        """Delays, then saturations and dead zones of inputs that are to be estimated."""
+        """Parameters of inputs to estimate: free delays, then free saturations and dead zones."""
         late = [FreeInputParameter(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
         return tuple([*late, *(limit.free for limit in self.limits if limit.free is not None)])
 
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
-        """Return the structure with delays and limits fixed to values by name, such as ``delay_u`` and ``sat_u``."""
+        """Return the structure with free delays and limits fixed to values by name, such as ``delay_u``, ``sat_u``."""
         names = {n: input_name("delay", n) for n in self.free_delays}
         delays = {n: values[name] for n, name in names.items() if name in values}
         limits = tuple(
@@ -502,12 +507,15 @@ class Structure:
         return replace(self.with_delays(delays), input_nonlinearities=_or_unset(limits))
 
     def without_input_nonlinearities(self) -> Structure:
-        """Return the structure without free delays, saturations and dead zones."""
+        """Return the structure without its free delays, free saturations and free dead zones; fixed ones are kept."""
         fixed_limits = [limit for limit in self.limits if limit.free is None]
         return replace(self, free_delays={}, input_nonlinearities=_or_unset(fixed_limits))
 
     def describe_inputs(self, digits: str = "r") -> dict[str, str]:
-        """Return text of inputs with a delay or non-linearity by name, such as ``sat(u(t - 0.035 s), 0.94)``."""
+        """Return, for each input with a delay or non-linearity, its text such as ``sat(u(t - 0.035 s), 0.94)``.
+
+        `digits` is a format specification for numbers; ``"r"`` gives all digits.
+        """
         known = {n: f"{'+' if d < 0 else '-'} {_format(abs(d), digits)}" for n, d in self.delay.items() if d}
         free = {n: f"- {_format(low, digits)}:{_format(high, digits)}" for n, (low, high) in self.free_delays.items()}
         out = {n: f"{n}(t {text} s)" for n, text in {**known, **free}.items()}
@@ -520,12 +528,12 @@ class Structure:
         return "\n".join(f"{e.as_text(inputs)}{self.offset_in_words}" for e in self.equations)
 
     def equation_text(self, item: Equation) -> str:
-        """Return an identified equation as text, with delays, non-linearities and offset."""
+        """Return an identified equation as text with six significant digits, with input effects and offset."""
         return format_equation(item, self.describe_inputs(".6g")) + self.offset_in_words
 
     @property
     def offset_in_words(self) -> str:
-        """Return the text of the offset at the end of an equation; empty without an offset."""
+        """Text of the offset at the end of an equation, such as " + c"; empty for ``"none"`` and ``"level"``."""
         names = {*self.coefficient_names, *self.order_names, *self.signals}
         name = next(n for n in ("c", *(f"c{k}" for k in range(len(names) + 1))) if n not in names)
         auto_text = f" + ({name} if the runs ask for it)"
@@ -538,26 +546,29 @@ class Structure:
 
 
 def _format(value: float, digits: str) -> str:
-    """Return a number as text with the given digits; ``"r"`` gives all digits."""
+    """Return a number as text by the format specification `digits`; ``"r"`` gives all digits."""
     return format_shortest(value) if digits == "r" else format(value, digits)
 
 
 def _or_unset(limits: Sequence[InputNonlinearity]) -> tuple[InputNonlinearity, ...] | UnsetType:
-    """Return the non-linearities as a tuple, or msgspec's UNSET if there are none, so that they are not written."""
+    """Return the non-linearities as a tuple, or msgspec's UNSET if there are none, so that files omit the field."""
     return tuple(limits) or UNSET
 
 
 def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
-    """Return the exponents of t of an integrated offset by ``"constant"`` and ``"ramp"``.
+    """Return the exponents of t that an offset has after alpha-fold integration, by ``"constant"`` and ``"ramp"``.
 
-    A constant c gives c t^alpha / Gamma(alpha + 1).
+    A constant c becomes c t^alpha / Gamma(alpha + 1).
     """
     names = {"none": (), "level": (), "auto": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
     return {name: round(alpha + i, 9) for i, name in enumerate(names)}
 
 
 def restrict_structure(structure: Structure, equations: tuple[Equation, ...], **changes: Any) -> Structure:
-    """Return a structure with other equations, restricted to their orders and signals, and with other changes."""
+    """Return a structure with the given equations and only the options of their orders and signals.
+
+    `changes` are new values of other fields.
+    """
     orders = {n for e in equations for n in e.order_names}
     signals = {s for e in equations for s in e.signals}
     return replace(

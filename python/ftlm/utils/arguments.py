@@ -1,4 +1,4 @@
-"""Error messages for arguments of a wrong type, which name the actual type and the type of the annotation."""
+"""Decorator that replaces exceptions from arguments of a wrong type by messages with actual and expected type."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from ftlm.errors import FtlmError, ModelError
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import MAX_SEQUENCE_LENGTH, real_number, short_repr, whole_number
 
-#: Exceptions that arguments of another type cause.
+#: Exceptions that an argument of a wrong type can cause.
 _FROM_ARGUMENTS = (TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
 
-#: Parts of the paths of installed packages.
+#: Folder names in the paths of installed packages.
 _PACKAGE_FOLDERS = ("site-packages", "dist-packages")
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
-#: Operators whose arguments are checked as those of public methods are.
+#: Operators whose arguments are checked like those of public methods.
 _CHECKED_OPERATORS = ("__call__", "__contains__", "__getitem__")
-#: Types that stand for a list, also of another kind.
+#: Annotated list types, for which iterables of matching items are accepted, except bytes, mappings and arrays.
 _LIST_TYPES = (Sequence, Iterable, Collection, tuple, list)
 #: Names of types in messages.
 _KIND_WORDS: dict[Any, str] = {
@@ -45,18 +45,19 @@ _KIND_WORDS: dict[Any, str] = {
     tuple: "a tuple",
     **dict.fromkeys((Sequence, Iterable, Collection, list), "a list"),
 }
-#: Items of a mapping or a list that are checked.
+#: Maximum number of items of a mapping or list whose types are checked.
 _MAX_CHECKED_ITEMS = 1000
-#: Size from which a number is named as the cause of a failure.
+#: Magnitude from which a number counts as a wrong argument after a failure.
 _MAX_NUMBER = 2.0**62
 
 
 def check_arguments(decorated: Decorated) -> Decorated:
     """Decorate a function such that an exception caused by a wrong argument becomes a ModelError.
 
-    Of a class, the public methods and the operators in `_CHECKED_OPERATORS` are decorated. The arguments are compared
-    with their annotations only after a call has failed, so successful calls take no additional time. Errors of ftlm
-    itself are not changed. A range with too many values is rejected before the call.
+    For a class, the constructor, the public methods and the operators in `_CHECKED_OPERATORS` are decorated. Arguments
+    are compared with their annotations only after a call has failed, so successful calls take no additional time. Other
+    errors of ftlm, and exceptions from code of the user, are not changed. A range with more than 50 million values is
+    rejected before the call.
     """
     if inspect.isclass(decorated):
         type.__setattr__(decorated, "__init__", check_arguments(decorated.__init__))
@@ -77,7 +78,7 @@ def check_arguments(decorated: Decorated) -> Decorated:
         try:
             return decorated(*args, **kwargs)
         except Exception as error:
-            # A decorated function below names its own argument, and the caller knows the one of this function.
+            # An error of an inner decorated function names its own argument; the caller needs the argument of this one.
             cause = error.__cause__ if isinstance(error, FtlmError) else error
             foreign = cause is error or isinstance(cause, _FROM_ARGUMENTS)
             if foreign and cause is not None and not _is_raised_by_caller(cause):
@@ -88,7 +89,7 @@ def check_arguments(decorated: Decorated) -> Decorated:
 
 
 def _check_range(function: Callable[..., Any], args: Any, kwargs: Any) -> None:
-    """Raise ModelError for the first argument that is a range with too many values."""
+    """Raise ModelError for the first argument that is a range with more than `MAX_SEQUENCE_LENGTH` values."""
     for name, value in inspect.signature(function).bind_partial(*args, **kwargs).arguments.items():
         if isinstance(value, range) and value and abs((value[-1] - value[0]) // value.step) >= MAX_SEQUENCE_LENGTH:
             raise ModelError(
@@ -97,7 +98,7 @@ def _check_range(function: Callable[..., Any], args: Any, kwargs: Any) -> None:
 
 
 def _is_raised_by_caller(error: BaseException) -> bool:
-    """Whether an exception comes from user code that ftlm called: a callback, a controller or a board."""
+    """Whether an exception comes from code of the user that ftlm called, such as a callback or a controller."""
     trace = error.__traceback__
     while trace is not None:
         package = str(trace.tb_frame.f_globals.get("__name__")).partition(".")[0]
@@ -109,7 +110,7 @@ def _is_raised_by_caller(error: BaseException) -> bool:
 
 
 def _raise_unknown_keyword(signature: inspect.Signature, kwargs: Mapping[str, Any], error: Exception) -> None:
-    """Raise TypeError that names the keywords of a function if one of the given ones is not among them."""
+    """Raise TypeError with the known keywords if a given keyword is not a parameter of the function."""
     names = [n for n, p in signature.parameters.items() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
     takes_any = any(p.kind == p.VAR_KEYWORD for p in signature.parameters.values())
     unknown = next((name for name in kwargs if name not in names), None)
@@ -120,7 +121,7 @@ def _raise_unknown_keyword(signature: inspect.Signature, kwargs: Mapping[str, An
 
 
 def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, error: Exception) -> None:
-    """Raise ModelError for the first argument whose type is not the annotated one."""
+    """Raise ModelError for the first argument that does not match its annotation; return if all arguments match."""
     signature = inspect.signature(function)
     try:
         bound = signature.bind(*args, **kwargs)
@@ -142,21 +143,21 @@ def _raise_type_error(function: Callable[..., Any], args: Any, kwargs: Any, erro
 
 
 class _UnknownType:
-    """Placeholder for a type that only type checkers import."""
+    """Placeholder for a type that is imported only for type checkers; it matches every value."""
 
     def __class_getitem__(cls, item: object) -> type[_UnknownType]:
         return cls
 
 
 class _Names(dict[str, Any]):
-    """Mapping from names of a module and public names of ftlm to objects; other names are unknown types."""
+    """Mapping from names of a module, builtins and public names of ftlm to objects; other names are unknown types."""
 
     def __missing__(self, name: str) -> Any:
         return getattr(builtins, name, None) or getattr(sys.modules.get("ftlm"), name, _UnknownType)
 
 
 def _annotation(annotation: Any, names: _Names) -> Any:
-    """Return the type that the text of an annotation denotes."""
+    """Return the type of an annotation that is given as text; an unknown type without an annotation."""
     owner = types.SimpleNamespace(__annotations__={"value": annotation})
     return _UnknownType if annotation is inspect.Parameter.empty else get_type_hints(owner, {}, names)["value"]
 
@@ -169,7 +170,7 @@ def _alternatives(annotation: Any) -> tuple[Any, ...]:
 
 
 def _describe_type(kind: Any) -> str:
-    """Return text on a type that is not a union."""
+    """Return the name of a type that is not a union, as used in messages."""
     if get_origin(kind) is Literal:
         return ", ".join(map(repr, get_args(kind)))
     kind = get_origin(kind) or kind
@@ -177,7 +178,7 @@ def _describe_type(kind: Any) -> str:
 
 
 def _fits(value: object, annotation: Any) -> bool:
-    """Whether a value has the annotated type; True for annotations that cannot be checked."""
+    """Whether a value matches an annotation; True for annotations that cannot be checked."""
     return any(_fits_one(value, kind) for kind in _alternatives(annotation))
 
 

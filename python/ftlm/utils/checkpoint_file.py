@@ -1,18 +1,18 @@
-"""Checkpoint file of a long computation: an SQLite database of records, appended under digests by one writer.
+"""Checkpoint file of a long computation: an SQLite database of records with digests, appended by one writer.
 
 The only table has the name of the computation (``search`` or ``selection``) and one row per record:
 
 ===========  ========================================================================================================
 ``number``   1, 2, …
-``payload``  one MessagePack map, whose key ``type`` names its kind
+``payload``  one MessagePack map, whose key ``type`` is the type of the record
 ``digest``   BLAKE2b of the previous digest (nothing for the first record) and the payload, 16 bytes
 ===========  ========================================================================================================
 
-Records are only appended. The rollback journal of SQLite makes every append complete or void, however the process ends,
-and is deleted at the end of each append, so the database file contains all records. (After a kill, a write-ahead log
-would contain the last records in a second file.) SQLite does not detect changed bytes of a page. Every digest therefore
-covers all records up to its own. A record that was lost, moved or changed is reported as damage, and no later record is
-used.
+Records are only appended. With the rollback journal of SQLite, every append is either complete or without effect, even
+if the process is killed. The journal is deleted at the end of each append, so the database file contains all records.
+(After a kill, a write-ahead log would contain the last records in a second file.) SQLite does not detect changed bytes
+of a page. Every digest therefore covers all records up to its own. A record that was lost, moved or changed is reported
+as damage, and no later record is used.
 """
 
 from __future__ import annotations
@@ -37,29 +37,29 @@ from ftlm.utils.parameters import parameter
 Kind: TypeAlias = Literal["search", "selection"]
 TABLE_COLUMNS = "(number INTEGER PRIMARY KEY, payload BLOB NOT NULL, digest BLOB NOT NULL)"
 DIGEST_BYTES = 16
-#: Maximum size of a checkpoint file. The largest search under an order law needs less than a tenth.
+#: Maximum size of a checkpoint file. The largest search with an order law needs less than a tenth of it.
 MAX_FILE_BYTES = 4 << 30
-#: An append waits so long for readers, and a reader for an append.
+#: Maximum time that an append waits for readers, and a reader for an append.
 READER_TIMEOUT_S = 60.0
-#: Pause between two attempts to become the writer. A writer is without its lock for some microseconds after an append,
-#: and has it back before the second attempt.
+#: Pause between the two attempts of a process to lock the file as its writer. An existing writer is without its lock
+#: for some microseconds after an append, so that the first attempt may succeed, but the second one then fails.
 LOCK_PAUSE_S = 0.01
 
 
 def encode_numpy(value: object) -> object:
-    """Return a NumPy number as a Python number, and an array as its shape and little-endian doubles."""
+    """Return a NumPy number as a Python number, and an array as (shape, little-endian doubles)."""
     if isinstance(value, np.ndarray):
         return value.shape, np.ascontiguousarray(value, "<f8").tobytes()
     if isinstance(value, (np.floating, np.integer, np.bool_)):
         return value.item()
     if isinstance(value, tuple):
         return tuple(value)
-    # Requested of a hook for other types by msgspec.
+    # msgspec requires this exception for other types.
     raise NotImplementedError(type(value))
 
 
 def decode_array(_: type, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the array with a given shape and bytes."""
+    """Return the float64 array from (shape, little-endian doubles)."""
     shape, data = msgspec.convert(value, tuple[tuple[int, ...], bytes])
     return np.frombuffer(data, "<f8").astype(np.float64).reshape(shape)
 
@@ -72,7 +72,7 @@ def _digest(prefix: bytes, payload: bytes) -> bytes:
 
 
 def _insert(connection: sqlite3.Connection, kind: Kind, payloads: Sequence[bytes]) -> None:
-    """Append records to the table of a database, and commit them."""
+    """Append records to the table of a computation, which is created if necessary, and commit them."""
     with connection:
         connection.execute(f"CREATE TABLE IF NOT EXISTS {kind} {TABLE_COLUMNS}")
         last = connection.execute(f"SELECT digest FROM {kind} ORDER BY number DESC LIMIT 1").fetchone()
@@ -83,15 +83,15 @@ def _insert(connection: sqlite3.Connection, kind: Kind, payloads: Sequence[bytes
 
 
 class CheckpointFile:
-    """Checkpoint file that is open for reading or writing.
+    """Open checkpoint file; raise DataError if it cannot be opened or belongs to another computation or program.
 
     Parameters
     ----------
     path, kind
-        Path of the file, and the kind of computation whose records it contains.
+        Path of the file, and kind of the computation whose records it contains.
     access
-        Whether the file is only read (also by other processes), resumed by its single writer, or created if it does not
-        exist.
+        ``"read"``: only read, while another process may write. ``"resume"``: write to an existing file as its single
+        writer. ``"create"``: the same, but create the file if it does not exist.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class CheckpointFile:
         verb = "read" if access == "read" else "opened"
         try:
             status = self._status(access)
-            # A pipe that nobody writes to would keep SQLite waiting.
+            # SQLite would wait forever for a pipe without a writer.
             if status is not None and not stat.S_ISREG(status.st_mode):
                 raise DataError(f"store {path} is not a regular file; choose another file")
             if status is not None and status.st_size > MAX_FILE_BYTES:
@@ -117,7 +117,7 @@ class CheckpointFile:
             why = error.strerror if isinstance(error, OSError) else None
             raise DataError(f"store {path} cannot be {verb}: {why or error}; choose another file") from error
         try:
-            # The intact records of a file that was cut off are read.
+            # With this setting, the intact records of a truncated file can be read.
             self._connection.execute("PRAGMA writable_schema = ON")
             if access != "read":
                 self._lock()
@@ -130,7 +130,7 @@ class CheckpointFile:
             raise
 
     def _status(self, access: str) -> os.stat_result | None:
-        """Return the status of the file; None if it does not exist and can be created."""
+        """Return the status of the file; None if the file does not exist and `access` is "create"."""
         try:
             return self.path.stat()
         except FileNotFoundError:
@@ -140,16 +140,16 @@ class CheckpointFile:
             return None
 
     def _lock(self) -> None:
-        """Lock the file against other writers until it is closed; readers have access between appends."""
+        """Lock the file against other writers until it is closed; readers still have access between appends."""
         run = self._connection.execute
         run("PRAGMA busy_timeout = 0")
         run("PRAGMA journal_mode = DELETE")
         run("BEGIN IMMEDIATE")
-        # Fails before any work where the file or its folder is read-only.
+        # This statement fails at once if the file or its folder is read-only.
         run("PRAGMA user_version = 0")
         run("ROLLBACK")
         time.sleep(LOCK_PAUSE_S)
-        # The journal is deleted on disk too when an append ends.
+        # With EXTRA, the deletion of the journal at the end of an append is also flushed to disk.
         run("PRAGMA synchronous = EXTRA")
         run("BEGIN IMMEDIATE")
         run(f"PRAGMA busy_timeout = {round(1000 * READER_TIMEOUT_S)}")
@@ -170,7 +170,7 @@ class CheckpointFile:
         return DataError(f"{self.path} is not an ftlm {self.kind} store; give a file written with {parameter('store')}")
 
     def _opening_error(self, error: sqlite3.Error, verb: str) -> DataError:
-        """Return the error for a file that SQLite cannot open."""
+        """Return the DataError for a file that SQLite cannot open; `verb` is "read" or "opened"."""
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         if code == sqlite3.SQLITE_BUSY:
             return DataError(
@@ -183,7 +183,7 @@ class CheckpointFile:
         return self._foreign_error()
 
     def read(self) -> tuple[list[bytes], str | None]:
-        """Return the payloads of all intact records, and text on any damage after them (or None)."""
+        """Return the payloads of the intact records, and text on damage after them; None if there is no damage."""
         payloads: list[bytes] = []
         digest, damage = b"", None
         if self._is_empty:
@@ -197,7 +197,7 @@ class CheckpointFile:
                     break
                 payloads.append(payload)
             else:
-                # Pages that no record uses, which an append might.
+                # Check also the pages that no record uses, because a later append may use them.
                 answer = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
                 damage = None if answer == "ok" else f"after record {len(payloads)}: {answer}"
         except sqlite3.Error as error:
@@ -205,7 +205,7 @@ class CheckpointFile:
         return payloads, damage
 
     def append(self, payloads: Sequence[bytes]) -> None:
-        """Append all records and flush them to disk, or append none and raise DataError."""
+        """Append records and flush them to disk; if this fails, append none of them and raise DataError."""
         try:
             if not self._connection.in_transaction:
                 self._connection.execute("BEGIN IMMEDIATE")
@@ -218,9 +218,9 @@ class CheckpointFile:
             ) from error
 
     def recover(self, payloads: Sequence[bytes]) -> Path:
-        """Replace a damaged file by one with the given intact records, and close it.
+        """Replace the damaged file by a file with the given intact records, and close it.
 
-        Returns the path of a copy of the damaged file.
+        Return the path of a copy of the damaged file; raise DataError if the copy exists or a file cannot be written.
         """
         self.close()
         copy = write_atomically(self.path.with_name(self.path.name + ".damaged"), self.path.read_bytes(), force=False)

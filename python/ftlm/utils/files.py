@@ -22,17 +22,17 @@ from ftlm.utils.parameters import parameter
 from ftlm.utils.resources import optional_module
 from ftlm.utils.validation import error_text, nearest, short_repr
 
-#: INFO: files read and written, start and end of fits. WARNING: findings that make a result doubtful.
+#: Logger of the package. INFO: files read and written, start and end of fits. WARNING: findings against a result.
 PACKAGE_LOGGER = logging.getLogger("ftlm")
 PACKAGE_LOGGER.addHandler(logging.NullHandler())
 
 
-#: Binary mode on systems that distinguish text from bytes.
+#: Flags to create a file that must not exist, in binary mode on systems that distinguish text from bytes.
 _NEW_FILE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
 def check_new(path: str | os.PathLike[str], *, force: bool) -> Path:
-    """Return a path; raise DataError if it is a folder, or an existing file without ``force``."""
+    """Return a path for writing; raise DataError for a folder, an existing file without `force`, a link or a device."""
     file = Path(path)
     if file.is_dir():
         raise DataError(f"{file} is a folder; name a file in it")
@@ -48,7 +48,7 @@ def check_new(path: str | os.PathLike[str], *, force: bool) -> Path:
 
 
 def _link_status(file: Path) -> os.stat_result | None:
-    """Return the status of a path without following symbolic links; None if it does not exist."""
+    """Return the status of a path itself, not of the target of a symbolic link; None if it does not exist."""
     try:
         return file.lstat()
     except (OSError, ValueError):
@@ -56,7 +56,7 @@ def _link_status(file: Path) -> os.stat_result | None:
 
 
 def check_free(*paths: str | os.PathLike[str] | None, force: bool) -> None:
-    """Raise DataError, before a computation, for paths that could not be written after it; None is skipped."""
+    """Raise DataError for a path that cannot be written; call it before a long computation. None is skipped."""
     for path in paths:
         if path is None:
             continue
@@ -69,7 +69,7 @@ def check_free(*paths: str | os.PathLike[str] | None, force: bool) -> None:
 
 
 def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
-    """Create a folder; raise DataError, before a computation, for files in it that could not be written."""
+    """Create a folder; raise DataError if this fails, or if a file in `names` exists in it and `force` is False."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -83,7 +83,9 @@ def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: bool) -> Path:
-    """Write a temporary file, flush it to disk and rename it: readers see the old content or the new one.
+    """Write bytes to a file so that readers see either the old or the new content, and return the path.
+
+    A temporary file in the same folder is written, flushed to disk and renamed.
 
     Raises
     ------
@@ -92,11 +94,11 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
     """
     file = check_new(path, force=force)
     try:
-        # In the same folder, since a rename cannot cross file systems. Names have a maximum length.
+        # The file is in the same folder, because a rename cannot cross file systems. File names have a maximum length.
         beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
         status = _link_status(file)
-        # Never through a link that another program left. The permissions are those that a new file has here, or those
-        # of the file that is overwritten, from the first byte on.
+        # O_EXCL does not follow a link that another program created. The permissions are the default of a new file, or
+        # those of the file that is overwritten, from the first byte on.
         descriptor = os.open(beside, _NEW_FILE_FLAGS, 0o666 if status is None else stat.S_IMODE(status.st_mode) & 0o777)
         try:
             with os.fdopen(descriptor, "wb") as stream:
@@ -122,7 +124,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else None
         raise DataError(f"{file} cannot be written: {why or error}; choose another folder") from error
-    # The rename itself survives a power cut only when the folder is on disk too; not every system can do that.
+    # After a power failure, the rename is preserved only if the folder was flushed; not every system supports this.
     with contextlib.suppress(OSError):
         descriptor = os.open(file.parent, os.O_RDONLY)
         try:
@@ -134,19 +136,19 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
 
 
 def check_ending(path: str | os.PathLike[str], ending: str) -> None:
-    """Raise ModelError for a file to write whose name does not end in an extension such as ``".html"``."""
+    """Raise ModelError if the name of a file does not end in the extension `ending`, such as ``".html"``."""
     if Path(path).suffix.lower() != ending:
         raise ModelError(f"{path} does not end in {ending}; use this extension")
 
 
 def _move_exclusively(beside: Path, file: Path) -> None:
-    """Rename a file to a name that must not exist; raise an error if it was created in the meantime."""
+    """Rename the file `beside` to `file`, which must not exist; raise FileExistsError if it exists."""
     try:
         os.link(beside, file, follow_symlinks=False)
     except FileExistsError:
         raise
     except (OSError, NotImplementedError):
-        # Without hard links an empty file reserves the name.
+        # On file systems without hard links, an empty file reserves the name.
         os.close(os.open(file, _NEW_FILE_FLAGS, 0o666))
         try:
             os.replace(beside, file)
@@ -155,18 +157,18 @@ def _move_exclusively(beside: Path, file: Path) -> None:
                 file.unlink()
             raise
     else:
-        # The file is complete, whatever becomes of its other name.
+        # The file is complete even if its temporary name cannot be deleted.
         with contextlib.suppress(OSError):
             beside.unlink()
 
 
-#: Longest name in a message, and size limit of models, controllers and settings, which take some kilobytes.
+#: Maximum length of a name in a message, and maximum size of a model, controller or settings file (usually kilobytes).
 MAX_NAME_CHARACTERS, MAX_SMALL_FILE_BYTES = 300, 1 << 20
 _READ_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 
 
 def nearest_file_hint(path: Path) -> str:
-    """Return text such as " (did you mean …?)" with the file beside `path` of the most similar name, or ""."""
+    """Return text such as " (did you mean …?)" with the most similar file name in the folder of `path`, or ""."""
     try:
         beside = sorted(entry.name for entry in path.parent.iterdir())
     except (OSError, ValueError):
@@ -175,19 +177,19 @@ def nearest_file_hint(path: Path) -> str:
 
 
 def read_small_file(path: str | os.PathLike[str], what: str, source: str) -> bytes:
-    """Return the bytes of a regular file within a size limit; pipes and devices are rejected.
+    """Return the bytes of a regular file of at most 1 MiB.
 
     Parameters
     ----------
     path
         File to read.
     what, source
-        Name of the content, and remedy: the kind of file to pass.
+        Name of the content, and kind of file to pass instead, for messages.
 
     Raises
     ------
     DataError
-        If the file cannot be read, is not a regular file, or is too large.
+        If the file cannot be read, is not a regular file (such as a pipe or device), or is too large.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path = {short_repr(path)} is not the path of a file; give {source}")
@@ -224,18 +226,18 @@ def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F
     path
         File to read.
     what, source
-        Name of the content, and remedy: the kind of file to pass.
+        Name of the content, and kind of file to pass instead, for messages.
     kind
-        Schema of the content.
+        Type of the content, a msgspec structure, which is returned.
 
     Raises
     ------
     DataError
-        If the file cannot be read, is too large, is not TOML, or has other content.
+        If the file cannot be read, is too large, is not TOML, or has unknown keys or values of a wrong type.
     """
     content = read_small_file(path, what, source)
     try:
-        # Other editors put a byte-order mark first.
+        # Some editors write a byte-order mark at the start.
         return msgspec.toml.decode(content.removeprefix(b"\xef\xbb\xbf"), type=kind)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         unknown = re.search("unknown field `(.*)`", str(error))
@@ -244,7 +246,7 @@ def read_toml(path: str | os.PathLike[str], what: str, source: str, kind: type[F
 
 
 def _field_names(kind: type[msgspec.Struct]) -> list[str]:
-    """Return the keys of a schema and of its nested tables."""
+    """Return the keys of a msgspec structure and of the structures nested in it."""
     names = []
     for field in msgspec.structs.fields(kind):
         tables = [
@@ -255,7 +257,7 @@ def _field_names(kind: type[msgspec.Struct]) -> list[str]:
 
 
 class FileHeader(msgspec.Struct):
-    """Header of every document, which can be read in files of any version."""
+    """Common fields of all JSON documents of ftlm, which can be read from files with any schema version."""
 
     format: str
     schema: int
@@ -271,11 +273,11 @@ class JsonFormat(Generic[F]):
     what
         Name of the content.
     source
-        Remedy in error messages: the kind of file to pass.
+        Kind of file to pass instead, for error messages.
     kind
-        Type of the content.
+        Type of the content, a msgspec structure.
     schema
-        Schema that this version reads and writes.
+        Schema version that this version of ftlm reads and writes.
     """
 
     what: str
@@ -289,7 +291,7 @@ class JsonFormat(Generic[F]):
         Raises
         ------
         DataError
-            If the file cannot be read, is too large, or has another format or schema.
+            If the file cannot be read, is too large, or has another format or schema version.
         """
         content = read_small_file(path, self.what, self.source)
         file = Path(path)
@@ -302,7 +304,7 @@ class JsonFormat(Generic[F]):
             ) from error
 
     def _check_schema(self, file: Path, content: bytes) -> None:
-        """Raise DataError if a file of this format has another schema."""
+        """Raise DataError if a file has this format but another schema version."""
         try:
             head = msgspec.json.decode(content, type=FileHeader)
         except (msgspec.MsgspecError, ValueError, RecursionError):
@@ -316,7 +318,7 @@ class JsonFormat(Generic[F]):
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:
-    """Return rows as a pandas DataFrame.
+    """Return rows, each a mapping of values by column, as a pandas DataFrame with the columns `index` as its index.
 
     Raises
     ------

@@ -14,10 +14,10 @@ from typing import Any, TextIO, cast
 
 from markupsafe import Markup
 
-#: Significant digits of estimates: more than their accuracy, enough for comparison with the paper.
+#: Number of significant digits of printed estimates: enough for a comparison with the paper.
 SIGNIFICANT_DIGITS = 5
 DIVERGED_TEXT = "diverged"
-#: Line length [characters]: largest and smallest.
+#: Maximum and minimum line length [characters].
 MAX_LINE_CHARACTERS, MIN_LINE_CHARACTERS = 110, 40
 _EQUATION_PATTERN = re.compile(r"D\^?\S* \S+ = ")
 GREEK_LETTERS = {
@@ -46,7 +46,7 @@ def symbol(name: str) -> str:
 
 
 def symbol_html(name: str) -> Markup:
-    """Return a name as a symbol with an HTML subscript; the text is escaped."""
+    """Return a name as an HTML symbol, such as θ with the subscript 12 for ``theta12``; the text is escaped."""
     match = SYMBOL_PATTERN.fullmatch(name)
     if not match:
         return Markup("<i>{}</i>").format(name)
@@ -55,14 +55,14 @@ def symbol_html(name: str) -> Markup:
 
 
 class Exact(float):
-    """Number that is not an estimate, such as an order of the grid, and is therefore printed in full."""
+    """Number that is not an estimate, such as an order on a grid, and is printed with up to ten digits."""
 
 
 Cell = str | float | None
 
 
 def number(value: float, digits: int = SIGNIFICANT_DIGITS) -> str:
-    """Return a number as text with the given significant digits; infinity is "∞ diverged"."""
+    """Return a number as text with `digits` significant digits; infinity is "∞ diverged", and NaN is "undefined"."""
     if isinstance(value, Integral):
         return f"{value:,}".replace(",", "\u202f")
     if math.isnan(value):
@@ -78,17 +78,17 @@ def number(value: float, digits: int = SIGNIFICANT_DIGITS) -> str:
 
 
 def format_bound(value: float, spec: str = ".3g") -> str:
-    """Return a standard error or an interval bound as text; infinity (not identifiable) is "∞"."""
+    """Return a standard error or an interval bound as text in the format `spec`; infinity is "∞"."""
     return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
 
 
 def truncate_text(text: str, most: int) -> str:
-    """Return a text of at most `most` characters, truncated with an ellipsis."""
+    """Return a text, truncated with an ellipsis if it has more than `most` characters."""
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Return a number as text, rounded to two digits of its standard error, or to five digits without one."""
+    """Return "value ± error" as text, rounded to two digits of the standard error; without one, five digits."""
     if error is None or not math.isfinite(error) or error <= 0 or not math.isfinite(value):
         return f"{value:.5g}"
     decimals = 1 - math.floor(math.log10(error))
@@ -98,18 +98,18 @@ def with_error(value: float, error: float | None) -> str:
 
 
 def columns() -> int:
-    """Return the line length [characters] of the terminal or of ``COLUMNS``, within limits."""
+    """Return the line length [characters] of the terminal or of the variable ``COLUMNS``, limited to 40 … 110."""
     return min(
         max(shutil.get_terminal_size((MAX_LINE_CHARACTERS, 40)).columns, MIN_LINE_CHARACTERS), MAX_LINE_CHARACTERS
     )
 
 
 def wrap_text(text: str, lead: str = "", further: str | None = None) -> list[str]:
-    """Return a text as lines of the current line length.
+    """Return a text as a list of lines that fit the terminal; see :func:`columns`.
 
-    `lead` begins the first line, and `further` the others (by default spaces).
+    The first line begins with `lead`, and each other line with `further` (by default spaces).
     """
-    # Equations break between their terms; what is ± something, or so many per cent, stays together.
+    # Equations break between their terms. Texts such as "1 ± 2" and "3 %" do not break.
     bound = re.sub(" (?![+-] )" if _EQUATION_PATTERN.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
     lines = textwrap.wrap(
         bound,
@@ -122,17 +122,17 @@ def wrap_text(text: str, lead: str = "", further: str | None = None) -> list[str
     return [line.replace("\u00a0", " ") for line in lines]
 
 
-#: Characters that a terminal obeys: controls except tab and line feed, marks of the text direction, line separators.
+#: Characters that control a terminal: controls except tab and line feed, marks of text direction, line separators.
 _CONTROL_PATTERN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u061c\\u200e\\u200f\\u2028-\\u202e\\u2066-\\u2069]")
 
 
 def escape_controls(text: str) -> str:
-    """Return a text in which control characters are replaced by JSON escapes."""
+    """Return a text with control characters replaced by JSON escapes."""
     return _CONTROL_PATTERN.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 class EscapedStream:
-    """Text stream to a terminal that escapes control characters in everything that is written.
+    """Text stream to a terminal that escapes control characters in all texts written to it.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class EscapedStream:
         self.stream = stream
 
     def write(self, text: str) -> int:
-        """Write a text with escaped control characters, and return its length."""
+        """Write a text with escaped control characters, and return the length of the original text."""
         self.stream.write(escape_controls(text))
         return len(text)
 
@@ -154,7 +154,7 @@ class EscapedStream:
             self.write(line)
 
     def __getattr__(self, name: str) -> Any:
-        # A library that finds the bytes below would write around the escapes.
+        # A library with access to the underlying byte stream would write without escapes.
         if name in ("buffer", "detach"):
             raise AttributeError(name)
         return getattr(self.stream, name)
@@ -174,12 +174,12 @@ def finite(value: float) -> float | None:
 
 
 def attributes(value: object, names: Iterable[str]) -> dict[str, Any]:
-    """Return some attributes of an object as a dictionary for JSON."""
+    """Return the attributes in `names` of an object as a JSON-compatible dictionary; see :func:`json_value`."""
     return {name: json_value(getattr(value, name)) for name in names}
 
 
 def json_value(value: Any) -> Any:
-    """Return a value for JSON: mappings, sequences, and dataclasses as dictionaries; nonfinite numbers become None."""
+    """Return a JSON-compatible value: dataclasses become dictionaries, and nonfinite numbers become None."""
     if isinstance(value, Mapping):
         return {f"{k:g}" if isinstance(k, float) else str(k): json_value(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

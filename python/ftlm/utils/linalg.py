@@ -1,7 +1,7 @@
-"""Linear algebra of tall-skinny matrices, computed by the core on one thread.
+"""Linear algebra of tall-skinny matrices, computed by the Rust core on one thread.
 
-Threads of multithreaded libraries wait actively for a tenth of a second after each factorization. This is longer than
-most computations of this module.
+Multithreaded libraries are not used. Their threads wait actively for a tenth of a second after each factorization,
+which is longer than most computations of this module.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def dot(one: Floats, other: Floats) -> float:
 
 
 def projections(columns: Floats, row: Floats) -> Floats:
-    """Return the dot product of each column with a vector."""
+    """Return the dot product of each column with the vector `row`, shape (columns,)."""
     return np.asarray(np.einsum("ij,i->j", columns, row))
 
 
@@ -29,7 +29,7 @@ def vector_norm(row: Floats) -> float:
 
 def column_norms(columns: Floats) -> Floats:
     """Return the Euclidean norm of each column, without overflow or underflow."""
-    # Squares of large columns overflow.
+    # Without scaling, the squares of large values would overflow.
     peaks = np.max(np.abs(columns), axis=0, initial=0.0)
     return np.asarray(peaks * np.linalg.norm(columns / np.where(peaks > 0, peaks, 1.0), axis=0))
 
@@ -37,23 +37,23 @@ def column_norms(columns: Floats) -> Floats:
 def triangular_factor(tall: Floats) -> Floats:
     """Return the triangular factor R of the QR factorization of a tall matrix.
 
-    R has the same inner products of columns as the matrix, and therefore the same least-squares solutions.
+    The inner products of the columns of R are those of the matrix. Least-squares problems with columns of R therefore
+    have the same solutions.
     """
     return _core.triangular_factor(np.ascontiguousarray(tall.T))
 
 
 def thin_svd(tall: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return (left, sizes, right) of the thin singular value decomposition: the matrix is left * sizes @ right."""
+    """Return (U, s, Vt) of the thin singular value decomposition: the matrix is ``U * s @ Vt``, and s is a vector."""
     u, sizes, right = _core.singular_values(np.ascontiguousarray(tall.T))
     return u.reshape(sizes.size, len(tall)).T, sizes, right.reshape(sizes.size, tall.shape[1])
 
 
 def minimum_norm_solution(tall: Floats, target: Floats, rcond: float | None) -> Floats:
-    """Return the minimum-norm least-squares solution.
+    """Return the minimum-norm least-squares solution x of ``tall @ x = target``.
 
-    Singular values below the fraction ``rcond`` of the largest are treated as zero.
-
-    Without ``rcond``, the cutoff is the rounding level.
+    Singular values below `rcond` times the largest are treated as zero. With None, `rcond` is the machine epsilon times
+    the larger dimension of the matrix.
     """
     columns = tall.shape[1]
     both = triangular_factor(np.column_stack([tall, target]))
@@ -63,9 +63,10 @@ def minimum_norm_solution(tall: Floats, target: Floats, rcond: float | None) -> 
 
 
 def orthonormal(columns: Floats, least: float) -> Floats:
-    """Return an orthonormal basis of the span of columns, which are normalized first.
+    """Return a matrix whose columns are an orthonormal basis of the span of the given columns.
 
-    Singular directions below the fraction ``least`` of the largest are omitted.
+    The columns are normalized first. Left singular vectors are omitted if their singular value is at most `least` times
+    the largest.
     """
     sizes = column_norms(columns)
     directions, spread, _ = thin_svd(columns / np.where(sizes > 0, sizes, 1.0))

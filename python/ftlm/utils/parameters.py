@@ -12,18 +12,18 @@ from contextlib import contextmanager
 from typing import Literal
 
 Interface = Literal["python", "command line"]
-#: Flags that are not the name of the parameter with dashes. An order grid has two flags.
+#: Flags that are not "--" and the name of the parameter with dashes. Two flags set an order grid.
 FLAG_BY_PARAMETER = {"inputs": "-u", "outputs": "-y", "order_grid": "--order-grid or --increment"}
 
 
 class _Current:
-    """Interface that is currently used in messages."""
+    """Global variable for the interface whose syntax messages use."""
 
     interface: Interface = "python"
 
 
 class Placeholder(str):
-    """Word that represents a value in a message, such as ``UNIT``; it is shown without quotes."""
+    """Word in place of a value in a message, such as ``UNIT``; it is shown without quotes."""
 
     __slots__ = ()
 
@@ -31,19 +31,19 @@ class Placeholder(str):
         return str(self)
 
 
-#: Columns of a file by name of a signal, and by part of a frequency response.
+#: Placeholder mappings in messages: columns of a file by signal name, and by part of a frequency response.
 NAMED_COLUMNS = {Placeholder("name"): Placeholder("column")}
 PART_COLUMNS = {Placeholder("part"): Placeholder("column")}
 
 
 def current_interface() -> Interface:
-    """Return the interface for which messages are formatted."""
+    """Return the interface whose syntax messages use."""
     return _Current.interface
 
 
 @contextmanager
 def use_interface(name: Interface) -> Iterator[None]:
-    """Format messages for an interface within a ``with`` block."""
+    """Format messages in the syntax of an interface within a ``with`` block."""
     interface_before, _Current.interface = _Current.interface, name
     try:
         yield
@@ -88,9 +88,9 @@ def parameter(name: str, value: object = None) -> str:
 
 
 def setting(name: str) -> str:
-    """Return the beginning of a sentence on the value of a parameter, such as ``top =`` or ``--top``.
+    """Return the start of a message on the value of a parameter, such as ``top =`` or ``--top``.
 
-    Names that are not parameters are returned as quantities.
+    A name that is not an identifier, such as "delay of u", is a quantity and always followed by ``=``.
     """
     return f"{name} =" if _Current.interface == "python" or not name.isidentifier() else parameter(name)
 
@@ -103,7 +103,7 @@ def choose_text(python: str, command_line: str) -> str:
 def layout_parameter(**values: object) -> str:
     """Return a reference to layout options with values.
 
-    It is such as ``layout=dict(decimal='comma')`` or ``--decimal comma``.
+    Examples are ``layout=dict(decimal='comma')`` in Python and ``--decimal comma`` on the command line.
     """
     if _Current.interface == "python":
         return f"layout=dict({', '.join(f'{name}={value!r}' for name, value in values.items())})"
@@ -118,7 +118,7 @@ def layout_fields(*names: str) -> str:
 
 
 def _flag_value(value: object) -> str:
-    """Return the value of a flag as it is typed on the command line."""
+    """Return the value of a flag as typed on the command line."""
     if isinstance(value, Placeholder):
         return value.upper()
     if isinstance(value, Mapping):

@@ -21,27 +21,27 @@ import numpy as np
 from ftlm import _core
 from ftlm.errors import ModelError
 
-#: Environment variable with the limit: bytes, or a number with K, M, G or T (powers of 1024).
+#: Environment variable with the memory limit: bytes, or a number with K, M, G or T (powers of 1024).
 MEMORY_VARIABLE = "FTLM_MEMORY"
 #: Default share of the available memory. The rest is for records, threads and other programs.
 DEFAULT_MEMORY_SHARE = 0.8
-#: Limit if the system reports no available memory.
+#: Memory limit if the system does not report the available memory.
 FALLBACK_MEMORY_BYTES = 2 << 30
 _SYSTEM_ROOT = Path("/")
 
 
 def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
-    """Return the memory limit [bytes] of an order search: regressors, products, test vectors and grids together.
+    """Return the memory limit [bytes] of computations, from ``FTLM_MEMORY`` or 80 % of the available memory.
 
     Parameters
     ----------
     system
-        Root of the system's files.
+        Root folder of the system files, which tests replace.
 
     Raises
     ------
     ModelError
-        ``FTLM_MEMORY`` is not a positive size.
+        If ``FTLM_MEMORY`` is not a positive size.
     """
     text = os.environ.get(MEMORY_VARIABLE, "")
     if text:
@@ -58,7 +58,8 @@ def memory_limit(system: Path = _SYSTEM_ROOT) -> int:
 def available_memory(system: Path = _SYSTEM_ROOT) -> int | None:
     """Return the memory [bytes] that this process can still use without swapping; None if the system reports none.
 
-    It is the minimum of the kernel's available memory and the free memory of every control group of this process.
+    It is the minimum of the available memory that the kernel reports and the free memory of each control group of this
+    process. Without such reports, it is half of the physical memory.
     """
     amounts = [*_kernel_available_bytes(system), *_cgroup_available_bytes(system)]
     if not amounts:
@@ -81,7 +82,7 @@ def _kernel_available_bytes(system: Path) -> list[int]:
     return [int(match[1]) << 10] if match else []
 
 
-#: Folder, file of the limit, file of the usage, and entry of the reclaimable cache, by version of control groups.
+#: Folder, file with the limit, file with the usage, and key of the reclaimable cache, by version of control groups.
 _CGROUP_FILES = {
     1: ("sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     2: ("sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"),
@@ -89,7 +90,7 @@ _CGROUP_FILES = {
 
 
 def _cgroup_available_bytes(system: Path) -> list[int]:
-    """Return the free memory of each control group [bytes], v1 and v2; reclaimable page cache counts as free."""
+    """Return the free memory [bytes] of each control group with a limit; reclaimable page cache counts as free."""
     amounts = []
     for line in _text(system / "proc/self/cgroup").splitlines():
         number, controllers, name = (*line.split(":", 2), "", "")[:3]
@@ -101,7 +102,7 @@ def _cgroup_available_bytes(system: Path) -> list[int]:
         for depth in range(len(parts), -1, -1):
             folder = system.joinpath(root, *parts[:depth])
             limit, usage = _text(folder / most).strip(), _text(folder / now).strip()
-            # "max" is no limit; one beyond all memory is the older version's way to say so.
+            # In version 2 "max" means no limit, and in version 1 a huge number does.
             if limit.isdecimal() and usage.isdecimal() and int(limit) < 1 << 60:
                 match = re.search(rf"^{droppable} ([0-9]+)$", _text(folder / "memory.stat"), re.MULTILINE)
                 amounts.append(int(limit) - int(usage) + (int(match[1]) if match else 0))
@@ -111,17 +112,17 @@ def _cgroup_available_bytes(system: Path) -> list[int]:
 #: Length of the timed FFT, duration of the measurement [s], and time of one FFT on the reference machine [s], two
 #: cores of an idle x86-64 server.
 BENCHMARK_FFT_LENGTH, BENCHMARK_DURATION_S, REFERENCE_FFT_TIME_S = 4096, 0.03, 1.5e-5
-#: Range of the actual duration of an output-error fit relative to its estimate. The number and length of useful starts
-#: is not known in advance.
+#: Range of the actual duration of an output-error fit relative to the estimate. The number of candidates in the
+#: multistart and their iterations are not known in advance.
 FIT_TIME_FACTORS = (0.4, 6.0)
-#: Samples beyond which the duration grows more slowly: most evaluations use a part of the record.
+#: Number of samples above which the duration increases more slowly, because most evaluations use a part of the record.
 LONG_RECORD_SAMPLES = 10_000
-#: Speedup per additional core.
+#: Increase of the speedup by each additional core.
 PARALLEL_EFFICIENCY = 0.7
 
 
 def machine_slowdown() -> float:
-    """Return the time per unit of work on one core at the current load, relative to the reference machine."""
+    """Return the current time per computation on one core, relative to the reference machine (timed FFTs)."""
     values, count = np.ones(BENCHMARK_FFT_LENGTH), 0
     start_time = time.perf_counter()
     while time.perf_counter() - start_time < BENCHMARK_DURATION_S:
@@ -131,24 +132,23 @@ def machine_slowdown() -> float:
 
 
 def estimate_duration(seconds: float, threads: int) -> float:
-    """Return the expected duration [s] on this machine of work that takes ``seconds`` on one reference core."""
+    """Return the expected duration [s] on this machine of a computation that takes `seconds` on one reference core."""
     return seconds * machine_slowdown() / (1.0 + PARALLEL_EFFICIENCY * (max(threads, 1) - 1))
 
 
 def duration_bounds(seconds: float, came_to: tuple[float, float] = FIT_TIME_FACTORS) -> tuple[float, float]:
-    """Return the (shortest, longest) expected duration [s]: an estimate multiplied by two factors."""
+    """Return the (shortest, longest) expected duration [s]: the estimate `seconds` times each of the two factors."""
     return came_to[0] * seconds, came_to[1] * seconds
 
 
 def output_error_cost(samples: int, numbers: int) -> float:
     """Return the time [s] that an output-error fit takes on one core of the reference machine.
 
-    `samples` are those of all runs and outputs, and `numbers` is the number of free parameters.
+    `samples` is the number of samples of all runs and outputs, and `numbers` is the number of free parameters. Actual
+    times differ from the result by factors within :data:`FIT_TIME_FACTORS`.
 
-    Actual times differ from it by at most the factors :data:`FIT_TIME_FACTORS`.
-
-    The time of the multistart grows with the square of the number of parameters, that of the rest with the number of
-    samples. It grows more slowly for long records, because most of the fit uses a part of them.
+    The time of the multistart is proportional to the square of the number of parameters, and the remaining time to the
+    number of samples. The increase is slower for long records, because most evaluations use a part of the record.
     """
     return 0.04 * numbers**2 + 3.5e-4 * min(samples, LONG_RECORD_SAMPLES) + 2e-5 * samples
 
@@ -157,13 +157,16 @@ _STOP_FLAG: ContextVar[_core.Stop | None] = ContextVar("stop", default=None)
 
 
 def stop_flag() -> _core.Stop | None:
-    """Return the stop flag of this worker thread; None in the main thread."""
+    """Return the stop flag of this thread, with which the Rust core can be interrupted; None outside of a pool."""
     return _STOP_FLAG.get()
 
 
 @contextmanager
 def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
-    """Yield a thread pool whose running and queued tasks are cancelled if the main thread is interrupted."""
+    """Yield a thread pool; an interrupt in the ``with`` block stops running tasks and cancels queued tasks.
+
+    Any other exception in the block only cancels queued tasks.
+    """
     flag = stop_flag() or _core.Stop()
     with ThreadPoolExecutor(threads, initializer=_STOP_FLAG.set, initargs=(flag,)) as pool:
         try:
@@ -176,11 +179,11 @@ def interruptible_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, Any]:
-    """Return command, environment and working directory with which a script runs in an isolated Python process.
+    """Return arguments for :func:`subprocess.run` with which a script runs in an isolated Python process.
 
-    The process must not import an uploaded or downloaded file as a module. Python therefore runs isolated (``-I``:
-    neither ``PYTHONPATH`` nor the working directory is searched), in the folder of its installation. The absolute
-    module folders of this process, except its working directory, are searched after those of Python.
+    The process must not import an uploaded or downloaded file as a module. Python therefore runs in the folder of its
+    installation and isolated (``-I``: it searches neither ``PYTHONPATH`` nor the working directory). After the folders
+    of Python, it searches the absolute module folders of this process, except the working directory.
 
     Parameters
     ----------
@@ -189,11 +192,11 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
     arguments
         Arguments of the script.
     site
-        Whether the site packages are set up at the start, which takes some time.
+        Whether Python sets up the site packages at the start, which takes some time.
     """
     folder_now = os.getcwd()
     folders = [folder for folder in sys.path if os.path.isabs(folder) and folder != folder_now]
-    # The package itself may have been found in the working directory.
+    # This process may have imported the package from the working directory.
     folders.append(str(Path(__file__).resolve().parents[2]))
     program = f"import runpy, sys; sys.path += {folders!a}; runpy.run_path({str(script)!a}, run_name='__main__')"
     command = [sys.executable, "-I", *([] if site else ["-S"]), "-c", program, *arguments]
@@ -202,8 +205,8 @@ def python_child(script: Path, *arguments: str, site: bool = True) -> dict[str, 
 
 
 def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a task in a worker process, which ends when its parent process is killed."""
-    # Tasks of thread pools run in other threads than the main one.
+    """Return ``work(*arguments)`` in a worker process, which is set to end when its parent process is killed."""
+    # Tasks of a process pool run in the main thread, those of a thread pool do not.
     if threading.current_thread() is threading.main_thread():
         _end_with_parent(os.getpid())
     return work(*arguments)
@@ -211,7 +214,7 @@ def run_in_worker(work: Callable[..., Any], *arguments: Any) -> Any:
 
 @cache
 def _end_with_parent(_process: int) -> None:
-    """End this process when its parent ends; otherwise it would wait for tasks forever."""
+    """Start a thread that ends this process when its parent ends; otherwise the process would wait forever."""
     from multiprocessing import parent_process  # noqa: PLC0415 — pools alone import it
 
     parent = parent_process()

@@ -11,13 +11,14 @@ import numpy as np
 from ftlm import _core
 from ftlm.utils.validation import Floats
 
-#: First values beyond this many noise standard deviations are not rest.
+#: Number of noise standard deviations within which the first value of a signal at rest must lie.
 REST_SIGMAS = 5.0
-#: Nor are first values beyond this share of the signal's standard deviation, for signals without noise.
+#: Additional tolerance of the first value, as a fraction of the standard deviation of the signal, for signals without
+#: noise.
 REST_SHARE = 1e-3
 #: Median absolute deviation of a normal variable in standard deviations.
 MAD_OVER_SIGMA = 0.6744897501960817
-#: Residuals below this share of an output's standard deviation are rounding and discretization errors.
+#: Residuals below this fraction of the standard deviation of an output are rounding and discretization errors.
 ROUNDING_RESIDUAL_RATIO = 3e-5
 #: Huber threshold in standard deviations: 95 % efficiency under normal noise.
 HUBER_THRESHOLD = 1.345
@@ -43,25 +44,23 @@ def estimate_noise(samples: Floats) -> float:
     bends = np.diff(samples, 2)
     bends = bends[~np.isnan(bends)]
     if bends.size == 0:
-        # No three neighboring samples are present: use the samples that are, in order.
+        # No three adjacent samples are present, so missing samples are dropped.
         bends = np.diff(samples[~np.isnan(samples)], 2)
     return robust_deviation(bends) / float(np.sqrt(6.0))
 
 
-#: Orders of the differences from which :func:`white_noise` is estimated, and the least number of differences.
+#: Orders of the differences from which the noise is estimated, and minimum number of differences of an order.
 DIFFERENCE_ORDERS, MIN_DIFFERENCES = range(2, 9), 8
-#: Samples from which the noise of the start of a run is estimated; more would tell no more and cost time.
+#: Maximum number of first samples from which the noise is estimated; more samples would only increase the time.
 NOISE_SAMPLES = 4096
 
 
 def white_noise(samples: Floats) -> float:
     """Return the standard deviation of white noise on a signal that may oscillate.
 
-    It is the smallest of the estimates from differences of several orders.
-
-    White noise contributes to the differences of every order. An oscillation with few samples per period, which second
-    differences mistake for noise, contributes only to low orders (Hall, Kay, Titterington 1990,
-    doi:10.1093/biomet/77.3.521).
+    The result is the smallest of the estimates from differences of several orders. White noise contributes to the
+    differences of every order. An oscillation with few samples per period also contributes to second differences, but
+    less to differences of higher orders (Hall, Kay, Titterington 1990, doi:10.1093/biomet/77.3.521).
     """
     start = samples[:NOISE_SAMPLES]
     least = estimate_noise(start)
@@ -75,28 +74,30 @@ def white_noise(samples: Floats) -> float:
 
 
 def robust_deviation(values: Floats) -> float:
-    """Return the standard deviation of normally distributed values, from the median of their absolute values."""
+    """Return a robust standard deviation of zero-mean normal values, from the median of their absolute values."""
     return float(np.median(np.abs(values))) / MAD_OVER_SIGMA if values.size else 0.0
 
 
 def huber_excess(few: Floats, many: Floats) -> float:
-    """Return how much a smaller model's Huber loss exceeds a larger model's, in units of the noise variance.
+    """Return the Huber loss of a smaller model minus that of a larger model, in units of the noise variance.
 
-    If the smaller model is sufficient, the excess is chi-squared distributed. Its degrees of freedom are the additional
-    parameters of the larger model, even with outliers (doi:10.1214/aoms/1177703732).
+    `few` and `many` are the residuals of the two models. If the smaller model is sufficient, the difference is
+    chi-squared distributed, even with outliers. Its number of degrees of freedom is that of the additional parameters
+    of the larger model (doi:10.1214/aoms/1177703732). The result is infinite if `few` has values that are not
+    finite.
     """
     scale = robust_deviation(many) or float(np.sqrt(np.mean(many**2)))
     if not np.all(np.isfinite(few)) or (scale == 0.0 and np.any(few)):
         return float("inf")
     one, other = (np.abs(e) / (scale or 1.0) for e in (few, many))
     losses = [np.where(r <= HUBER_THRESHOLD, r**2, HUBER_THRESHOLD * (2.0 * r - HUBER_THRESHOLD)) for r in (one, other)]
-    # Both means are those of the loss's slope and curvature; under normal noise their ratio is 0.86.
+    # Mean squared slope and mean curvature of the loss of the larger model; their ratio is 0.86 for normal noise.
     slope, curvature = np.mean(np.minimum(other, HUBER_THRESHOLD) ** 2), np.mean(other <= HUBER_THRESHOLD)
     return float(np.sum(losses[0] - losses[1]) * curvature / slope) if slope > 0 else 0.0
 
 
 def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Return autocovariances at lags 0 to `most`, pooled over series, and the number of pairs at each lag.
+    """Return autocovariances at lags 0 to `most`, pooled over series, and the number of sample pairs at each lag.
 
     The mean of each series is subtracted. NaN marks missing samples.
     """
@@ -104,7 +105,7 @@ def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats
 
 
 def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
-    """Return autocorrelations at lags 0 to `most`, pooled over series, and the number of pairs at each lag.
+    """Return autocorrelations at lags 0 to `most`, pooled over series, and the number of sample pairs at each lag.
 
     NaN marks missing samples.
     """
@@ -114,13 +115,12 @@ def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Float
 
 
 def portmanteau(series: Sequence[Floats], most: int) -> float:
-    """Return a whiteness statistic over lags 1 to ``most``.
+    """Return a whiteness statistic over lags 1 to `most`, pooled over series.
 
-    For white noise it is chi-squared distributed with ``most`` degrees of freedom.
-
-    The variance of the noise may change within a series, because each lag is divided by the variance of its own
-    products (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). The Box-Pierce statistic would be too large for
-    a machine that rests during a part of the run.
+    For white noise, the statistic is chi-squared distributed with `most` degrees of freedom. The squared
+    autocovariance at each lag is divided by the variance of the products at this lag, so the variance of the noise may
+    change within a series (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). The Box-Pierce statistic would be
+    too large for a machine that is at rest during a part of the run.
     """
     return _core.portmanteau(series, most)
 
@@ -128,7 +128,7 @@ def portmanteau(series: Sequence[Floats], most: int) -> float:
 def chi_squared(degrees: int, level: float) -> float:
     """Return the value that a chi-squared variable exceeds with probability ``level`` (Wilson-Hilferty approximation).
 
-    The relative error is 0.3 % from five degrees of freedom and 1 % from one.
+    The relative error is 0.3 % for at least five degrees of freedom, and 1 % for fewer.
     """
     return _core.chi_squared(degrees, NormalDist().inv_cdf(1 - level))
 
@@ -139,16 +139,16 @@ def chi_squared_99(degrees: int) -> float:
 
 
 def variance_inflation(series: Floats) -> float:
-    """Return the variance of a sum of the series' values relative to that for white noise, at least 1 (Bartlett)."""
+    """Return the variance of the sum of a series over that of white noise of equal variance, at least 1 (Bartlett)."""
     return _core.variance_inflation(series)
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:
-    """Whether the :func:`portmanteau` test accepts that a series is white noise, at the 1 % level."""
+    """Whether the :func:`portmanteau` test over `lags` lags does not reject white noise at the 1 % level."""
     return _core.is_white(series, lags)
 
 
-#: Relative range below which a signal is constant up to rounding.
+#: Range of a signal, relative to its largest magnitude, up to which it counts as constant.
 CONSTANT_TOLERANCE = 1e-12
 
 
@@ -174,9 +174,9 @@ def fit_whitening_filter(series: Sequence[Floats], most: int) -> tuple[Floats, f
 
 
 def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:
-    """Return series, minus their mean, after a whitening filter; the samples of its start-up are omitted.
+    """Return the series minus their means, filtered by the whitening filter with the coefficients `through`.
 
-    Filtered samples that depend on a missing sample are zero.
+    The initial transient of the filter is omitted. Filtered samples that depend on a missing sample (NaN) are zero.
     """
     out = []
     for x in series:
@@ -186,5 +186,5 @@ def whiten_series(series: Sequence[Floats], through: Floats) -> list[Floats]:
 
 
 def is_constant(series: Sequence[Floats]) -> bool:
-    """Whether no series varies by more than rounding."""
+    """Whether every series is constant up to rounding errors."""
     return all(float(np.ptp(x)) <= CONSTANT_TOLERANCE * float(np.max(np.abs(x))) for x in series)

@@ -20,16 +20,16 @@ from ftlm.utils.resources import available_memory
 
 #: Environment variable with the default number of threads.
 THREADS_VARIABLE = "FTLM_THREADS"
-#: NumPy dtype kinds of real numbers. `float` drops the imaginary part of a complex number and counts days of a date.
+#: NumPy dtype kinds of scalars that are accepted as real numbers; `float` would also convert complex numbers and dates.
 _REAL_DTYPE_KINDS = frozenset("fiuO")
-#: NumPy dtype kinds of arrays of real numbers.
+#: NumPy dtype kinds of arrays that are accepted as real numbers.
 _NUMBER_DTYPE_KINDS = frozenset("fiub")
 
 
 def short_repr(value: object, most: int = 60) -> str:
-    """Return the repr of a value for a message, truncated; a long integer is replaced by its number of bits."""
+    """Return the repr of a value for a message, truncated to `most` characters; for a long integer its size in bits."""
     if type(value) is int and value.bit_length() > 3 * most:
-        # A long integer has no decimal form in Python.
+        # Python refuses to convert a long integer to decimal text.
         return f"an integer of {value.bit_length()} bits"
     try:
         text = repr(value)
@@ -39,7 +39,7 @@ def short_repr(value: object, most: int = 60) -> str:
 
 
 def error_text(error: BaseException, most: int = 500) -> str:
-    """Return the message of an exception of another package, truncated and without unencodable characters."""
+    """Return the message of an exception of another package, truncated to `most` characters, encodable in UTF-8."""
     try:
         text = str(error)
     except Exception:
@@ -48,7 +48,7 @@ def error_text(error: BaseException, most: int = 500) -> str:
 
 
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
-    """Raise ModelError unless a value is one of the given strings."""
+    """Raise ModelError unless a value is one of the strings in `choices`; `name` is the parameter in the message."""
     words = list(choices)
     if not isinstance(value, str) or value not in words:
         raise ModelError(f"{setting(name)} {short_repr(value)} is not known; use {' or '.join(map(repr, words))}")
@@ -56,12 +56,12 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 def is_masked_array(value: object) -> TypeGuard[np.ma.MaskedArray[Any, Any]]:
     """Whether a value is a masked array or a masked element of one."""
-    # Without the module there is none, and its import takes a tenth of NumPy's.
+    # Masked arrays exist only if numpy.ma is imported, and its import would take a tenth of the time of NumPy's.
     return "numpy.ma" in sys.modules and np.ma.isMaskedArray(value)
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value can be a real number; complex values cannot."""
+    """Whether a value may be a real number: not text, a boolean, a complex number or a masked value."""
     if isinstance(value, (str, bytes, bytearray, bool, complex)) or is_masked_array(value):
         return False
     return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL_DTYPE_KINDS
@@ -88,7 +88,7 @@ def check_integer(name: str, value: object, low: int, high: int | None = None) -
 
 
 def check_seed(seed: object) -> int:
-    """Return a random seed as an int; raise ModelError for floats, booleans and values out of range."""
+    """Return a random seed as an int; raise ModelError for floats, booleans and negative numbers."""
     try:
         number = -1 if isinstance(seed, bool) else operator.index(seed)  # type: ignore[arg-type]
     except TypeError:
@@ -99,7 +99,7 @@ def check_seed(seed: object) -> int:
 
 
 def check_pulses(m: object, below: float = 1 << 62) -> int:
-    """Return the number of block pulses as an int; raise ModelError unless it is positive and below 2^62."""
+    """Return the number of block pulses as an int; raise ModelError unless it is positive and less than `below`."""
     pulses = whole_number(m)
     if pulses is None or not 1 <= pulses < below:
         raise ModelError(f"{setting('m')} {m!r} is not a number of pulses; give a whole number, at least 1")
@@ -123,7 +123,7 @@ def real_number(name: str, value: object) -> float:
 
 
 def frequency_pair(band: Iterable[object]) -> tuple[float, float]:
-    """Return both limits of a frequency band [rad/s]; raise ModelError unless it is a pair of numbers."""
+    """Return the limits of a frequency band [rad/s] as (low, high) floats; raise ModelError unless it is a pair."""
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
@@ -134,7 +134,7 @@ def frequency_pair(band: Iterable[object]) -> tuple[float, float]:
 
 
 def join_names(names: Iterable[object], most: int = 40) -> str:
-    """Return quoted names, joined by commas, for a message; at most ``most`` of them."""
+    """Return quoted names, joined by commas, for a message; names beyond the first `most` are only counted."""
     every = [repr(name) for name in names]
     if not every:
         return "none"
@@ -142,7 +142,7 @@ def join_names(names: Iterable[object], most: int = 40) -> str:
 
 
 def nearest(word: object, names: Iterable[object]) -> str:
-    """Return text such as " (did you mean …?)" with the most similar name, or "" if none is similar."""
+    """Return text such as " (did you mean …?)" with the name most similar to `word`, or "" if none is similar."""
     options = [str(name) for name in names]
     prefixes = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
     close = [max(prefixes, key=len)] if prefixes else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
@@ -150,7 +150,7 @@ def nearest(word: object, names: Iterable[object]) -> str:
 
 
 def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
-    """Return the error for invalid rows: it names object, first row (from 0), number of rows and remedy."""
+    """Return a DataError for invalid rows: object, what is wrong, first row (from 0), number of rows and remedy."""
     return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
 
 
@@ -178,14 +178,14 @@ def names_to_columns(argument: str, column_names: object) -> dict[str, Hashable]
 
 
 def as_mapping(argument: str, value: object, of: str = "array") -> Mapping[str, object]:
-    """Return a mapping unchanged; raise DataError for any other value."""
+    """Return a mapping unchanged; raise DataError for any other value of the argument."""
     if not isinstance(value, Mapping):
         raise DataError(f"{parameter(argument)} is a {type(value).__name__}; pass a dict of name: {of}")
     return value
 
 
 def check_known(what: str, names: Iterable[str], choices: Sequence[str]) -> None:
-    """Raise ModelError for a name that is not one of the choices; `what` is the kind of object, for the message."""
+    """Raise ModelError for a name that is not in `choices`; `what` is the kind of object in the message."""
     for name in names:
         if name not in choices:
             near = difflib.get_close_matches(str(name), choices, 1)
@@ -226,16 +226,16 @@ Complex: TypeAlias = NDArray[np.complex128]
 
 
 Scalar = TypeVar("Scalar", bound=np.generic)
-#: Values of a sequence, which NumPy reads one by one, and of an array that is not compared with the memory.
+#: Maximum length of a sequence, which NumPy reads value by value. Larger arrays are compared with the available memory.
 MAX_SEQUENCE_LENGTH = 50_000_000
-#: Dimensions of nested sequences; NumPy visits every path of one that contains itself.
+#: Maximum nesting depth of sequences. In a sequence that contains itself, NumPy would follow every path.
 MAX_DIMENSIONS = 16
 
 
 def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
-    """Return the argument as an array of any dtype, possibly a view; all arrays of users pass this function.
+    """Return an argument of the user as an array of any dtype, possibly a view; `name` is the argument in messages.
 
-    Masked samples are missing samples: they become NaN with ``gaps``, and raise an error without.
+    Masked values are missing samples. They become NaN with `gaps`, and raise an error otherwise.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
     _check_sequence(name, values)
     try:
         if isinstance(values, (list, tuple)) and any(map(is_masked_array, values)):
-            # NumPy takes what lies under the masks of the items.
+            # NumPy would use the values under the masks of the items.
             values = np.ma.stack([np.ma.asarray(item) for item in values])
         mask = np.ma.getmaskarray(values) if is_masked_array(values) else None
         array = np.asarray(values)
@@ -264,7 +264,7 @@ def as_array(name: str, values: object, *, gaps: bool = False) -> NDArray[Any]:
 
 
 def _check_sequence(name: str, values: object) -> None:
-    """Raise DataError for a sequence that is too long or too deeply nested."""
+    """Raise DataError for a sequence with more than 50 million values or 16 levels of nesting."""
     depth, first = 0, values
     while isinstance(first, Sequence) and not isinstance(first, (str, bytes, bytearray, memoryview)):
         try:
@@ -324,7 +324,7 @@ def finite_floats(name: str, values: object) -> NDArray[np.float64]:
     Raises
     ------
     DataError
-        If a value is not finite (the message has the first index and the number), or in the cases of :func:`as_floats`.
+        If values are not finite (the message has the first index and their number), or as in :func:`as_floats`.
     """
     array = as_floats(name, values)
     if not np.isfinite(array).all():
@@ -341,7 +341,11 @@ def finite_floats(name: str, values: object) -> NDArray[np.float64]:
 def apply_along_axis(
     name: str, values: ArrayLike, axis: int, work: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Return the result of ``work``, which maps rows to rows, along one axis of an array."""
+    """Return the result of `work` along one axis of an array, in the shape of the array.
+
+    `work` maps a matrix to a matrix of the same shape, row by row. Raise DataError for values that are not finite, an
+    empty array or an unknown axis.
+    """
     array = finite_floats(name, values)
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
@@ -358,7 +362,7 @@ _SIGNAL_NAME = re.compile(r"[^\W\d][\w.\[\]]*")
 
 
 def is_run_name(name: object) -> bool:
-    """Whether an object is a valid run name."""
+    """Whether an object is a run name: 1 to 200 printable characters that do not begin with = + - or @."""
     return isinstance(name, str) and 0 < len(name) <= _NAME_LENGTH and name.isprintable() and name[0] not in "=+-@"
 
 
