@@ -1,4 +1,5 @@
-//! Times of the kernels: series algebra, Haar transforms, operational matrices, and candidates of an order search.
+//! Benchmarks of the kernels: series algebra, Haar transforms, operational matrices, correlations, and candidates of an
+//! order search.
 
 use std::hint::black_box;
 use std::time::Duration;
@@ -17,21 +18,22 @@ use ftlm::signal::block_pulse::PulseMeans;
 use ftlm::signal::metrics;
 use ftlm::simulate;
 
-/// 2048 pulses is a record of the paper; the longer ones show the growth.
+/// Lengths of the test signals in pulses. A record of the paper has 2048 pulses. The longer lengths show how the time
+/// grows.
 const LENGTHS: [usize; 3] = [1 << 11, 1 << 14, 1 << 17];
 
-/// Numbers in [−1, 1) without a pattern, the same in every run.
+/// Return pseudorandom numbers, uniform in [−1, 1). They are the same in every run.
 fn noise(m: usize, mut state: u64) -> Vec<f64> {
     (0..m)
         .map(|_| {
-            // Knuth's MMIX generator; its upper bits are good enough for test data.
+            // Knuth's MMIX generator, whose upper bits are good enough for test data.
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             (state >> 11) as f64 / (1u64 << 52) as f64 - 1.0
         })
         .collect()
 }
 
-/// Divisor of a damped oscillation, D^1.8 y + 5 D^0.9 y + 100 y, over a record of ten seconds.
+/// Return the divisor series of the damped oscillator D^1.8 y + 5 D^0.9 y + 100 y, with `m` pulses over ten seconds.
 fn divisor(m: usize) -> Vec<f64> {
     let step = 10.0 / m as f64;
     let mut d = vec![0.0; m];
@@ -63,7 +65,7 @@ fn series_algebra(c: &mut Criterion) {
             b.iter(|| series::divide(black_box(&signal), &d));
         });
     }
-    // The oracle, where it can be waited for.
+    // The naive reference is slow, so it is measured at the shortest length only.
     let (signal, d) = (noise(1 << 11, 2), divisor(1 << 11));
     group.throughput(Throughput::Elements(1 << 11));
     group.bench_function(BenchmarkId::new("divide naively", 1 << 11), |b| {
@@ -89,7 +91,7 @@ fn correlations(c: &mut Criterion) {
     for m in [1 << 12, 1 << 16] {
         let (x, y) = (noise(m, 1), noise(m, 2));
         group.throughput(Throughput::Elements(m as u64));
-        // As the residual tests take them: out to a quarter of the run, for the band.
+        // The residual tests compute correlations up to a quarter of the run, for the confidence band.
         group.bench_with_input(BenchmarkId::new("by spectra, N/4 lags", m), &m, |b, &m| {
             b.iter(|| metrics::covariances(black_box(&x), &y, m / 4));
         });
@@ -110,8 +112,9 @@ fn operational_matrices(c: &mut Criterion) {
     group.finish();
 }
 
-/// P1: a deflection equation with two free orders of its own, one of the hub angle, and the current, on 2048 pulses of
-/// a synthetic stage with noise of 1e−4 rad.
+/// Return the record and the order grid of problem P1: the deflection equation of a simulated joint over 2048 pulses.
+/// Free are alpha, the orders of two terms of the deflection, and the order of one term of the hub angle. The current
+/// has order 0. The noise has a standard deviation of 1e−4 rad.
 fn first_problem() -> (Record, OrderGrid) {
     let m = 2048;
     let step = 10.0 / m as f64;
@@ -132,7 +135,7 @@ fn first_problem() -> (Record, OrderGrid) {
     let Ok(driven) = make(vec![vec![0.0; m], vec![0.0; m], current.clone()]) else { unreachable!() };
     let Ok(mut angles) = simulate::respond(&stage, &driven, &[]) else { unreachable!() };
     for (angle, seed) in angles.iter_mut().zip(4..) {
-        // Uniform noise of this deviation.
+        // Uniform noise with a standard deviation of 1e−4 rad.
         angle.iter_mut().zip(noise(m, seed)).for_each(|(y, e)| *y += 1e-4 * 3.0_f64.sqrt() * e);
     }
     angles.push(current);
@@ -154,7 +157,7 @@ fn order_search(c: &mut Criterion) {
     for (name, criterion, seconds) in
         [("output error", Criterium::OutputError, 20), ("equation error", Criterium::EquationError, 2)]
     {
-        // Ten searches, whatever they take.
+        // Ten searches are measured, regardless of their duration.
         group.measurement_time(Duration::from_secs(seconds)).sampling_mode(SamplingMode::Flat);
         let options = Options {
             criterion,

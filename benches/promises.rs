@@ -1,6 +1,8 @@
-//! Times that `promises.py` sets beside its rivals, one `name seconds` a line; with a kernel's name, runs that kernel a
-//! fixed number of times for callgrind; with `search`, pulses, step and threads, runs one search; with `setup` and the
-//! same, sets one up.
+//! Times that `promises.py` compares with alternatives, one line `name seconds` for each.
+//!
+//! With the name of a kernel as argument, the program runs this kernel a fixed number of times for callgrind. With
+//! `search`, pulses, step and threads, it runs one order search. With `setup` and the same arguments, it only sets up
+//! the search.
 #![allow(missing_docs, clippy::cast_precision_loss)]
 
 use std::borrow::Cow;
@@ -32,14 +34,16 @@ use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::signal::block_pulse::{Intersample, PulseMeans};
 use ftlm::simulate;
 
-/// Processor seconds of this thread where the system tells them; right to a few milliseconds.
+/// Return the processor time of this thread \[s\], accurate to a few milliseconds. None if the system does not report
+/// it.
 fn processor() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
     text.split(' ').next()?.parse::<f64>().ok().map(|ns| 1e-9 * ns)
 }
 
-/// Shortest of at least `least` runs, and of as many as these seconds hold: what other work on the machine disturbs
-/// least. A run longer than a turn on a busy processor is measured by processor time, as a mean over many.
+/// Return the shortest duration of `work` \[s\]. It runs at least `least` times, and as often as fits in `seconds`. The
+/// shortest run is disturbed least by other work on the machine. If it takes more than a millisecond, the mean
+/// processor time over many runs is returned if it is shorter.
 fn shortest(least: usize, seconds: f64, mut work: impl FnMut()) -> f64 {
     work();
     let mut times = Vec::new();
@@ -78,7 +82,7 @@ fn noise(m: usize, seed: u64) -> Vec<f64> {
         .collect()
 }
 
-/// Seconds of one forward and of one inverse real transform of length n.
+/// Return the durations \[s\] of one forward and of one inverse real transform of length n.
 fn transforms(n: usize) -> (f64, f64) {
     let plan = fft::plan(n);
     let (signal, mut time) = (noise(n, 1), vec![0.0; n]);
@@ -99,7 +103,8 @@ fn transforms(n: usize) -> (f64, f64) {
     ((forward - copy).max(1e-9), (inverse - copy).max(1e-9))
 }
 
-/// Free runs that P6 is measured on, spread over the lattice of P1; their coefficients are least squares'.
+/// Number of simulations on which P6 is measured. Their orders are spread over the order grid of P1, and their
+/// coefficients are least-squares estimates.
 const RUNS: u64 = 9;
 
 fn free_runs() -> Vec<Equation> {
@@ -115,7 +120,8 @@ fn free_runs() -> Vec<Equation> {
         .collect()
 }
 
-/// Seconds of one free run as a search makes it, kernels and regressors at hand, memory reused: exact division.
+/// Return the duration \[s\] of one simulation as in an order search: kernels and regressors are available, memory is
+/// reused, and the division of series is exact.
 fn free_run(equation: &Equation, m: usize, division: &mut Division) -> f64 {
     let structure = &equation.structure;
     let step = 10.0 / m as f64;
@@ -173,12 +179,13 @@ fn operators() {
     );
 }
 
-/// A matrix written once, element by element, into memory never touched before.
+/// Return an m × m matrix that is written once, element by element, into newly allocated memory.
 fn written(m: usize) -> Vec<f64> {
     (0..m * m).map(|i| i as f64).collect()
 }
 
-/// The arm's first stage over this many pulses with a little noise, and the lattice of its deflection at this step.
+/// Return a record of the first joint of the arm over `m` pulses with a little noise, and the order grid of its
+/// deflection with the increment `step`.
 fn problem(m: usize, step: f64) -> Option<(Record, OrderGrid)> {
     let h = 10.0 / m as f64;
     let equation = |output: usize, terms: &[(usize, f64, f64)]| Equation {
@@ -210,9 +217,9 @@ fn problem(m: usize, step: f64) -> Option<(Record, OrderGrid)> {
     Some((record, OrderGrid::new(1, &alphas, &axes, |s| s == 2).ok()?))
 }
 
-/// Step of the lattice that is ranked by equation errors for callgrind: five million candidates.
+/// Increment of the order grid that is ranked by equation errors for callgrind: five million candidates.
 const RANKED: f64 = 0.025;
-/// Step at which free runs are screened in boxes: of 2^25 candidates and more.
+/// Increment of an order grid of more than 2^25 candidates, whose simulations are excluded in boxes.
 const BOXED: f64 = 0.015;
 
 fn options(threads: usize) -> Options {
@@ -228,16 +235,16 @@ fn options(threads: usize) -> Options {
     }
 }
 
-/// Processor seconds of all threads, in the hundredths that the system counts.
+/// Return the processor time of all threads \[s\], in the hundredths of a second that the system counts.
 fn processor_of_all() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // The program's name, in brackets, may hold blanks.
+    // The name of the program, in parentheses, may contain blanks.
     let fields: Vec<&str> = text.rsplit(')').next()?.split_whitespace().collect();
     let ticks = |i: usize| fields.get(i)?.parse::<f64>().ok();
     Some((ticks(11)? + ticks(12)?) / 100.0)
 }
 
-/// One search: prints its candidates, wall and processor seconds.
+/// Run one search. Print the number of candidates, the wall time \[s\] and the processor time \[s\].
 fn growth(m: usize, step: f64, threads: usize) {
     let Some((record, lattice)) = problem(m, step) else { return };
     let (start, before) = (Instant::now(), processor_of_all().unwrap_or(f64::NAN));
@@ -248,8 +255,8 @@ fn growth(m: usize, step: f64, threads: usize) {
     }
 }
 
-/// Sets up a search and stops before its first round: prints wall seconds, processor seconds of all threads and of the
-/// busiest one, and the most memory that the process had, in bytes.
+/// Set up a search and stop before its first batch. Print the wall time \[s\], the processor times \[s\] of all threads
+/// and of the busiest thread, and the peak memory of the process \[bytes\].
 fn setup(m: usize, step: f64, threads: usize) {
     let (Some((record, lattice)), Ok(pool)) = (problem(m, step), pool(threads)) else { return };
     let (records, options) = ([record], options(threads));
@@ -266,7 +273,7 @@ fn setup(m: usize, step: f64, threads: usize) {
     }
 }
 
-/// Processor seconds of every thread of this process.
+/// Return the processor time \[s\] of every thread of this process, by thread number.
 fn busy() -> BTreeMap<String, f64> {
     let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
     tasks
@@ -277,14 +284,15 @@ fn busy() -> BTreeMap<String, f64> {
         .collect()
 }
 
-/// The most memory that this process has had, in bytes.
+/// Return the peak memory of this process \[bytes\].
 fn peak() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = text.lines().find(|line| line.starts_with("VmHWM"))?;
     Some(1024.0 * line.split_whitespace().nth(1)?.parse::<f64>().ok()?)
 }
 
-/// The order that a joint fit of D^alpha y = d D^0.6 y + a y + b u finds where it is 1.6, from its own starts.
+/// Return the order alpha that a joint fit of D^alpha y = d D^0.6 y + a y + b u finds by multistart. The true order is
+/// 1.6.
 fn joint_fit(m: usize) -> Option<f64> {
     let h = 0.01;
     let u: Vec<f64> = (0..m).map(|k| if k % 400 < 230 { 1.0 } else { -0.6 }).collect();
@@ -327,7 +335,7 @@ fn joint_fit(m: usize) -> Option<f64> {
     black_box(found).optimum.estimate.first().copied()
 }
 
-/// One of the hottest kernels a fixed number of times, for callgrind; prints how many units of work it did.
+/// Run one of the most expensive kernels a fixed number of times, for callgrind. Print the number of units of work.
 fn kernel(name: &str) {
     let m = 2048;
     match name {

@@ -1,5 +1,6 @@
-//! A plant of fractional order identified from one noisy run: its orders over a lattice, then orders and coefficients
-//! together by joint output error. `cargo run --release --example identify` takes seconds.
+//! Identification of a fractional-order plant from one noisy run. An order search finds the orders on a grid, and a
+//! joint output-error fit refines orders and coefficients together. `cargo run --release --example identify` takes
+//! seconds.
 
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Result;
@@ -14,15 +15,17 @@ use ftlm::regressors::Record;
 use ftlm::signal::block_pulse::{point_samples, PulseMeans};
 use ftlm::simulate;
 
-/// Pulses of the run, and their width \[s\].
+/// Number of pulses of the run.
 const PULSES: usize = 500;
+/// Width of a pulse \[s\].
 const STEP: f64 = 0.02;
 
-/// Signals of the run.
+/// Index of the output among the signals of the run.
 const OUTPUT: usize = 0;
+/// Index of the input among the signals of the run.
 const INPUT: usize = 1;
 
-/// D^1.85 y = −12 y − 1.5 D^0.65 y + 9 u.
+/// Return the plant D^1.85 y = −12 y − 1.5 D^0.65 y + 9 u.
 fn plant() -> Result<Equation> {
     let terms = vec![
         Term { signal: OUTPUT, order: 0.0 },
@@ -32,7 +35,7 @@ fn plant() -> Result<Equation> {
     Equation::new(Structure { output: OUTPUT, order: 1.85, terms }, vec![-12.0, -1.5, 9.0])
 }
 
-/// Uniform noise in [−1, 1), the same at every run.
+/// Return pseudorandom numbers, uniform in [−1, 1). They are the same in every run.
 fn noise(count: usize) -> Vec<f64> {
     let mut state = 1_u64;
     let mut next = || {
@@ -42,13 +45,13 @@ fn noise(count: usize) -> Vec<f64> {
     (0..count).map(|_| next()).collect()
 }
 
-/// A free order that stands alone in its law.
+/// Return an order law that equals one free order. `place` is the index of this order among `count` free orders.
 fn free(place: usize, count: usize) -> AffineOrder {
     AffineOrder { constant: 0.0, weights: (0..count).map(|i| f64::from(u8::from(i == place))).collect() }
 }
 
 fn main() -> Result<()> {
-    // A run: the free response to a square wave of current, with noise of one percent.
+    // Run: simulated response to a square-wave current, with noise of one percent of the largest output.
     let input: Vec<f64> = (0..PULSES).map(|k| if k % 200 < 100 { 1.0 } else { -1.0 }).collect();
     let driven = Record::new(STEP, PulseMeans::from_signals(vec![vec![0.0; PULSES], input.clone()]), None)?;
     let clean = simulate::respond(&[plant()?], &driven, &[])?.remove(0);
@@ -56,7 +59,8 @@ fn main() -> Result<()> {
     let measured: Vec<f64> = clean.iter().zip(noise(PULSES)).map(|(y, e)| y + 0.01 * size * e).collect();
     let record = Record::new(STEP, PulseMeans::from_signals(vec![measured.clone(), input]), None)?;
 
-    // Orders by exhaustive search: alpha from 1.5 to 2, the damping's from 0 to 1.4, in steps of 0.1.
+    // Exhaustive search over orders with an increment of 0.1: alpha from 1.5 to 2, the order of the damping from 0.1 to
+    // 1.4.
     let tenths = |range: std::ops::RangeInclusive<u8>| range.map(|i| 0.1 * f64::from(i)).collect::<Vec<_>>();
     let axis = |signal, values| TermAxis { signal, values, interchangeable: false };
     let axes = [axis(OUTPUT, vec![0.0]), axis(OUTPUT, tenths(1..=14)), axis(INPUT, vec![0.0])];
@@ -82,7 +86,7 @@ fn main() -> Result<()> {
         );
     }
 
-    // From the best row on, everything at once and continuously.
+    // Joint fit of all orders and coefficients, which starts from the best row.
     let Some(best) = outcome.rows.first() else {
         println!("no candidate could be simulated");
         return Ok(());

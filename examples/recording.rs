@@ -1,5 +1,5 @@
-//! Columns of samples with a gap and a delay, fitted by joint output error. `cargo run --release --example recording`
-//! takes seconds.
+//! Joint output-error fit of columns of samples with a gap and a delay. `cargo run --release --example recording` takes
+//! seconds.
 
 use ftlm::equation::Initial;
 use ftlm::error::Result;
@@ -14,12 +14,15 @@ use ftlm::parallel::Stop;
 use ftlm::recording::{Channel, Recording, Recordings, Role};
 use ftlm::signal::block_pulse::Intersample;
 
-/// Number of samples, sampling interval and delay of the input \[s\].
+/// Number of samples of the run.
 const ROWS: usize = 300;
+/// Sampling interval \[s\].
 const STEP: f64 = 0.05;
+/// Delay of the input \[s\].
 const DELAY: f64 = 0.15;
 
-/// Columns as a file would have them: D y = −2 y + 3 u, with u late by three samples, and five samples of y not read.
+/// Return samples of y and u, as they would be read from a file. The plant is D y = −2 y + 3 u with u delayed by three
+/// samples. Five samples of y are missing (NaN).
 fn columns() -> (Vec<f64>, Vec<f64>) {
     let u: Vec<f64> = (0..ROWS).map(|k| if k % 60 < 30 { 1.0 } else { -1.0 }).collect();
     let decay = f64::exp(-2.0 * STEP);
@@ -61,7 +64,7 @@ fn main() -> Result<()> {
     let [alpha, a, b] = found.optimum.estimate[..] else { return Ok(()) };
     println!("D^{alpha:.4} y = {a:.3} y + {b:.3} u, with u {DELAY} s late");
 
-    // What the model says where nothing was read.
+    // Simulated output at the missing samples.
     let terms = vec![(0, 0.0), (1, 0.0)].into_iter().map(|(signal, order)| ftlm::equation::Term { signal, order });
     let structure = ftlm::equation::Structure { output: 0, order: alpha, terms: terms.collect() };
     let model = ftlm::equation::Equation::new(structure, vec![a, b])?;

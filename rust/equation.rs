@@ -1,39 +1,39 @@
 //! Equations of fractional order: terms, orders, order laws, initial terms, sensor filters, solvability.
 //!
-//! An equation is D^α y = Σ_k c_k D^{ν_k} s_k over the signals of a record. Divided by D^α it is a series equation, y =
-//! Σ_k c_k I^{α−ν_k} s_k + initial terms. All other modules use this form.
+//! An equation is D^α y = Σ_k c_k D^{ν_k} s_k over the signals s_k of a record, with coefficients c_k. Integrated by
+//! I^α it becomes y = Σ_k c_k I^{α−ν_k} s_k + initial terms. All other modules use this form.
 
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
 use crate::fractional::kernels::{block_pulse_kernel, MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER};
 use crate::series;
 
-/// Orders closer than this are equal. Orders of a grid are multiples of its increment up to rounding.
+/// Difference below which two orders count as equal. Orders of a grid are multiples of its increment up to rounding.
 pub const ORDER_GRAIN: f64 = 1e-9;
 
-/// Term D^ν s. Its coefficient is stored in the [`Equation`].
+/// Term D^ν s of an equation. The [`Equation`] stores its coefficient.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Term {
     /// Index of the signal in the record.
     pub signal: usize,
-    /// Order ν; negative only for an input (an integration).
+    /// Order ν of the derivative. Only the order of an input may be negative, which is an integration.
     pub order: f64,
 }
 
-/// D^α y = Σ c_k D^{ν_k} s_k without its coefficients.
+/// Equation D^α y = Σ c_k D^{ν_k} s_k without its coefficients c_k.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
     /// Index of the output y in the record.
     pub output: usize,
-    /// Highest order α.
+    /// Order α of the equation.
     pub order: f64,
     /// Terms of the right-hand side.
     pub terms: Vec<Term>,
 }
 
-/// A structure with its coefficients.
+/// Equation: a structure with its coefficients.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Equation {
-    /// Orders and signals.
+    /// Output, orders and signals of the equation.
     pub structure: Structure,
     /// Coefficient of each term.
     pub coefficients: Vec<f64>,
@@ -46,43 +46,46 @@ const OFFSET_EXPONENT_TOLERANCE: f64 = 0.05;
 /// Initial conditions of a record.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Initial {
-    /// Zero initial conditions: no initial terms.
+    /// Zero initial conditions, without initial terms.
     Rest,
-    /// All powers of t of Caputo derivatives: t^i, i < ⌈α⌉, and t^{α−ν+i}, i < ⌈ν⌉.
+    /// Powers of t from Caputo derivatives. An equation of order α has t^i for i < ⌈α⌉. Each of its terms of order ν
+    /// adds t^{α−ν+i} for i < ⌈ν⌉.
     Caputo,
-    /// Explicit exponents.
+    /// Powers of t with explicit exponents.
     Powers(Vec<f64>),
-    /// Constant of unknown value on the right-hand side, one a record, in addition to other initial conditions.
+    /// Unknown constant on the right-hand side of each equation in each record, in addition to other initial
+    /// conditions.
     ///
-    /// Integrated with the equation it is c t^α/Γ(α + 1), one more power of t. A ramp r t is r t^{α+1}/Γ(α + 2).
+    /// Integration of an equation of order α turns a constant c into c t^α/Γ(α+1), and a ramp r t into r
+    /// t^{α+1}/Γ(α+2).
     Offset {
-        /// Other initial conditions, not an offset.
+        /// Other initial conditions, without an offset.
         under: Box<Initial>,
-        /// Whether the constant includes a ramp.
+        /// True if there is an unknown ramp in addition to the constant.
         ramp: bool,
     },
-    /// Output level: an unknown constant that is added to the simulated output, one a record and equation.
+    /// Output level: an unknown constant that is added to the simulated output, one per record and equation.
     ///
-    /// It is not a term of the equation, so its value does not depend on the orders. The record holds deviations from a
-    /// reference. The equation error has no term for the level.
+    /// It is not a term of the equation, so its value does not depend on the orders. The record contains deviations
+    /// from a reference. The equation error has no term for the level.
     Level {
-        /// Other initial conditions, not an offset.
+        /// Other initial conditions, without an offset.
         under: Box<Initial>,
     },
     /// Sensor filter with nonzero initial conditions.
     ///
-    /// Filtered signals lack the response of the filter to inputs before the record. That transient is a sum of the
+    /// Filtered signals lack the response of the filter to inputs before the record. This transient is a sum of the
     /// filter's responses to an impulse and to derivatives of an impulse.
     Filtered {
-        /// Other initial conditions, possibly with an offset, not filtered.
+        /// Other initial conditions, which may include an offset or a level, but no filter transient.
         under: Box<Initial>,
-        /// Number of these responses: the relative degree of the filter.
+        /// Number of filter responses in the transient, which is the relative degree of the filter.
         states: u8,
     },
 }
 
 impl Equation {
-    /// Return an equation with one finite coefficient per term.
+    /// Equation with one finite coefficient per term.
     ///
     /// # Errors
     /// [`Error::Length`] if the number of coefficients differs from the number of terms; [`Error::NotFinite`] for a
@@ -100,12 +103,12 @@ impl Equation {
         Ok(equation)
     }
 
-    /// Return an error if the equation needs a signal beyond the number `signals` of the record. Any signal may be an
-    /// input.
+    /// Return an error for an invalid equation. `signals` is the number of signals in the record, all of which may be
+    /// inputs.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a signal that does not exist, [`Error::OutOfRange`] for an invalid order
-    /// ([`Structure::check`]); a wrong number of coefficients or one that is not finite ([`Equation::new`]).
+    /// [`Error::Structure`] for a signal that does not exist, [`Error::OutOfRange`] for an invalid order.
+    /// [`Error::Length`] for a wrong number of coefficients, [`Error::NotFinite`] for a coefficient that is not finite.
     pub fn check(&self, signals: usize) -> Result<()> {
         self.structure.check(signals, |_| true)?;
         self.check_coefficients()
@@ -118,11 +121,11 @@ impl Equation {
 }
 
 impl Initial {
-    /// Add an unknown constant on the right-hand side (1), a constant and a ramp (2), or an output level (3). 0 adds
-    /// nothing.
+    /// Add an unknown constant on the right-hand side (`offset` = 1), a constant and a ramp (2), or an output level
+    /// (3). 0 adds nothing.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for another number.
+    /// [`Error::OutOfRange`] for any other value of `offset`.
     ///
     /// ```
     /// use ftlm::equation::{Initial, Structure, Term};
@@ -144,7 +147,7 @@ impl Initial {
         }
     }
 
-    /// Add the initial transient of a filter of this relative degree. 0 adds nothing.
+    /// Add the initial transient of a sensor filter whose relative degree is `states`. 0 adds nothing.
     ///
     /// ```
     /// use ftlm::equation::{Initial, Structure};
@@ -160,7 +163,7 @@ impl Initial {
         }
     }
 
-    /// Initial conditions without offset and filter transient.
+    /// Return the initial conditions without offset, output level and filter transient.
     #[must_use]
     pub fn under(&self) -> &Self {
         match self {
@@ -169,7 +172,7 @@ impl Initial {
         }
     }
 
-    /// Whether an output level is unknown.
+    /// True if an output level is unknown.
     #[must_use]
     pub fn has_level(&self) -> bool {
         match self {
@@ -179,7 +182,7 @@ impl Initial {
         }
     }
 
-    /// Return the initial conditions `start` with the offset and filter transient of this one.
+    /// Return the initial conditions `start` with the offset, output level and filter transient of `self`.
     ///
     /// ```
     /// use ftlm::equation::Initial;
@@ -199,7 +202,7 @@ impl Initial {
         }
     }
 
-    /// Initial conditions without the offset.
+    /// Return the initial conditions without the offset on the right-hand side. An output level remains.
     ///
     /// ```
     /// use ftlm::equation::Initial;
@@ -218,13 +221,13 @@ impl Initial {
         }
     }
 
-    /// Whether initial conditions are zero apart from offset and filter: all signals were zero before the record.
+    /// True if all signals were zero before the record, apart from an offset, an output level and the filter transient.
     #[must_use]
     pub fn is_at_rest(&self) -> bool {
         *self.under() == Self::Rest
     }
 
-    /// Initial conditions of an output without a sensor filter.
+    /// Return the initial conditions without the transient of a sensor filter.
     #[must_use]
     pub(crate) fn without_filter(&self) -> &Self {
         match self {
@@ -233,7 +236,7 @@ impl Initial {
         }
     }
 
-    /// Whether exponents depend on the orders of the equation.
+    /// True if exponents of the initial terms depend on the orders of the equation.
     #[must_use]
     pub fn follows_orders(&self) -> bool {
         match self {
@@ -242,7 +245,7 @@ impl Initial {
         }
     }
 
-    /// Exponents of t of an offset that is integrated by α.
+    /// Return the exponents of t of the offset in an equation of order `alpha`. Empty without an offset.
     pub(crate) fn offset_exponents(&self, alpha: f64) -> Vec<f64> {
         match self {
             Self::Offset { ramp: true, .. } => vec![tidy(alpha), tidy(alpha + 1.0)],
@@ -252,16 +255,16 @@ impl Initial {
         }
     }
 
-    /// Exponents of the filter transient: −1 for an impulse, −2, −3, … for its derivatives.
+    /// Iterate over the exponents of the filter transient: −1 for an impulse, −2, −3, … for its derivatives.
     pub(crate) fn impulses(&self) -> impl Iterator<Item = f64> {
         let states = if let Self::Filtered { states, .. } = self { *states } else { 0 };
         (1..=states).map(|k| -f64::from(k))
     }
 
-    /// Return an error for exponents whose power of t has no mean over the first pulse.
+    /// Return an error for an explicit exponent whose power of t has no mean over the first pulse.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for an exponent of −1 or less, [`Error::NotFinite`].
+    /// [`Error::OutOfRange`] for an exponent of −1 or less, [`Error::NotFinite`] for an exponent that is not finite.
     pub fn check(&self) -> Result<()> {
         let Self::Powers(exponents) = self.under() else { return Ok(()) };
         check_finite("exponents of the initial terms", exponents)?;
@@ -278,13 +281,14 @@ impl Initial {
 }
 
 impl Structure {
-    /// Return an error for invalid orders.
+    /// Return an error for invalid orders or signals. `signals` is the number of signals, and `is_input` is true for
+    /// inputs.
     ///
-    /// α must be in (0, 10], orders of the output in [0, α), others in [0, α + 1). Orders of inputs may be negative
-    /// down to −3.
+    /// The order α must be in (0, 10], orders of the output in [0, α), and orders of other signals in [0, α + 1).
+    /// Orders of inputs may be negative down to −3.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] naming the term, [`Error::Structure`] for a signal that does not exist.
+    /// [`Error::OutOfRange`] for an order that is out of range, [`Error::Structure`] for a signal that does not exist.
     pub fn check(&self, signals: usize, is_input: impl Fn(usize) -> bool) -> Result<()> {
         let range = |name: String, value: f64, range: String, remedy: &str| Error::OutOfRange {
             name,
@@ -320,19 +324,20 @@ impl Structure {
         Ok(())
     }
 
-    /// Integration order α − ν of term k. Negative values differentiate.
+    /// Return the integration order α − ν of term `k`: order of the equation minus order of the term. A negative value
+    /// is a differentiation.
     ///
     /// # Panics
-    /// If there is no term k.
+    /// If there is no term `k`.
     #[must_use]
     pub fn integration(&self, k: usize) -> f64 {
         tidy(self.order - self.terms[k].order)
     }
 
-    /// Distinct exponents of the initial terms, ascending.
+    /// Return the distinct exponents of the initial terms, ascending.
     ///
-    /// With an offset, which is t^α, Caputo's powers within 0.05 of α are omitted: t beside D^1.0003 is nearly
-    /// collinear with the offset.
+    /// With an offset, powers from Caputo derivatives within 0.05 of its exponents are omitted, because they are nearly
+    /// collinear with it. An example is t^1 with an equation of order 1.0003, whose offset is t^1.0003.
     #[must_use]
     pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
         let mut exponents = match initial.under() {
@@ -358,17 +363,17 @@ impl Structure {
     }
 }
 
-/// Whether a highest order is in (0, 10].
+/// True if an order α of an equation is in (0, 10].
 #[must_use]
 pub fn alpha_fits(alpha: f64) -> bool {
     alpha > 0.0 && alpha <= MAX_ORDER
 }
 
-/// Whether an order search tries a term of this order under α.
+/// True if an order search may use a term of this order in an equation of order `alpha`.
 ///
-/// Orders of the output are in [0, α), of another signal in [0, α], of an input in [−3, α]. [`Structure::check`] also
-/// admits higher orders of other signals. A search must not: with an order above α a free term nearly reproduces the
-/// output itself.
+/// Orders must be in [0, α) for the output (`own`), in [−3, α] for an input, and in [0, α] for other signals.
+/// [`Structure::check`] also admits orders up to α + 1 for other signals. A search must not use them, because a free
+/// term of an order above α nearly reproduces the output.
 #[must_use]
 pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
     if own {
@@ -385,14 +390,15 @@ pub(crate) fn missing_signal_error(signal: usize, signals: usize) -> Error {
     }
 }
 
-/// Integers 0, 1, … below `order`: exponents of the powers of t whose derivative D^order is zero.
+/// Iterate over the integers 0, 1, … below `order`: the exponents of the powers of t whose Caputo derivative D^order is
+/// zero.
 fn whole_below(order: f64) -> impl Iterator<Item = f64> {
     (0_u32..).map(f64::from).take_while(move |&i| i < order.min(MAX_ORDER) - ORDER_GRAIN)
 }
 
-/// Order rounded to the resolution, so that equal orders have equal bits.
+/// Round an order to a multiple of 1e−9, so that equal orders have equal bits.
 ///
-/// Numbers beyond 9·10⁶, which are farther apart than the resolution, and NaN are returned as they are.
+/// NaN is returned unchanged, as are magnitudes beyond 9·10⁶, where floating-point numbers are farther apart than 1e−9.
 ///
 /// ```
 /// assert_eq!(ftlm::equation::tidy(0.1 + 0.2), 0.3);
@@ -403,39 +409,41 @@ pub fn tidy(order: f64) -> f64 {
     const EXACT: f64 = 9_007_199_254_740_992.0; // 2⁵³
     let units = (order * 1e9).round();
     if units.abs() < EXACT {
-        // Of −0 as well, so that equal orders have equal bits.
+        // Adding 0 turns −0 into 0, so that equal orders have equal bits.
         units / 1e9 + 0.0
     } else {
         order
     }
 }
 
-/// Order as an integer multiple of the resolution: the key of its regressor. Saturates beyond 9·10⁹; 0 for NaN.
+/// Return an order as an integer multiple of 1e−9, which identifies the regressor of this order. The result saturates
+/// for magnitudes beyond 9·10⁹ and is 0 for NaN.
 #[must_use]
 #[allow(clippy::cast_possible_truncation)]
 pub fn grains(order: f64) -> i64 {
     (order * 1e9).round() as i64
 }
 
-/// Maximum magnitude of an order law within the bounds of its free orders. A law may exceed the range of one order,
-/// because the range is checked at every point. The memory of tables by integer order is proportional to this limit.
+/// Maximum magnitude of an order law within the bounds of its free orders. A law may exceed the range of a single
+/// order, because that range is checked at every point. The memory of tables by integer order is proportional to this
+/// limit.
 pub const MAX_REACHED_ORDER: f64 = 100.0;
 
-/// An affine order law: constant + Σ weight·free order.
+/// Affine order law: constant + Σ weight × free order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AffineOrder {
-    /// Constant part.
+    /// Constant part of the order.
     pub constant: f64,
     /// Weight of each free order.
     pub weights: Vec<f64>,
 }
 
 impl AffineOrder {
-    /// Check that each free order has a weight, and that the law within their bounds is at most [`MAX_REACHED_ORDER`]
-    /// in magnitude.
+    /// Return an error for an invalid order law. `bounds` holds the lower and upper bound of each free order.
     ///
     /// # Errors
-    /// [`Error::Length`] for a wrong number of weights; [`Error::OutOfRange`] for an order beyond that limit.
+    /// [`Error::Length`] for a wrong number of weights. [`Error::OutOfRange`] if the law may exceed
+    /// [`MAX_REACHED_ORDER`] in magnitude within the bounds.
     pub fn check(&self, bounds: &[(f64, f64)]) -> Result<()> {
         check_length("weights of an order", bounds.len(), self.weights.len())?;
         let free = self.weights.iter().zip(bounds).map(|(w, (low, high))| w.abs() * low.abs().max(high.abs()));
@@ -451,28 +459,30 @@ impl AffineOrder {
         })
     }
 
-    /// Value of the law at these free orders.
+    /// Return the value of the law at the given free orders.
     #[must_use]
     pub fn at(&self, free: &[f64]) -> f64 {
         tidy(self.constant + self.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>())
     }
 }
 
-/// Rational filter Σ b D^ν / Σ a D^ν, such as the low-pass filter of a sensor.
+/// Rational filter Σ b D^ν / Σ a D^ν with coefficients b and a, such as the low-pass filter of a sensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Filter {
-    /// (coefficient, order) of the numerator.
+    /// Terms of the numerator as (coefficient, order).
     pub numerator: Vec<(f64, f64)>,
-    /// (coefficient, order) of the denominator.
+    /// Terms of the denominator as (coefficient, order).
     pub denominator: Vec<(f64, f64)>,
 }
 
 impl Filter {
-    /// Filter as a series of m pulses of `step` s with zero initial conditions. O(terms · m + m log² m).
+    /// Return the filter as a power series in the one-step delay, with `m` coefficients, for pulses of length `step`
+    /// \[s\] and zero initial conditions. O(terms · m + m log² m).
     ///
     /// # Errors
-    /// An improper filter, an order outside [0, 10], a denominator that starts with zero, a value that is not finite, a
-    /// step that is not positive, more points than memory holds.
+    /// [`Error::OutOfRange`] for an improper filter, an order outside [0, 10], a step that is not positive, or too many
+    /// pulses. [`Error::NotFinite`] for a coefficient that is not finite. [`Error::LeadingZero`] for a denominator that
+    /// starts with zero.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -513,11 +523,11 @@ impl Filter {
     }
 }
 
-/// Maximum number n of equations for which the check is done. It examines all 2^n sets of columns, so larger systems
-/// are not checked.
+/// Maximum number n of equations that [`check_regular`] tests. The test examines all 2^n sets of columns, so larger
+/// systems are not tested.
 const MAX_EQUATIONS: usize = 16;
 
-/// Leading term of a polynomial entry: order, coefficient, and sum of the absolute values added to that coefficient.
+/// Leading term of a polynomial: order, coefficient, and sum of the magnitudes added to the coefficient. None for 0.
 type Leading = Option<(f64, f64, f64)>;
 
 fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading {
@@ -530,8 +540,9 @@ fn add_leading_term(sum: Leading, order: f64, value: f64, size: f64) -> Leading 
 
 /// Return an error if coupled equations do not determine every output.
 ///
-/// As a polynomial in s the determinant must have the order of its largest products. If these cancel, the equations
-/// repeat or contradict each other.
+/// The determinant of the equations is a polynomial in the Laplace variable s. Its order must be the order of its
+/// largest products. If these products cancel, the equations repeat or contradict each other. Systems of more than 16
+/// equations are not tested.
 ///
 /// # Errors
 /// [`Error::Structure`] if the equations cannot be solved for all outputs.

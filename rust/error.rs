@@ -1,14 +1,14 @@
-//! Errors of all computations, with the values found and a remedy.
+//! Errors of all computations. Each contains the values found and a remedy.
 
 use thiserror::Error;
 
-/// Error with the cause and a remedy.
+/// Error with its cause and a remedy.
 ///
 /// [`Error::kind`] groups the variants for bindings: data, model, convergence, interruption, internal.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A signal contains NaN or infinity.
+    /// A signal or argument contains NaN or infinity.
     #[error("{name} is not finite at index {index} ({count} such values in all); remove or replace these samples")]
     NotFinite {
         /// Name of the argument.
@@ -43,23 +43,24 @@ pub enum Error {
     /// Haar coordinates of a length that is not a power of two.
     #[error("Haar coordinates need m to be a power of two, not {m}; take m = {below} or {above}, or block-pulse (time) coordinates")]
     NotPowerOfTwo {
-        /// The length given.
+        /// Length that was given.
         m: usize,
-        /// Nearest power of two below.
+        /// Largest power of two below the length.
         below: usize,
-        /// Nearest power of two above.
+        /// Smallest power of two above the length.
         above: usize,
     },
-    /// Division by a series that starts with (nearly) zero. For a coupled system: a singular leading matrix.
+    /// Division by a series whose first coefficient is zero or nearly zero. In a coupled system: a singular leading
+    /// matrix.
     #[error("the leading coefficient of a divisor series is {leading:e}, so that the equation cannot be solved for its output; check for a term of the output at the highest order with coefficient 1")]
     LeadingZero {
-        /// The leading coefficient, or the pivot of the leading matrix.
+        /// First coefficient of the series, or the pivot of the leading matrix.
         leading: f64,
     },
     /// Linearly dependent regressors.
     #[error("regressor {index} of {count} is a linear combination of the others to machine precision; remove a term or change its order")]
     Singular {
-        /// First dependent regressor.
+        /// Index of the first dependent regressor.
         index: usize,
         /// Number of regressors.
         count: usize,
@@ -67,40 +68,40 @@ pub enum Error {
     /// Order grid without candidates.
     #[error("the order grid has no candidate: {why}; widen the intervals or refine the step")]
     EmptyOrderGrid {
-        /// Condition that no order satisfies.
+        /// Condition that no combination of orders satisfies.
         why: String,
     },
     /// Order grid with too many candidates.
     #[error("the order grid has up to {count} candidates, more than the limit of {limit}; at 10 ns per candidate, the best case, a search takes {} on one core; take a larger step, narrower intervals or fixed orders", format_search_time(*count))]
     OrderGridTooLarge {
-        /// Number of candidates. If they were not enumerated, the number of all tuples of the axes.
+        /// Number of candidates. If the candidates were not enumerated, the number of all tuples of orders.
         count: u128,
         /// Maximum number of candidates.
         limit: u128,
     },
-    /// Bank of regressors over the memory limit.
+    /// Bank of regressors that exceeds the memory limit.
     #[error("{columns} regressors of {m} pulses and their products need {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step or narrower intervals")]
     BankTooLarge {
-        /// Number of columns.
+        /// Number of regressors.
         columns: usize,
-        /// Pulses.
+        /// Number of pulses of each regressor.
         m: usize,
         /// Memory needed, in bytes.
         bytes: u128,
         /// Memory allowed, in bytes.
         limit: u128,
     },
-    /// Working memory over its limit.
+    /// Working memory that exceeds its limit.
     #[error("{what} need {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step, narrower intervals, fewer or shorter runs, or raise the memory limit")]
     Memory {
-        /// Data that need the memory.
+        /// Description of the data that need the memory.
         what: String,
         /// Memory needed, in bytes.
         bytes: u128,
         /// Memory allowed, in bytes.
         limit: u128,
     },
-    /// Equation that is malformed, or one with a signal that the record does not have.
+    /// Inconsistent model, for example an equation with a signal that the record does not have.
     #[error("{what}; {remedy}")]
     Structure {
         /// Cause.
@@ -111,7 +112,7 @@ pub enum Error {
     /// Response or estimate that overflows.
     #[error("the {what} is not finite from index {index} on; the model is unstable on this record")]
     Diverged {
-        /// Name of the computation.
+        /// Name of the computation that overflows.
         what: String,
         /// Index of the first value that is not finite.
         index: usize,
@@ -126,7 +127,7 @@ pub enum Error {
         /// Cause.
         why: String,
     },
-    /// Every start of a fit leads to a simulation that overflows.
+    /// Fit whose simulation overflows at every initial guess.
     #[error("the simulation of {output} overflows from every initial guess; remove the term that makes the model unstable, or bound its coefficient")]
     Beyond {
         /// Name of the output.
@@ -140,10 +141,10 @@ pub enum Error {
         /// Remedy.
         remedy: String,
     },
-    /// The caller asked to stop.
+    /// Computation that the caller stopped.
     #[error("interrupted")]
     Interrupted,
-    /// Threads that the system cannot start.
+    /// Threads that the operating system cannot start.
     #[error("{threads} threads could not be started: {why}; use fewer threads")]
     Threads {
         /// Number of requested threads.
@@ -175,13 +176,13 @@ pub enum Kind {
 }
 
 impl Error {
-    /// Whether a simulation ends before its record does, so that an optimization shortens its step.
+    /// True if this error ends a simulation early, so that an optimizer must shorten its step.
     #[must_use]
     pub fn ends_simulation(&self) -> bool {
         matches!(self, Self::Diverged { .. } | Self::NoSolution { .. } | Self::LeadingZero { .. })
     }
 
-    /// Category of this error.
+    /// Return the category of this error.
     #[must_use]
     pub fn kind(&self) -> Kind {
         match self {
@@ -202,7 +203,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 /// Return an error if a value is not finite.
 ///
 /// # Errors
-/// [`Error::NotFinite`] with the first bad index and the count.
+/// [`Error::NotFinite`] with the index of the first such value and the number of such values.
 ///
 /// ```
 /// let error = ftlm::error::check_finite("x", &[0.0, f64::NAN]).unwrap_err();
@@ -231,10 +232,10 @@ pub fn check_length(name: &str, expected: usize, actual: usize) -> Result<()> {
     }
 }
 
-/// Return an error for a result of operations in the step that overflows.
+/// Return an error if a result that depends on the step is not finite.
 ///
 /// # Errors
-/// [`Error::OutOfRange`].
+/// [`Error::OutOfRange`] for the step.
 pub(crate) fn check_overflow(result: &[f64], step: f64) -> Result<()> {
     if result.iter().all(|v| v.is_finite()) {
         return Ok(());
@@ -247,7 +248,7 @@ pub(crate) fn check_overflow(result: &[f64], step: f64) -> Result<()> {
     })
 }
 
-/// Number as text; an extreme one has an exponent in place of hundreds of zeros.
+/// Format a number. Very small and very large magnitudes have an exponent in place of many zeros.
 fn format_number(value: f64) -> String {
     let plain = value == 0.0 || !value.is_finite() || (1e-9..1e16).contains(&value.abs());
     if plain {
@@ -257,7 +258,7 @@ fn format_number(value: f64) -> String {
     }
 }
 
-/// Return the minimum duration of a search over `count` candidates as text, at 10 ns per candidate.
+/// Return the minimum duration of a search over `candidates` candidates as text, at 10 ns per candidate.
 #[allow(clippy::cast_precision_loss)]
 fn format_search_time(candidates: u128) -> String {
     let seconds = candidates as f64 * 1e-8;
@@ -271,10 +272,10 @@ fn format_search_time(candidates: u128) -> String {
     }
 }
 
-/// Return an error for a step that is not positive and finite.
+/// Return an error if the step is not positive and finite.
 ///
 /// # Errors
-/// [`Error::OutOfRange`].
+/// [`Error::OutOfRange`] for the step.
 pub fn check_step(step: f64) -> Result<()> {
     if step.is_finite() && step > 0.0 {
         Ok(())
@@ -288,14 +289,14 @@ pub fn check_step(step: f64) -> Result<()> {
     }
 }
 
-/// Maximum number of points of a series or a record: 1 GiB per signal. A larger number is a mistake that would exhaust
-/// memory. The tables of prime divisors, with 31-bit indices, are large enough.
+/// Maximum number of points of a series or a record, which take 1 GiB per signal. A larger number is a mistake that
+/// would exhaust memory. Tables of prime divisors with 31-bit indices cover this number.
 pub const MAX_POINTS: usize = 1 << 27;
 
-/// Return an error for more points than [`MAX_POINTS`].
+/// Return an error if `m` exceeds [`MAX_POINTS`].
 ///
 /// # Errors
-/// [`Error::OutOfRange`].
+/// [`Error::OutOfRange`] for the argument `name`.
 pub fn check_points(name: &str, m: usize) -> Result<()> {
     if m <= MAX_POINTS {
         return Ok(());
@@ -309,10 +310,10 @@ pub fn check_points(name: &str, m: usize) -> Result<()> {
     })
 }
 
-/// Return an error for data of more bytes than the limit.
+/// Return an error if data need more bytes than the limit. `what` describes the data.
 ///
 /// # Errors
-/// [`Error::Memory`].
+/// [`Error::Memory`] with the bytes needed and the limit.
 pub fn check_memory(what: impl FnOnce() -> String, bytes: usize, limit: usize) -> Result<()> {
     if bytes <= limit {
         return Ok(());
@@ -320,13 +321,13 @@ pub fn check_memory(what: impl FnOnce() -> String, bytes: usize, limit: usize) -
     Err(Error::Memory { what: what(), bytes: bytes as u128, limit: limit as u128 })
 }
 
-/// Maximum number of rows of a dense matrix, which then takes two gigabytes. Dense matrices serve study only.
+/// Maximum number of rows of a square dense matrix, which takes two gigabytes. Dense matrices are for study only.
 pub const MAX_DENSE_ROWS: usize = 1 << 14;
 
-/// Return an error for a dense matrix without rows or with more than [`MAX_DENSE_ROWS`].
+/// Return an error if a dense matrix has no rows or more than [`MAX_DENSE_ROWS`].
 ///
 /// # Errors
-/// [`Error::OutOfRange`].
+/// [`Error::OutOfRange`] for the number of rows `m`.
 pub fn check_dense(m: usize) -> Result<()> {
     if (1..=MAX_DENSE_ROWS).contains(&m) {
         return Ok(());

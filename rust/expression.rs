@@ -1,12 +1,12 @@
 //! Expressions of non-linear terms as programs in postfix notation, evaluated together with their derivatives.
 //!
-//! A channel is a signal or a derivative of it. A [`DerivedSignal`] is an expression over channels, such as y³ or
+//! A channel is a signal or a derivative of a signal. A [`DerivedSignal`] is an expression over channels, such as y³ or
 //! |Dy|·Dy. A non-linear term of an equation is a linear term of a derived signal.
 
 use crate::error::{Error, Result};
 use crate::fractional::kernels::MAX_ORDER;
 
-/// Function of one argument.
+/// Elementary function of one argument.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Function {
     /// Sine.
@@ -42,7 +42,7 @@ impl Function {
         }
     }
 
-    /// Value and derivative at x. The infinite slope of a root at 0 is replaced by 0.
+    /// Return value and derivative at x. The infinite slope of the square root at 0 is replaced by 0.
     fn apply(self, x: f64) -> (f64, f64) {
         match self {
             Self::Sin => (libm::sin(x), libm::cos(x)),
@@ -67,7 +67,7 @@ fn sign(x: f64) -> f64 {
     }
 }
 
-/// Value and derivative of x^n. The infinite slope of a power below 1 at 0 is replaced by 0.
+/// Return value and derivative of x^n. The infinite slope at 0 for n < 1 is replaced by 0.
 #[allow(clippy::cast_possible_truncation)]
 fn power(x: f64, n: f64) -> (f64, f64) {
     if n == 0.0 {
@@ -83,28 +83,28 @@ fn power(x: f64, n: f64) -> (f64, f64) {
 /// Instruction of a program in postfix notation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Instruction {
-    /// Push a constant.
+    /// Push a constant on the stack.
     Constant(f64),
-    /// Push the value of a channel.
+    /// Push the value of the channel with this index on the stack.
     Channel(usize),
-    /// Add the two topmost values.
+    /// Replace the two topmost values of the stack by their sum.
     Add,
-    /// Multiply the two topmost values.
+    /// Replace the two topmost values of the stack by their product.
     Multiply,
-    /// Negate the topmost value.
+    /// Negate the topmost value of the stack.
     Negate,
-    /// Raise the topmost value to a power.
+    /// Raise the topmost value of the stack to this power.
     Power(f64),
-    /// Apply a function to the topmost value.
+    /// Apply a function to the topmost value of the stack.
     Apply(Function),
 }
 
 impl Instruction {
-    /// Instruction from a name and a number: `constant` (value), `channel` (index), `add`, `multiply`, `negate`,
-    /// `power` (exponent), or a function.
+    /// Return the instruction with a name and a number: `constant` (value), `channel` (index), `add`, `multiply`,
+    /// `negate`, `power` (exponent), or the name of a function.
     ///
     /// # Errors
-    /// [`Error::Structure`] for another name, or an index that is not whole.
+    /// [`Error::Structure`] for another name, or a channel index that is not a whole number.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn parse(name: &str, value: f64) -> Result<Self> {
         Ok(match name {
@@ -126,7 +126,7 @@ fn refuse<T>(what: String, remedy: &str) -> Result<T> {
     Err(Error::Structure { what: format!("{what} in a non-linear term"), remedy: remedy.into() })
 }
 
-/// Expression over numbered channels.
+/// Expression over numbered channels, which are signals or derivatives of signals.
 ///
 /// ```
 /// use ftlm::expression::{Expression, Function, Instruction, Values};
@@ -145,11 +145,11 @@ pub struct Expression {
 }
 
 impl Expression {
-    /// Expression of a program over this number of channels.
+    /// Expression that a program computes from this number of channels.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a program that lacks a value or ends with several values, a channel that does not
-    /// exist, or a number that is not finite.
+    /// [`Error::Structure`] for a program that lacks a value or ends with several values, a channel index out of range,
+    /// or a number that is not finite.
     pub fn new(program: Vec<Instruction>, channels: usize) -> Result<Self> {
         let mut depth = 0_usize;
         for instruction in &program {
@@ -181,8 +181,8 @@ impl Expression {
         self.channels
     }
 
-    /// Value of the expression at these values of the channels. The derivatives are then in [`Values::slopes`]. If a
-    /// function has no value, it is in [`Values::fault`] and the result is not finite.
+    /// Return the value of the expression at the given channel values. Afterwards, [`Values::slopes`] holds its
+    /// derivatives. If a function has no finite value, [`Values::fault`] names it, and the result is not finite.
     pub fn evaluate(&self, channels: &[f64], values: &mut Values) -> f64 {
         let n = self.channels;
         values.stack.clear();
@@ -210,7 +210,7 @@ impl Expression {
     }
 }
 
-/// Reusable intermediate values of an evaluation.
+/// Intermediate values of an evaluation. Their memory is reused by the next evaluation.
 #[derive(Debug, Clone, Default)]
 pub struct Values {
     stack: Vec<f64>,
@@ -219,13 +219,14 @@ pub struct Values {
 }
 
 impl Values {
-    /// Derivatives of the last evaluation with respect to the channels.
+    /// Derivatives of the last evaluation with respect to each channel.
     #[must_use]
     pub fn slopes(&self) -> &[f64] {
         &self.slopes
     }
 
-    /// Function that had no finite value in the last evaluation, and its finite argument.
+    /// Name and argument of the first function without a finite value at a finite argument in the last evaluation; None
+    /// if all values were finite.
     #[must_use]
     pub fn fault(&self) -> Option<(&'static str, f64)> {
         self.fault
@@ -252,17 +253,17 @@ impl Values {
     }
 }
 
-/// Signal that is an expression over channels: signals and derivatives of them.
+/// Signal that an expression computes from channels, which are signals or derivatives of signals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DerivedSignal {
     /// The expression over the channels.
     pub expression: Expression,
-    /// Signal and order of the derivative of each channel.
+    /// (index of the signal, order of its derivative) of each channel.
     pub channels: Vec<(usize, f64)>,
 }
 
 impl DerivedSignal {
-    /// Signal that is an expression over these channels.
+    /// Signal that an expression computes from these channels.
     ///
     /// # Errors
     /// [`Error::Structure`] for a wrong number of channels, or an order that is negative or above 10.

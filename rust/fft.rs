@@ -1,7 +1,9 @@
-//! Real fast Fourier transforms: shared plans, fast lengths and scratch memory. The only user of `realfft`.
+//! Real fast Fourier transforms: shared plans, fast lengths and scratch memory. Only this module uses the crate
+//! `realfft`.
 //!
-//! Forward transforms are not normalized, inverse transforms are divided by the length. A product of spectra is thus a
-//! cyclic convolution. Plans are shared. The caller supplies scratch memory: one [`Workspace`] per thread.
+//! Forward transforms are not normalized. Inverse transforms are divided by the length, so the inverse transform of a
+//! product of spectra is a cyclic convolution. Plans are shared by all threads. The caller supplies scratch memory: one
+//! [`Workspace`] per thread.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -13,10 +15,10 @@ pub use realfft::num_complex::Complex;
 
 use crate::parallel::ForkSafeLock;
 
-/// Complex value of one frequency bin.
+/// Complex value of a spectrum at one frequency.
 pub type Bin = Complex<f64>;
 
-/// Forward and inverse real transform of one even length.
+/// Plan of the forward and the inverse real transform of one length.
 #[derive(Clone)]
 pub struct Plan {
     len: usize,
@@ -24,13 +26,13 @@ pub struct Plan {
     inverse: Arc<dyn ComplexToReal<f64>>,
 }
 
-/// Scratch memory of one thread. It grows to the largest plan used.
+/// Scratch memory for the transforms of one thread. It grows as the largest plan requires.
 #[derive(Default)]
 pub struct Workspace {
     scratch: Vec<Bin>,
 }
 
-/// Smallest even 5-smooth length of at least `n`. Transforms are fast at these lengths.
+/// Return the smallest even length of at least `n` without prime factors above 5. Transforms of these lengths are fast.
 #[must_use]
 pub fn fast_length(n: usize) -> usize {
     let mut len = n.max(2);
@@ -50,13 +52,13 @@ pub fn fast_length(n: usize) -> usize {
 
 /// Maximum length of a transform whose plan is never evicted from the cache. A plan takes about 20 bytes per point.
 const MAX_PERMANENT_PLAN_POINTS: usize = 1 << 14;
-/// Total points of longer plans above which the least recently used are evicted.
+/// Total number of points of longer plans above which the least recently used plans are evicted.
 ///
-/// Refining a grid again and again would otherwise leave all its plans in memory. A plan evicted too early costs two
-/// transforms.
+/// Otherwise, refining a grid repeatedly would leave all its plans in memory. If a plan is evicted too early, its new
+/// computation costs about two transforms.
 const MAX_CACHED_PLAN_POINTS: usize = 1 << 20;
-/// Number of recent requests whose long plans are not evicted, even above the limit. One evaluation of a large problem
-/// may need more points.
+/// Number of recent requests for long plans whose plans are not evicted, even above the limit. One evaluation of a
+/// large problem may need more points than the limit.
 const IN_USE: u64 = 16;
 
 /// Plans by length, each with the number of its last request.
@@ -65,7 +67,7 @@ struct Plans {
     plans: BTreeMap<usize, (Plan, u64)>,
 }
 
-/// Plans of all threads. Each thread copies short plans once, so that it does not wait for the lock again.
+/// Plans that all threads share. Each thread copies short plans once, so that it does not wait for the lock again.
 static SHARED_PLANS: ForkSafeLock<Plans> = ForkSafeLock::new(Plans::new());
 
 thread_local! {
@@ -87,7 +89,7 @@ impl Plans {
         Some(plan.clone())
     }
 
-    /// Store a plan, unless one of its length exists. Return the stored plan and the evicted plans.
+    /// Store a plan, unless there is a plan of the same length. Return the stored plan and the evicted plans.
     ///
     /// The caller drops the evicted plans outside the lock.
     fn keep(&mut self, plan: Plan) -> (Plan, Vec<Plan>) {
@@ -104,7 +106,8 @@ impl Plans {
         (plan, forgotten)
     }
 
-    /// Evict long plans, the least recently used first, until at most `points` remain.
+    /// Evict plans longer than [`MAX_PERMANENT_PLAN_POINTS`], the least recently used first, until these have at most
+    /// `points` points in total. Recently requested plans are not evicted. Return the evicted plans.
     fn make_room(&mut self, points: usize) -> Vec<Plan> {
         let mut long: Vec<(u64, usize)> = self
             .plans
@@ -126,9 +129,9 @@ impl Plans {
     }
 }
 
-/// Plan of a length, shared by all threads. See [`fast_length`] for fast lengths.
+/// Return the plan of a length, which all threads share. See [`fast_length`] for fast lengths.
 ///
-/// Long plans that were not used recently are evicted.
+/// Long plans that were not used recently are evicted from the cache.
 ///
 /// ```
 /// use ftlm::fft::{plan, Complex, Workspace};
@@ -159,7 +162,8 @@ pub fn plan(len: usize) -> Plan {
     plan
 }
 
-/// Power spectrum of a signal: squared magnitudes from zero to the Nyquist frequency, zero-padded to a fast length.
+/// Return the power spectrum of a signal: squared magnitudes from frequency zero to the Nyquist frequency. The signal
+/// is zero-padded to a fast length.
 #[must_use]
 pub fn power_spectrum(signal: impl ExactSizeIterator<Item = f64>) -> Vec<f64> {
     let plan = plan(fast_length(signal.len()));
@@ -176,7 +180,7 @@ impl Plan {
         Self { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) }
     }
 
-    /// Number of real points.
+    /// Number of real points of the transform.
     #[must_use]
     pub fn len(&self) -> usize {
         self.len
@@ -188,16 +192,16 @@ impl Plan {
         self.len == 0
     }
 
-    /// Number of bins of a spectrum: `len / 2 + 1`.
+    /// Number of frequencies of a spectrum: `len / 2 + 1`.
     #[must_use]
     pub fn bins(&self) -> usize {
         self.len / 2 + 1
     }
 
-    /// Transform `time` into `spectrum`. `time` has `len` elements and is overwritten, `spectrum` has `bins`.
+    /// Transform `time` (`len` values, overwritten) into `spectrum` (`bins` values).
     ///
     /// # Panics
-    /// If the lengths differ, which is a programming error.
+    /// If a length differs from that of the plan, which is a programming error.
     pub fn transform(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
         self.check(time.len(), spectrum.len());
         let scratch = workspace.at_least(self.forward.get_scratch_len());
@@ -215,10 +219,11 @@ impl Plan {
         );
     }
 
-    /// Inverse transform of `spectrum`, divided by the length. `spectrum` is overwritten.
+    /// Compute the inverse transform of `spectrum` (`bins` values, overwritten), divided by the length. Write it to
+    /// `time` (`len` values).
     ///
     /// # Panics
-    /// As [`Plan::transform`].
+    /// If a length differs from that of the plan, which is a programming error.
     pub fn inverse(&self, spectrum: &mut [Bin], time: &mut [f64], workspace: &mut Workspace) {
         self.check(time.len(), spectrum.len());
         // The transform rejects an imaginary part in the two bins that are real for a real signal.
@@ -242,7 +247,7 @@ impl Plan {
 }
 
 impl Workspace {
-    /// An empty workspace.
+    /// Workspace without scratch memory, which is allocated on first use.
     #[must_use]
     pub fn new() -> Self {
         Self::default()

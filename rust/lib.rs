@@ -4,7 +4,7 @@
 //!
 //! 1. [`signal`]: point samples become means over block pulses, and pulse means become nonuniform samples;
 //! 2. [`fractional`], [`series`]: fractional integrals as truncated power series in the one-step delay, and the
-//!    operational matrices of the literature; [`fft`], [`linalg`] and [`simd`] serve them;
+//!    operational matrices of the literature; [`fft`], [`linalg`] and [`simd`] support them;
 //! 3. [`equation`]: terms, orders, order laws, sensor filters; solvability of coupled equations;
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
 //! 5. [`estimation`]: coefficients at fixed orders by least squares, multi-innovation least squares and instrumental
@@ -38,13 +38,13 @@
 //! # }
 //! ```
 //!
-//! A [`recording::Recording`] holds samples, a [`regressors::Record`] holds [`signal::block_pulse::PulseMeans`].
-//! Estimates from samples in place of means would be biased.
+//! A [`recording::Recording`] contains samples, and a [`regressors::Record`] contains
+//! [`signal::block_pulse::PulseMeans`]. Estimates from samples in place of pulse means would be biased.
 //!
 //! # Features
 //!
 //! No feature is enabled by default. `rig`: [`rig`], the simulated arm and the safety guard of the rigs. `oracles`:
-//! slow reference computations for tests. `python`: the Python bindings, with `rig` and `oracles`.
+//! slow reference computations for tests. `python`: the Python bindings, which enable `rig` and `oracles`.
 //!
 //! Numerical code does not access files, clocks (except the timer of the virtual rig) or Python.
 #![forbid(unsafe_op_in_unsafe_fn)]
@@ -80,7 +80,7 @@ pub mod recording;
 #[cfg(feature = "rig")]
 pub mod rig;
 
-/// Types for a fit of measured columns.
+/// Types and functions for a fit of measured signals.
 pub mod prelude {
     pub use crate::error::{Error, Result};
     pub use crate::estimation::joint_fit::structure::{Order, ParametricEquation};

@@ -1,10 +1,11 @@
 //! Parallel execution: parallel map, thread pool of one search, fork-safe locks and cancellation.
 //!
-//! A global thread pool hangs after a fork, so work runs on the pool of the current search, or serially if there
-//! is none.
+//! A global thread pool hangs after a fork. Work therefore runs on the thread pool of the current search, or serially
+//! if there is none.
 //!
-//! After a fork the child has one thread, and a lock that another thread held stays locked for good. These locks are
-//! tried for some microseconds, far longer than any thread holds them. Then the caller continues without the value.
+//! After a fork, the child process has one thread. A lock that another thread had taken stays locked for good. Attempts
+//! to take a fork-safe lock end after some microseconds, far longer than any thread keeps it locked. The caller then
+//! continues without the value.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, TryLockError};
@@ -13,10 +14,10 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 
-/// Map `work` over the items, in parallel if a thread pool is installed.
+/// Apply `work` to each item, in parallel if the caller runs in a thread pool.
 ///
-/// Results keep the order of the items. Each thread reuses its scratch memory. `work` must give the same result for any
-/// scratch, so that results do not depend on the number of threads.
+/// Results keep the order of the items. `scratch` creates scratch memory, which a thread reuses for its items. `work`
+/// must give the same result for any scratch memory, so that results do not depend on the number of threads.
 pub(crate) fn map<T, S, R>(
     items: Vec<T>,
     scratch: impl Fn() -> S + Sync + Send,
@@ -37,10 +38,11 @@ where
 /// Maximum number of threads of a search.
 pub const MAX_THREADS: usize = 1024;
 
-/// Build a separate thread pool for one search. A global pool hangs after a fork.
+/// Build a thread pool for one search. A global thread pool would hang after a fork.
 ///
 /// # Errors
-/// [`Error::OutOfRange`] for a number outside 1 to [`MAX_THREADS`], [`Error::Threads`] if the system cannot start them.
+/// [`Error::OutOfRange`] for a number outside 1 to [`MAX_THREADS`], [`Error::Threads`] if the system cannot start the
+/// threads.
 ///
 /// ```
 /// # use ftlm::parallel::pool;
@@ -65,7 +67,7 @@ pub fn pool(threads: usize) -> Result<rayon::ThreadPool> {
         .map_err(|e| Error::Threads { threads, why: e.to_string() })
 }
 
-/// Set of workspaces, one per thread.
+/// Workspaces for the threads of a pool, one per thread.
 pub(crate) struct PerThread<T>(Vec<Mutex<T>>);
 
 impl<T: Default> PerThread<T> {
@@ -73,12 +75,12 @@ impl<T: Default> PerThread<T> {
         Self((0..pool.current_num_threads().max(1)).map(|_| Mutex::default()).collect())
     }
 
-    /// Number of threads.
+    /// Number of workspaces, which is the number of threads.
     pub(crate) fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Call a function with the workspace of the current thread.
+    /// Apply a function to the workspace of the current thread and return its result.
     pub(crate) fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> R {
         let thread = rayon::current_thread_index().unwrap_or(0) % self.0.len();
         let mut memory = self.0[thread].lock().unwrap_or_else(PoisonError::into_inner);
@@ -86,11 +88,11 @@ impl<T: Default> PerThread<T> {
     }
 }
 
-/// Maximum number of attempts to take a lock.
+/// Maximum number of attempts to take a lock. The caller then continues without the value.
 const MAX_LOCK_ATTEMPTS: usize = 128;
 const SPIN_LOCK_ATTEMPTS: usize = 64;
 
-/// Value behind a lock with a bounded number of attempts.
+/// Value behind a lock that is tried a limited number of times, so that a caller never waits forever after a fork.
 pub(crate) struct ForkSafeLock<T>(Mutex<T>);
 
 impl<T> ForkSafeLock<T> {
@@ -98,7 +100,7 @@ impl<T> ForkSafeLock<T> {
         Self(Mutex::new(value))
     }
 
-    /// Run short work on the value. None if the lock cannot be taken.
+    /// Apply `work`, which must be short, to the value and return its result. None if the lock cannot be taken.
     pub(crate) fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> Option<R> {
         for turn in 0..MAX_LOCK_ATTEMPTS {
             match self.0.try_lock() {
@@ -120,7 +122,7 @@ impl<T> ForkSafeLock<T> {
     }
 }
 
-/// Cancellation flag, set by any thread and polled by the computing one. Clones share the flag.
+/// Cancellation flag. Any thread may set it, and the computing thread polls it. Clones share the flag.
 ///
 /// ```
 /// let stop = ftlm::parallel::Stop::default();
@@ -137,13 +139,13 @@ impl Stop {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// Whether cancellation was requested.
+    /// True if cancellation was requested.
     #[must_use]
     pub fn is_set(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 
-    /// Return an error after cancellation was requested.
+    /// Return an error if cancellation was requested.
     ///
     /// # Errors
     /// [`Error::Interrupted`] after a stop request.

@@ -1,28 +1,28 @@
-//! SIMD kernels with instructions chosen at run time. The only user of `pulp`.
+//! SIMD kernels, whose instruction set is chosen at run time. Only this module uses the crate `pulp`.
 //!
 //! Kernels are loops over arrays of [`LANE_COUNT`] values. They are inlined into [`dispatch_simd`], so that the
-//! compiler uses the widest vector instructions of this processor. Multiply-adds are not fused and sums are not
-//! reordered, so a kernel gives the same bits inside and outside [`dispatch_simd`].
+//! compiler uses the widest vector instructions of the processor. Multiplications and additions are not fused, and sums
+//! are not reordered. A kernel therefore gives the same bits inside and outside [`dispatch_simd`].
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// Number of values that a kernel processes side by side.
+/// Number of values that a kernel processes in parallel.
 pub const LANE_COUNT: usize = 8;
 
-/// Vector of one value for each of L parallel computations.
+/// Vector with one value for each of L parallel computations.
 pub type Lanes<const L: usize> = [f64; L];
 
-/// Task that [`dispatch_simd`] runs with vector instructions.
+/// Kernel that [`dispatch_simd`] runs with vector instructions.
 ///
-/// `run` and the functions in its inner loops must be `#[inline(always)]`: code that is not inlined is compiled for the
-/// oldest machine.
+/// `run` and the functions in its inner loops must be `#[inline(always)]`. Code that is not inlined is compiled for the
+/// minimum instruction set.
 pub trait SimdKernel {
-    /// Result type.
+    /// Type of the result.
     type Output;
 
-    /// Run the kernel.
+    /// Run the kernel and return its result.
     fn run(self) -> Self::Output;
 }
 
@@ -39,12 +39,13 @@ impl<K: SimdKernel> WithSimd for PulpKernel<K> {
 
 static USE_PORTABLE: AtomicBool = AtomicBool::new(false);
 
-/// Make [`dispatch_simd`] run kernels compiled for the oldest machine, so that tests can compare both.
+/// If `on`, make [`dispatch_simd`] run kernels with the minimum instruction set, so that tests can compare both
+/// results.
 pub fn force_portable(on: bool) {
     USE_PORTABLE.store(on, Ordering::Relaxed);
 }
 
-/// Run a kernel with the widest vector instructions of this machine.
+/// Run a kernel with the widest vector instructions of the processor and return its result.
 ///
 /// ```
 /// use ftlm::simd::{dispatch_simd, dot, SimdKernel};
@@ -70,7 +71,7 @@ pub fn dispatch_simd<K: SimdKernel>(kernel: K) -> K::Output {
     }
 }
 
-/// Dot product Σ a·b of slices of equal length, accumulated in [`LANE_COUNT`] lanes.
+/// Return the dot product Σ a·b of slices of equal length, accumulated in [`LANE_COUNT`] lanes.
 /// ```
 /// assert_eq!(ftlm::simd::dot(&[1.0, 2.0], &[3.0, 4.0]), 11.0);
 /// ```

@@ -1,4 +1,4 @@
-//! Simulation of models: response, equation and output error, explicit Euler baseline.
+//! Simulation of models: response, equation error, output error, and explicit Euler as a baseline.
 
 use crate::equation::{check_regular, Equation, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
@@ -8,38 +8,39 @@ use crate::regressors::{is_impulse, Record};
 use crate::series;
 use crate::series_system::System;
 
-/// Response with initial terms fitted to the measured outputs.
+/// Response of a model whose initial terms are fitted to the measured outputs.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Response {
     /// Pulse means of each equation's output.
     pub outputs: Vec<Vec<f64>>,
-    /// Exponents of the initial terms, per equation.
+    /// Exponents of t of the initial terms, by equation.
     pub exponents: Vec<Vec<f64>>,
-    /// Coefficients of the initial terms. 0 for a linearly dependent term.
+    /// Coefficients of the initial terms, by equation. The coefficient of a linearly dependent term is 0.
     pub initial: Vec<Vec<f64>>,
 }
 
-/// Filter of measured outputs, and the outputs that it applies to.
+/// Sensor filter, and the outputs to which it applies.
 #[derive(Debug, Clone, Copy)]
 pub struct OutputFilter<'a> {
-    /// The filter as a series.
+    /// Filter as a power series in the one-step delay.
     pub series: &'a [f64],
-    /// Flag of each equation: true if the filter applies to its output.
+    /// For each equation, whether the filter applies to its output.
     pub applies: &'a [bool],
 }
 
-/// Simulation (free run: only inputs and initial conditions are used): pulse means of the outputs.
+/// Simulate equations (free run: only inputs and initial conditions are used). Return the pulse means of their outputs.
 ///
-/// Signals that are not outputs of `equations` are taken from the record: a single equation uses other measured outputs
-/// (measured coupling), a complete system only the inputs. `initial` has (exponent, coefficient) pairs per equation,
-/// empty for zero initial conditions. Integer exponents below 0 are impulses. They are added to the output if they act
-/// on its sensor only: if the record is not filtered, or if the output has a filter transient
-/// ([`Record::with_initial_state`]). An unstable model may overflow, so that values are not finite. O(n² m log² m).
+/// Signals that are not outputs of `equations` are taken from the record. A single equation therefore uses other
+/// outputs as measured, and a complete system uses only the inputs. `initial` holds (exponent, coefficient) pairs of
+/// powers of t by equation; it is empty for zero initial conditions. Integer exponents below 0 denote impulses. An
+/// impulse that acts on the sensor only is added to the output. This is the case if the record is not filtered, or if
+/// the output has a filter transient ([`Record::with_initial_state`]). An unstable model may overflow, so that values
+/// are not finite. O(n² m log² m) for n equations and m pulses.
 ///
 /// # Errors
-/// Invalid orders or signals, missing or nonfinite coefficients, [`Error::LeadingZero`] if the outputs cannot be solved
-/// for.
+/// Errors for invalid orders, signals or coefficients ([`Equation::check`]). [`Error::LeadingZero`] or
+/// [`Error::Structure`] if the equations cannot be solved for their outputs.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -59,7 +60,7 @@ pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64
     build_system(equations, record, initial)?.respond(initial)
 }
 
-/// Build the system of given equations. Return an error for invalid equations.
+/// Build the system of equations on a record. Return an error for invalid equations or initial terms.
 fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, f64)>]) -> Result<System<'a>> {
     for equation in equations {
         equation.check(record.len())?;
@@ -70,7 +71,7 @@ fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(
     for terms in initial {
         let (exponents, coefficients): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
         check_finite("coefficients of the initial terms", &coefficients)?;
-        // Through a filter that is applied afterwards an impulse is an ordinary input.
+        // An impulse that passes a filter afterwards is an ordinary input, so its exponent is not checked.
         Initial::Powers(exponents.into_iter().filter(|&e| !is_impulse(e)).collect()).check()?;
     }
     let system = System::new(equations, record)?;
@@ -78,12 +79,14 @@ fn build_system<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(
     Ok(system)
 }
 
-/// Response of a damped copy of the equations: output series at ρz, ρ = e^{−decay}.
+/// Simulate damped equations: the power series of the system are evaluated at ρz, where z is the one-step delay and ρ =
+/// e^{−decay}. Inputs and initial terms are not damped.
 ///
-/// A large enough decay [1/pulse] makes every model stable. Instruments need to be free of noise, but not exact.
+/// A large enough decay [1/pulse] makes every model stable. Damped responses serve as instruments, which need to be
+/// free of noise but not exact.
 ///
 /// # Errors
-/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
+/// The errors of [`respond`], for invalid equations or equations that cannot be solved for the outputs.
 pub fn respond_damped(
     equations: &[Equation],
     record: &Record,
@@ -93,23 +96,23 @@ pub fn respond_damped(
     build_system(equations, record, initial)?.with_damping(decay).respond(initial)
 }
 
-/// Inverse of the matrix of the equations: `[j][i]` is the response of output j to a unit pulse in the error of
-/// equation i. O(n³ m log² m).
+/// Return the inverse of the matrix of the equations. `[j][i]` is the response of output j to a unit pulse in the error
+/// of equation i. O(n³ m log² m) for n equations and m pulses.
 ///
 /// # Errors
-/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
+/// The errors of [`respond`], for invalid equations or equations that cannot be solved for the outputs.
 pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f64>>>> {
     build_system(equations, record, &[])?.inverse()
 }
 
-/// Response of every output to a unit of each initial term, all other inputs zero.
+/// Return the response of every output to a unit of each initial term, with all other inputs zero.
 ///
-/// `[k][j]` are the pulse means of output j for the k-th pair of an equation and an exponent of t. All responses need
-/// one division, O(n³ m log² m), and one product each. Strongly growing responses are divided one by one, which
-/// preserves the digits of their first terms.
+/// `units` holds (index of the equation, exponent of t) of each initial term. `[k][j]` holds the pulse means of output
+/// j for initial term k. All responses need one division, O(n³ m log² m) for n equations and m pulses, and one product
+/// each. Strongly growing responses are divided one by one, which preserves the digits of their first terms.
 ///
 /// # Errors
-/// [`Error::Structure`] for an equation that does not exist, and as [`respond`].
+/// [`Error::Structure`] for an equation index out of range. The errors of [`respond`] for invalid equations.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -131,10 +134,11 @@ pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, 
     build_system(equations, record, &as_terms(equations.len(), units)?)?.unit_responses(units)
 }
 
-/// Response with zero initial conditions ([`respond`]) and [`unit_responses`], with shared transforms.
+/// Return the response with zero initial conditions ([`respond`]) and the [`unit_responses`]. Both share their
+/// transforms.
 ///
 /// # Errors
-/// [`Error::Structure`] for an initial term of an equation that does not exist; invalid equations as in [`respond`].
+/// [`Error::Structure`] for an equation index out of range in `units`. The errors of [`respond`] for invalid equations.
 #[allow(clippy::type_complexity)]
 pub fn respond_and_units(
     equations: &[Equation],
@@ -145,7 +149,8 @@ pub fn respond_and_units(
     system.rest_and_unit_responses(units)
 }
 
-/// Unit initial terms by equation.
+/// Return the initial terms `units` with coefficient 1, by equation. Return an error for an equation index out of
+/// range.
 fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f64)>>> {
     let mut initial = vec![Vec::new(); equations];
     for &(i, exponent) in units {
@@ -162,11 +167,11 @@ fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f6
 
 /// Simulate with the initial terms that fit the measured outputs best.
 ///
-/// The response is linear in the initial terms. They follow by least squares on the output error, each output weighted
-/// by 1/σ of its measurement, and apply to this record only.
+/// The response is linear in the initial terms. Their coefficients follow by least squares on the output error, with
+/// each output weighted by 1/σ, where σ is the standard deviation of its measurement. They apply to this record only.
 ///
 /// # Errors
-/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
+/// The errors of [`respond`] for invalid equations. [`Error::Length`] for a filter of the wrong length.
 pub fn respond_with_initial(
     equations: &[Equation],
     record: &Record,
@@ -236,12 +241,13 @@ fn weight(y: &[f64]) -> f64 {
     }
 }
 
-/// Equation error ε = y − Σ c_k I^{α−ν_k} s_k − initial terms, with measured signals s.
+/// Return the equation error ε = y − Σ c_k I^{α−ν_k} s_k − initial terms in each pulse, with measured output y and
+/// signals s_k.
 ///
 /// Initial terms are fitted by least squares at the given coefficients.
 ///
 /// # Errors
-/// Invalid orders, signals or coefficients, or equations that cannot be solved for the outputs ([`respond`]).
+/// The errors of [`respond`] for an invalid equation.
 ///
 /// ```
 /// # use ftlm::signal::block_pulse::PulseMeans;
@@ -269,15 +275,15 @@ pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -
     Ok(residuals)
 }
 
-/// Integer-order equations by explicit Euler from zero initial conditions, the baseline of the paper.
+/// Simulate integer-order equations by explicit Euler from zero initial conditions, the baseline of the paper.
 ///
-/// `signals` are point samples of the record's signals at intervals of `step`. Those of the equations' outputs are
-/// ignored. Every α must be an integer, every order of an output an integer below its α, every other order 0. Returns
-/// one sample per row for each equation, not finite if the step is unstable.
+/// `signals` holds point samples of the signals of the record at intervals of `step` \[s\]. Samples of the outputs are
+/// ignored. Every α must be an integer, every order of an output an integer below its α, and every other order 0.
+/// Return the samples of the output of each equation. They are not finite if the step is unstable.
 ///
 /// # Errors
-/// [`Error::Structure`] naming the equation whose orders are not integers, and as [`respond`] for equations, signals,
-/// step.
+/// [`Error::Structure`] with the index of an equation whose orders are not supported. The errors of
+/// [`Equation::check`], and errors for signals of different lengths or an invalid step.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -> Result<Vec<Vec<f64>>> {
     check_step(step)?;
@@ -336,13 +342,14 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
     Ok(out)
 }
 
-/// Output error Σ|y − ŷ|, (45) of the paper, for each row of coefficients of one structure. Initial conditions are
-/// zero.
+/// Return the output error Σ|y − ŷ| between measurement y and simulation ŷ, eq. (45) of the paper, for each row of
+/// coefficients of one structure. Initial conditions are zero. The error is infinite if the simulation overflows.
 ///
-/// It shows the convergence of a recursion. Regressors are computed once; each row costs one division.
+/// The errors show the convergence of a recursive estimate. Regressors are computed once, and each row costs one
+/// division.
 ///
 /// # Errors
-/// Invalid orders or signals, a row of another length.
+/// Errors for invalid orders or signals ([`Structure::check`]). [`Error::Length`] for a row of the wrong length.
 pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -> Result<Vec<f64>> {
     structure.check(record.len(), |_| true)?;
     let m = record.m();
@@ -377,11 +384,13 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
         .collect()
 }
 
-/// Stability margin of the block-pulse scheme at the Nyquist frequency, for own-output terms (coefficient, η = α − ν).
+/// Return the stability margin of the block-pulse scheme at the Nyquist frequency. `own_terms` holds (coefficient c,
+/// integration order η = α − ν) of the terms of the output, and `step` is the pulse length h \[s\].
 ///
-/// The divisor 1 − Σ c F^η at z = −1 is 1 − Σ c h^η A(η)/Γ(η+2) with A(η) = 4(1 − 2^{η+2})·ζ(−η−1), the Abel sum of the
-/// alternating kernel (A(1) = 0, A(2) = −1/2). If it is not positive, the scheme has a mode that grows from pulse to
-/// pulse even for a stable model, and the step must be refined. For D²y = −c y the margin is 1 − c·h²/12.
+/// The scheme divides by 1 − Σ c F^η, where F^η is the power series of I^η. At z = −1 the divisor is 1 − Σ c h^η
+/// A(η)/Γ(η+2) with A(η) = 4(1 − 2^{η+2})·ζ(−η−1), the Abel sum of the alternating kernel (A(1) = 0, A(2) = −1/2). If
+/// it is not positive, the scheme has a mode that grows from pulse to pulse even for a stable model. The step must then
+/// be refined. For D²y = −c y the margin is 1 − c·h²/12.
 ///
 /// ```
 /// let margin = ftlm::simulate::nyquist_margin(&[(-12.0, 2.0)], 0.5);
@@ -395,7 +404,7 @@ pub fn nyquist_margin(own_terms: &[(f64, f64)], step: f64) -> f64 {
         .sum::<f64>()
 }
 
-/// Abel sum A(η) of [`nyquist_margin`] by the functional equation of ζ: A = 4(1 −
+/// Return the Abel sum A(η) of [`nyquist_margin`] by the functional equation of the Riemann zeta function: A = 4(1 −
 /// 2^{s+1})·2^{−s}π^{−s−1}·sin(−πs/2)·Γ(1+s)·ζ(1+s), s = η + 1.
 fn alternating_sum(eta: f64) -> f64 {
     use std::f64::consts::PI;
@@ -405,7 +414,7 @@ fn alternating_sum(eta: f64) -> f64 {
     4.0 * (1.0 - libm::exp2(s + 1.0)) * zeta
 }
 
-/// Riemann zeta function ζ(x), x > 1, by 16 terms and Euler–Maclaurin summation.
+/// Riemann zeta function ζ(x) for x > 1, by Euler–Maclaurin summation with 16 terms.
 fn zeta(x: f64) -> f64 {
     const TERMS: f64 = 16.0;
     let mut sum = 0.0;

@@ -21,45 +21,48 @@ use crate::linalg::{dense, small};
 use crate::parallel::Stop;
 use crate::signal::block_pulse::{delay_samples, delayed_row, Intersample};
 
-/// Input of the equations.
+/// Input of the equations, with its samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct InputSignal {
     /// Index of the signal in the equations.
     pub signal: usize,
     /// Samples, one per row of the record.
     pub samples: Vec<f64>,
-    /// Inter-sample behavior. A linear signal is delayed at its samples and then linear between them.
+    /// Inter-sample behavior. The samples of a linear signal are delayed first, and then interpolated linearly.
     pub between: Intersample,
-    /// Delay in sampling intervals, whole and fractional.
+    /// Delay in sampling intervals, which need not be an integer.
     pub delay: f64,
-    /// Value before the record, for a delayed input.
+    /// Value of a delayed input before the record.
     pub before: f64,
 }
 
-/// Maximum number n of states. A step costs O(n²).
+/// Maximum number n of states. A step of the recursion costs O(n²).
 const MAX_STATES: usize = 128;
-/// Maximum condition number of the matrix of direct terms. Above it the orders of the system depend on a cancellation.
+/// Maximum condition number of the matrix of direct feedthrough terms. Above it, the orders of the system would depend
+/// on a cancellation.
 const MAX_CONDITION: f64 = 1e10;
-/// Tolerance at which a delay d in sampling intervals counts as an integer, relative to max(1, d).
+/// Distance from the nearest integer at which a delay d in sampling intervals counts as an integer, relative to max(1,
+/// d).
 const DELAY_TOLERANCE: f64 = 1e-9;
-/// Number of rows that are computed together between two checks for a stop request.
+/// Number of rows that are computed together. A stop request is checked after each such block.
 const BLOCK_ROWS: usize = 1 << 10;
 /// Magnitude below which a state is set to 0 at the next block, because arithmetic below 1e−308 is slow.
 const MIN_STATE: f64 = 1e-290;
-/// Number of Taylor terms of φ₂(A) for ‖A‖ ≤ 1/2.
+/// Number of Taylor terms for the matrix function φ₂(A), φ₂(z) = (e^z − 1 − z)/z², with ‖A‖ ≤ 1/2.
 const TAYLOR_TERMS: i32 = 15;
 
-/// Samples of the outputs of equations with integer orders, concatenated: `rows` samples for each equation.
+/// Return exact samples of the outputs of equations with integer orders, concatenated: `rows` samples for each
+/// equation.
 ///
-/// The outputs are simulated together, and a signal that is neither output nor input is zero. A sample is the value
-/// just after the inputs of its row have changed. `initial` has (exponent, coefficient) pairs per equation, empty for
-/// zero initial conditions. An unstable model may overflow, so that values are not finite. None if the direct terms are
-/// singular or nearly so, if there are more than 128 states, or if the transition over one interval overflows. O(n²) a
-/// row with n states.
+/// The equations are simulated together. A signal that is neither output nor input is zero. A sample is the value just
+/// after the inputs of its row have changed. `initial` holds (exponent, coefficient) pairs of powers of t by equation;
+/// it is empty for zero initial conditions. An unstable model may overflow, so that values are not finite. The result
+/// is None if direct feedthrough makes the equations (nearly) singular, with more than 128 states, or if the transition
+/// over one interval overflows. O(n²) per row with n states.
 ///
 /// # Errors
-/// Invalid equations, orders or exponents that are not integers or are below 0, samples that are not finite or not as
-/// many as rows, too many rows, [`Error::Interrupted`] after a stop.
+/// Errors for invalid equations, and for orders or exponents that are negative or not integers. Errors for samples that
+/// are not finite or not `rows` in number, and for too many rows. [`Error::Interrupted`] after a stop request.
 ///
 /// ```
 /// use ftlm::equation::{Equation, Structure, Term};
@@ -102,7 +105,8 @@ pub fn respond(
     recursion.run(model.start, rows, stop).map(Some)
 }
 
-/// Convert an order or exponent to an integer; values above [`MAX_STATES`] become [`MAX_STATES`] + 1.
+/// Convert an order or exponent to an integer. Values above [`MAX_STATES`] become [`MAX_STATES`] + 1. Return an error
+/// for a negative value, or a value that is not an integer.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 fn integer(order: f64) -> Result<usize> {
     let nearest = order.round();
@@ -115,21 +119,22 @@ fn integer(order: f64) -> Result<usize> {
     })
 }
 
-/// Continuous state-space model in time units of one sampling interval. Matrices are row-major.
+/// Continuous-time state-space model, with one sampling interval h as the unit of time. Matrices are row-major.
 struct Realization {
     states: usize,
     outputs: usize,
-    /// System matrix h A.
+    /// System matrix h A, where h is the sampling interval.
     system: Vec<f64>,
-    /// Input gains (h B, D) of each input.
+    /// Gains (h B, D) of each input on the states and on the outputs.
     drives: Vec<(Vec<f64>, Vec<f64>)>,
-    /// Output matrix C, a row for each output.
+    /// Output matrix C, one row per output.
     read: Vec<f64>,
     start: Vec<f64>,
 }
 
 impl Realization {
-    /// The balanced state-space model of equations; None if the direct terms are singular, or for too many states.
+    /// Return the balanced state-space model of equations. None if direct feedthrough makes them singular, or for too
+    /// many states.
     fn new(
         equations: &[Equation],
         inputs: &[InputSignal],
@@ -139,13 +144,13 @@ impl Realization {
         let count = equations.len();
         let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
         let mut lengths = vec![0; count];
-        // (equation, integrations, index of the output or count + index of the input, coefficient).
+        // (equation, integration order, index of the output or `count` + index of the input, coefficient).
         let mut terms = Vec::new();
         for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
             for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
                 let of_input = || inputs.iter().position(|u| u.signal == term.signal).map(|q| count + q);
                 let eta = integer(structure.integration(k))?;
-                // A signal without samples is zero.
+                // A signal that is neither output nor input is zero.
                 let Some(source) = outputs.iter().position(|&o| o == term.signal).or_else(of_input) else { continue };
                 if c != 0.0 {
                     terms.push((i, eta, source, c));
@@ -161,7 +166,7 @@ impl Realization {
             return Ok(None);
         }
         let first: Vec<usize> = (0..count).map(|i| lengths[..i].iter().sum()).collect();
-        // Direct terms: (I − E) y = w₁ + F u, F as columns.
+        // Direct feedthrough: (I − E) y = w₁ + F u, with I − E in `tied` and the columns of F in `direct`.
         let mut tied = vec![0.0; count * count];
         let mut direct = vec![vec![0.0; count]; inputs.len()];
         (0..count).for_each(|i| tied[i * count + i] = 1.0);
@@ -209,12 +214,12 @@ impl Realization {
         Ok(Some(model))
     }
 
-    /// Scale the states by powers of two until off-diagonal rows and columns of hA are of equal size (Parlett and
-    /// Reinsch, 1969).
+    /// Scale the states by powers of two until the off-diagonal parts of each row and column of h A have nearly equal
+    /// norms (Parlett and Reinsch, 1969).
     fn balance(&mut self) {
         let n = self.states;
         let mut has_changed = true;
-        // Each sweep reduces the norm, and a reducible matrix stops when its coupling is negligible.
+        // Each sweep reduces the norm. For a reducible matrix, the sweeps end when its coupling is negligible.
         for _ in 0..MAX_STATES {
             if !std::mem::take(&mut has_changed) {
                 break;
@@ -241,7 +246,7 @@ impl Realization {
         }
     }
 
-    /// Recursion over one sampling interval; None if it overflows.
+    /// Return the recursion over one sampling interval; None if it overflows.
     fn discretize<'a>(&self, inputs: &'a [InputSignal]) -> Result<Option<Recursion<'a>>> {
         let n = self.states;
         let Some(interval) = Transition::new(&self.system, n, 1.0) else { return Ok(None) };
@@ -280,7 +285,8 @@ impl Realization {
     }
 }
 
-/// Matrix functions e^M − I, φ₁(M) and φ₂(M) of an n × n matrix, row-major.
+/// Matrix functions e^M − I (`growth`), φ₁(M) (`first`) and φ₂(M) (`second`) of an n × n matrix M, row-major. φ₁ and φ₂
+/// are defined in the module documentation.
 pub(crate) struct Transition {
     pub(crate) growth: Vec<f64>,
     first: Vec<f64>,
@@ -288,7 +294,7 @@ pub(crate) struct Transition {
 }
 
 impl Transition {
-    /// Functions of `share` times the matrix, by scaling and squaring; None if they overflow.
+    /// Compute the functions of M = `share` × `matrix` by scaling and squaring; None if they overflow.
     #[allow(clippy::cast_possible_truncation)]
     pub(crate) fn new(matrix: &[f64], n: usize, share: f64) -> Option<Self> {
         let norm = (0..n).map(|i| (0..n).map(|j| matrix[i * n + j].abs()).sum::<f64>()).fold(0.0_f64, f64::max) * share;
@@ -324,24 +330,25 @@ impl Transition {
     }
 }
 
-/// Matrix exponential e^M of a row-major n × n matrix; None if it overflows.
+/// Return the matrix exponential e^M of a row-major n × n matrix M; None if it overflows.
 pub(crate) fn exponential(matrix: &[f64], n: usize) -> Option<Vec<f64>> {
     let mut growth = Transition::new(matrix, n, 1.0)?.growth;
     growth.iter_mut().step_by(n + 1).for_each(|v| *v += 1.0);
     Some(growth)
 }
 
-/// Effect of an input on the states after one interval. `now` is the gain of the input's value at the start of the
-/// interval, `later` the gain of its next value.
+/// Gains of an input on the states after one interval. `now` multiplies the value of the input at the start of the
+/// interval, and `later` its next value.
 pub(crate) struct InputGains {
     pub(crate) now: Vec<f64>,
     pub(crate) later: Vec<f64>,
 }
 
 impl InputGains {
-    /// Gains of an input with this drive; None if they overflow.
+    /// Gains of an input whose input vector is `drive`; None if they overflow.
     ///
-    /// `fraction` is the part of the interval after which the next value of a zero-order-hold input arrives, 0 without a delay.
+    /// `fraction` is the fraction of the interval after which the next value of a zero-order-hold input takes effect.
+    /// It is 0 without a delay.
     pub(crate) fn new(
         interval: &Transition,
         system: &[f64],
@@ -355,7 +362,7 @@ impl InputGains {
             Intersample::Linear => dense::multiply(&interval.second, drive, n, n, 1),
             Intersample::Hold if fraction == 0.0 => return Some(Self { now: all, later: vec![0.0; n] }),
             Intersample::Hold => {
-                // The next value arrives within the interval and acts over the rest of it.
+                // The next value takes effect within the interval and acts over the rest of it.
                 let rest = 1.0 - fraction;
                 let part = Transition::new(system, n, rest)?;
                 dense::multiply(&part.first, drive, n, n, 1).into_iter().map(|v| v * rest).collect()
@@ -366,16 +373,17 @@ impl InputGains {
     }
 }
 
-/// Input of a recursion.
+/// Input of the recursion.
 struct Channel<'a> {
     samples: Cow<'a, [f64]>,
     /// Number of rows by which the samples are delayed.
     lag: isize,
     before: f64,
-    /// Gains of the value in a row on the next state.
+    /// Gains of the value in the current row on the states in the next row. `later` holds the gains of the value in the
+    /// next row.
     now: Vec<f64>,
     later: Vec<f64>,
-    /// Direct gain on each output.
+    /// Direct feedthrough gain on each output.
     direct: Vec<f64>,
 }
 
@@ -390,9 +398,9 @@ struct Recursion<'a> {
 }
 
 impl Recursion<'_> {
-    /// Samples of the outputs from an initial state.
+    /// Return the samples of all outputs from an initial state, concatenated: `rows` samples for each output.
     fn run(&self, state: Vec<f64>, rows: usize, stop: &Stop) -> Result<Vec<f64>> {
-        // Common numbers of states get loops of constant length.
+        // Loops of constant length are compiled for common numbers of states.
         match self.states {
             1 => self.run_states(1, state, rows, stop),
             2 => self.run_states(2, state, rows, stop),
@@ -449,7 +457,7 @@ impl Channel<'_> {
     }
 }
 
-/// Add gain × input value to each of the `n` states, for every row of a block.
+/// Add gain × input value to each of the `n` states in every row of a block.
 #[inline(always)]
 fn add_forcing(n: usize, gains: &[f64], values: &[f64], forcing: &mut [f64]) {
     let gains = &gains[..n];
@@ -460,16 +468,16 @@ fn add_forcing(n: usize, gains: &[f64], values: &[f64], forcing: &mut [f64]) {
     }
 }
 
-/// Add the output with these gains on the `n` states of each row.
+/// Add Σ gain × state over the `n` states to the sample of an output in each row.
 #[inline(always)]
 fn add_outputs(n: usize, gains: &[f64], history: &[f64], samples: &mut [f64]) {
-    // An output does not depend on a state without gain, which may overflow.
+    // An output does not depend on a state with zero gain, which may overflow.
     for (j, &gain) in gains.iter().enumerate().filter(|&(_, &gain)| gain != 0.0) {
         samples.iter_mut().zip(history.chunks_exact(n.max(1))).for_each(|(y, states)| *y += gain * states[j]);
     }
 }
 
-/// Advance the state by one block of rows; `history` contains the forcing of each row, which is replaced by the state
+/// Advance the state by one block of rows. `history` contains the forcing of each row, which is replaced by the state
 /// at that row.
 #[inline(always)]
 fn advance(n: usize, growth: &[f64], state: &mut [f64], history: &mut [f64]) {

@@ -1,23 +1,27 @@
-//! Friction forces of coupled bodies in one pulse, with a set-valued friction law.
+//! Friction forces of coupled bodies in one pulse, a time step of a simulation, with a set-valued friction law.
 //!
-//! The friction of a single body is a function of its end velocity without friction ([`FrictionLaw::pulse`]), which the
-//! mean forces on the other bodies change: φ_a = T_a(p_a − Σ_{b≠a} G_ab φ_b), e = p − G φ. With Coulomb friction T_a
-//! rises with its argument by at most 1/G_aa, so that friction and end velocity of a body never change in opposite
-//! directions: two solutions have Δe_a Δφ_a ≥ 0 for every a, while Δe = −G Δφ. If G is a P-matrix (all principal minors
-//! are positive, as for an inverse inertia matrix), some a has Δφ_a (G Δφ)_a > 0 unless Δφ = 0. The solution is
-//! therefore unique: exactly one combination of sliding and sticking is consistent. Newton steps find it in a few
-//! iterations. A Newton step without progress is replaced by a Gauss–Seidel sweep over the bodies, which decreases the
-//! error for inertia matrices, because these are symmetric up to scaling.
+//! p_a is the velocity of body a at the end of the pulse without friction, e_a the velocity with friction, and φ_a the
+//! mean friction force. These satisfy e = p − G φ, where G_ab is the decrease of the velocity of body a per unit of
+//! friction force on body b. The friction force of a body is a function T_a of its end velocity without its own
+//! friction ([`FrictionLaw::pulse`]): φ_a = T_a(p_a − Σ_{b≠a} G_ab φ_b).
 //!
-//! Stribeck friction falls with speed. In long pulses several combinations may then be consistent. The iteration starts
-//! at the forces of the previous pulse, and its result is used.
+//! With Coulomb friction, T_a rises with its argument by at most 1/G_aa. Friction and end velocity of a body therefore
+//! never change in opposite directions: two solutions have Δe_a Δφ_a ≥ 0 for every a, while Δe = −G Δφ. If G is a
+//! P-matrix (all principal minors are positive, as for an inverse inertia matrix), some a has Δφ_a (G Δφ)_a > 0 unless
+//! Δφ = 0. The solution is therefore unique: exactly one combination of sliding and sticking is consistent. Newton
+//! steps find it in a few iterations. A Newton step that does not halve the error is replaced by a Gauss–Seidel sweep
+//! over the bodies. The sweep decreases the error for inertia matrices, because these are symmetric up to scaling.
+//!
+//! Stribeck friction falls with speed. In long pulses, several combinations of sliding and sticking may then be
+//! consistent. The iteration starts at the friction forces of the previous pulse, and the solution that it finds is
+//! used.
 
 use super::law::{FrictionLaw, Pulse, PulseDerivatives};
 use crate::error::{Error, Result};
 use crate::linalg::small;
 
-/// Friction problem of coupled bodies: their friction laws, and gains G_ab. G_ab is the decrease of the velocity of
-/// body a at the end of a pulse per unit of friction force on body b.
+/// Friction problem of coupled bodies: friction laws and gains G_ab. G_ab is the decrease of the velocity of body a at
+/// the end of a pulse per unit of friction force on body b.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionProblem {
     laws: Vec<FrictionLaw>,
@@ -25,22 +29,24 @@ pub struct FrictionProblem {
     gains: Vec<f64>,
 }
 
-/// Maximum number of iterations for the friction forces of a pulse. Two weakly coupled bodies need two.
+/// Maximum number of iterations for the friction forces of a pulse. Two weakly coupled bodies need two iterations.
 const MAX_CONTACT_ITERATIONS: usize = 200;
-/// Rounding error relative to the largest velocity without friction. A body does not move under a force that equals
-/// friction within this error.
+/// Rounding error of a velocity, relative to the largest velocity without friction. A body at rest does not move under
+/// a force that equals its friction within this error.
 pub(crate) const VELOCITY_ROUNDING_RATIO: f64 = 1e-12;
-/// Maximum error of a friction force, expressed as the change of velocity it causes relative to the velocities.
+/// Maximum error of a friction force, expressed as the velocity change it causes relative to the velocities of the
+/// pulse.
 pub(crate) const MAX_FRICTION_ERROR_RATIO: f64 = 1e-9;
 
 impl FrictionProblem {
-    /// Friction problem of bodies with these laws and gains.
+    /// Friction problem of bodies with these friction laws. `gains` holds G_ab, row-major.
     ///
     /// # Errors
-    /// [`Error::Diverged`] if the coupling leaves no unique solution of a pulse: the step is too long.
+    /// [`Error::Diverged`] if G is not a P-matrix, so that the friction forces of a pulse are not unique. The step is
+    /// then too long.
     pub fn new(laws: Vec<FrictionLaw>, gains: Vec<f64>) -> Result<Self> {
         if !is_p_matrix(&gains, laws.len()) {
-            // Same error as for a step that is too long, so that an optimizer shortens it.
+            // The optimizer shortens its step after this error.
             return Err(Error::Diverged { what: "friction of coupled bodies; simulation".into(), index: 0 });
         }
         Ok(Self { laws, gains })
@@ -58,13 +64,13 @@ impl FrictionProblem {
         &self.laws[body]
     }
 
-    /// Return G_ab, where a is `body` and b is `other`, which may be the same.
+    /// Return the gain G_ab, where a is `body` and b is `other`. Both may be the same body.
     #[must_use]
     pub fn gain(&self, body: usize, other: usize) -> f64 {
         self.gains[body * self.count() + other]
     }
 
-    /// Return G_aa, where a is `body`.
+    /// Return the gain G_aa, where a is `body`.
     #[must_use]
     pub fn own(&self, body: usize) -> f64 {
         self.gain(body, body)
@@ -76,17 +82,19 @@ impl FrictionProblem {
         self.laws[body].breakaway()
     }
 
-    /// Decrease of the end velocity of a body by the friction forces on the other bodies during a pulse.
+    /// Return the decrease of the end velocity of a body due to the friction forces on the other bodies during a pulse.
     fn coupling_velocity(&self, body: usize, forces: impl Fn(usize) -> f64) -> f64 {
         (0..self.count()).filter(|&b| b != body).map(|b| self.gain(body, b) * forces(b)).sum()
     }
 
-    /// Solve for the friction in a pulse, or in a part of it, that starts at the velocities `v` and would end at `p`
-    /// without friction.
+    /// Solve for the friction forces in a pulse or in an interval of it. `v` holds the velocities of the bodies at its
+    /// start, and `p` the velocities at its end without friction.
     ///
-    /// `length` is the length of the part as a fraction of the pulse; the gains are proportional to it. A body stays at
-    /// rest if the force exceeds its friction by at most `rounding`, in units of velocity. The iteration starts at the
-    /// friction forces `near`. `at` receives the end velocity of each body without its own friction, and its pulse.
+    /// `length` is the length of the interval as a fraction of the pulse; the gains are proportional to it. A body
+    /// stays at rest if the external force exceeds its friction by at most `rounding`, expressed as a velocity change.
+    /// The iteration starts at the friction forces `near`. `at` receives, for each body, the end velocity without its
+    /// own friction, and the solved pulse. Without convergence, the end velocities in the pulses are NaN, except with
+    /// Stribeck friction.
     pub fn solve(
         &self,
         length: f64,
@@ -126,7 +134,8 @@ impl FrictionProblem {
                 (forces, *at, miss) = (ahead, there, left);
                 continue;
             }
-            // Gauss–Seidel sweep over the bodies. It converges if each body moves others less than itself.
+            // Gauss–Seidel sweep over the bodies. It converges if each body affects itself more than it affects the
+            // others.
             for a in 0..n {
                 forces[a] = of(a, &forces).1.force;
             }
@@ -135,21 +144,23 @@ impl FrictionProblem {
         }
         let falls = self.laws.iter().any(|law| law.stribeck > 0.0);
         if !falls && miss > MAX_FRICTION_ERROR_RATIO * size {
-            // NaN counts as overflow: no solution is better than a wrong one.
+            // NaN counts as overflow, which is better than a wrong solution.
             at.iter_mut().for_each(|(_, pulse)| pulse.end = f64::NAN);
         }
     }
 
-    /// Derivative of the friction force of a body in a part of a pulse with respect to its end velocity without
-    /// friction. `at` holds this velocity and the pulse, as [`FrictionProblem::solve`] returns them.
+    /// Return the derivative of a body's friction force in an interval of a pulse with respect to its end velocity
+    /// without friction. `velocity` is its velocity at the start. `at` holds the end velocity and the pulse from
+    /// [`FrictionProblem::solve`].
     #[must_use]
     pub fn force_slope(&self, body: usize, length: f64, velocity: f64, at: &(f64, Pulse)) -> f64 {
         let unit = PulseDerivatives { start: 0.0, free: 1.0, first: 0.0, law: [0.0; 3] };
         self.laws[body].slope(velocity, at.0, length * self.own(body), &at.1, &unit).0
     }
 
-    /// Solution of (1 + `length` diag(slopes) (G − diag G)) x = `vector`: changes of the friction forces of coupled
-    /// bodies, from the changes that each would have alone.
+    /// Return the solution x of (1 + `length` diag(slopes) (G − diag G)) x = `vector`. x holds the changes of the
+    /// friction forces of coupled bodies. `vector` holds the changes that each force would have alone, and `slopes` the
+    /// values of [`FrictionProblem::force_slope`].
     #[must_use]
     pub fn solve_coupled(&self, length: f64, slopes: &[f64], vector: &[f64]) -> Vec<f64> {
         let n = self.count();
@@ -161,13 +172,14 @@ impl FrictionProblem {
         }
         match small::inverse(&matrix, n) {
             Ok(inverse) => (0..n).map(|a| (0..n).map(|b| inverse[a * n + b] * vector[b]).sum()).collect(),
-            // A P-matrix is never singular here. NaN in gives NaN out.
+            // With a P-matrix, the inversion fails only if a value is NaN. The result is then NaN as well.
             Err(_) => vec![f64::NAN; n],
         }
     }
 }
 
-/// True if all principal minors are positive, by recursion over the first pivot and its Schur complement.
+/// True if all principal minors of a row-major n × n matrix are positive. The test is recursive over the first pivot
+/// and its Schur complement.
 #[must_use]
 pub fn is_p_matrix(matrix: &[f64], n: usize) -> bool {
     if n == 0 {

@@ -1,74 +1,77 @@
-//! Coulomb–Stribeck friction in one pulse: F(v) sgn v with F(v) = fc + fs exp(−(v/vs)²), set-valued at rest.
+//! Coulomb–Stribeck friction in one pulse, a time step of a simulation: F(v) sgn v with F(v) = fc + fs exp(−(v/vs)²),
+//! set-valued at rest.
 //!
-//! Within a pulse the velocity is linear in time unless the body is at rest. The friction of the pulse is its mean in
-//! closed form: the mean of the Gaussian is a difference of error functions. A velocity that reaches zero stays zero if
-//! the force is at most the static friction. Otherwise the body reverses at that time, and the mean is continuous
-//! there. F decreases with speed. For long pulses the equation of the end velocity may therefore have several roots.
-//! The root that is closest to the initial velocity is used.
+//! Within a pulse the velocity is linear in time unless the body is at rest. The friction force of the pulse is the
+//! mean of F(v) sgn v in closed form. The mean of the Gaussian is a difference of error functions. A velocity that
+//! reaches zero stays zero if the force is at most the static friction. Otherwise the body reverses its direction. The
+//! mean friction force is continuous across this transition. F decreases with speed, so the equation of the end
+//! velocity may have several roots in long pulses. The root that is closest to the initial velocity is used.
 
 use core::f64::consts::PI;
 
-/// State of a body in a pulse.
+/// Motion of a body in a pulse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// Sliding, without change of sign.
+    /// Sliding without a change of direction.
     Slip,
     /// At rest at the end of the pulse.
     Stick,
-    /// Reversal of direction.
+    /// Sliding with a reversal of direction.
     Turn,
 }
 
-/// Coulomb friction with Stribeck effect.
+/// Friction law of Coulomb friction with Stribeck effect.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrictionLaw {
-    /// Coulomb friction fc, not negative, in the unit of D^α y.
+    /// Coulomb friction fc, not negative, in the unit of the highest derivative D^α y in the equation.
     pub coulomb: f64,
-    /// Stribeck friction fs at rest in addition to fc, not negative.
+    /// Stribeck friction fs, not negative: excess of the static friction over fc.
     pub stribeck: f64,
-    /// Stribeck velocity vs, positive: at this velocity the additional friction is fs/e.
+    /// Stribeck velocity vs, positive: speed at which the excess has fallen to fs/e.
     pub speed: f64,
 }
 
-/// Friction and motion in one pulse.
+/// Friction force and motion of a body in one pulse, which is a time step of a simulation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pulse {
-    /// Mean friction over the pulse, in the unit of D^α y; positive if it opposes a positive velocity.
+    /// Mean friction force over the pulse, in the unit of the highest derivative D^α y in the equation. It is positive
+    /// if it opposes a positive velocity.
     pub force: f64,
-    /// Velocity at the end, exactly 0 at rest.
+    /// Velocity at the end of the pulse, exactly 0 at rest.
     pub end: f64,
-    /// Phase of the body: sliding, at rest, or turning.
+    /// Motion of the body: sliding, at rest, or reversing.
     pub phase: Phase,
 }
 
-/// Derivatives of the quantities of a pulse with respect to a parameter.
+/// Derivatives of velocities, gain and friction law of a pulse with respect to one parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PulseDerivatives {
-    /// Derivative of the velocity at the start.
+    /// Derivative of the velocity at the start of the pulse.
     pub start: f64,
-    /// Derivative of the velocity at the end of the pulse without friction in it.
+    /// Derivative of the velocity at the end of the pulse without friction.
     pub free: f64,
-    /// Derivative of the friction gain: change of the velocity at the end of the pulse per unit of friction force.
+    /// Derivative of the friction gain, which is the decrease of the velocity at the end of the pulse per unit of
+    /// friction force.
     pub first: f64,
-    /// Derivatives of the friction parameters fc, fs and vs.
+    /// Derivatives of Coulomb friction, Stribeck friction and Stribeck velocity.
     pub law: [f64; 3],
 }
 
-/// Mean of the friction force F between two speeds, and its derivatives.
+/// Mean of the friction force F over a speed that changes linearly between two speeds, and its derivatives.
 struct Mean {
     value: f64,
-    /// Derivative with respect to the first speed.
+    /// Derivative of the mean with respect to the first speed.
     from: f64,
-    /// Derivative with respect to the second speed.
+    /// Derivative of the mean with respect to the second speed.
     to: f64,
-    /// Derivatives with respect to fc, fs and vs.
+    /// Derivatives of the mean with respect to Coulomb friction, Stribeck friction and Stribeck velocity.
     law: [f64; 3],
 }
 
-/// Difference of speeds, relative to vs, below which quadrature replaces a difference of error functions. Five points
-/// are then exact, while the difference would lose digits.
+/// Difference of two speeds, relative to the Stribeck velocity, below which quadrature replaces the difference of error
+/// functions. Quadrature with five points is then exact to rounding, while the difference would lose digits.
 const QUADRATURE_SPEED_RATIO: f64 = 0.2;
-/// Gauss–Legendre nodes and weights on [0, 1].
+/// Nodes and weights of the Gauss–Legendre quadrature with five points on [0, 1].
 const GAUSS_LEGENDRE_NODES: [(f64, f64); 5] = [
     (0.046_910_077_030_668, 0.118_463_442_528_094_54),
     (0.230_765_344_947_158_45, 0.239_314_335_249_683_24),
@@ -76,14 +79,15 @@ const GAUSS_LEGENDRE_NODES: [(f64, f64); 5] = [
     (0.769_234_655_052_841_6, 0.239_314_335_249_683_24),
     (0.953_089_922_969_332, 0.118_463_442_528_094_54),
 ];
-/// Maximum number of fixed-point iterations for the end velocity. Each adds a correct digit or more unless two roots
-/// nearly coincide.
+/// Maximum number of fixed-point iterations for the end velocity. Each iteration adds at least one correct digit,
+/// unless two roots nearly coincide.
 const MAX_SLIDE_ITERATIONS: usize = 500;
 
-/// Mean sign, end velocity and state of a pulse with Coulomb friction.
+/// Solve a pulse with Coulomb friction. Return (mean friction force divided by fc, end velocity, phase).
 ///
-/// `v` is the initial velocity, `p` the end velocity without friction, `b` the largest velocity change by friction. A
-/// body stays at rest if the force exceeds friction by at most `rounding`.
+/// `v` is the initial velocity, `p` the end velocity without friction, and `b` the largest velocity change that
+/// friction causes. A body stays at rest if the force exceeds its friction by at most `rounding`, expressed as a
+/// velocity change.
 #[must_use]
 pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
     if v == 0.0 {
@@ -105,20 +109,20 @@ pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
 }
 
 impl FrictionLaw {
-    /// Friction that does not depend on speed.
+    /// Coulomb friction alone: a friction force that does not depend on speed.
     #[must_use]
     pub const fn coulomb(coulomb: f64) -> Self {
         Self { coulomb, stribeck: 0.0, speed: 1.0 }
     }
 
-    /// Breakaway force: largest friction at rest.
+    /// Return the breakaway force fc + fs: the largest friction force at rest.
     #[must_use]
     pub fn breakaway(&self) -> f64 {
         self.coulomb + self.stribeck
     }
 
-    /// Mean of the exponential of the Stribeck term over a velocity that changes linearly between two nonnegative
-    /// speeds.
+    /// Return the mean of exp(−(v/vs)²), with the Stribeck velocity vs, over a speed v that changes linearly from
+    /// `from` to `to`. Both are nonnegative.
     fn share(&self, from: f64, to: f64) -> f64 {
         let (x, d) = (from / self.speed, (to - from) / self.speed);
         if d.abs() < QUADRATURE_SPEED_RATIO {
@@ -143,7 +147,7 @@ impl FrictionLaw {
         } else {
             ((share - gauss(x)) / d, (gauss(x + d) - share) / d)
         };
-        // Function of x and x + d only.
+        // The mean depends on vs only by x and x + d.
         let by_speed = -(x * by_from + (x + d) * by_to) / self.speed;
         let s = self.stribeck;
         Mean {
@@ -154,10 +158,11 @@ impl FrictionLaw {
         }
     }
 
-    /// End velocity of a body with initial velocity v and end velocity p without friction.
+    /// Return the end velocity of a body that slides without reversal, or None if it comes to rest.
     ///
-    /// A unit of friction decreases it by g. None if the body comes to rest. The mean friction decreases with the end
-    /// velocity, so iterates from v are monotone and converge to the nearest root.
+    /// `v` ≥ 0 is the initial velocity, and `p` the end velocity without friction. A unit of friction force decreases
+    /// the end velocity by `g`. The mean friction decreases with the end velocity, so iterates from `v` are monotone
+    /// and converge to the nearest root.
     fn slide(&self, v: f64, p: f64, g: f64) -> Option<f64> {
         let rounding = 4.0 * f64::EPSILON * (v + p.abs());
         let mut end = v;
@@ -175,10 +180,11 @@ impl FrictionLaw {
         Some(end)
     }
 
-    /// Pulse with initial velocity v and end velocity p without friction.
+    /// Return friction force and motion of a body in a pulse.
     ///
-    /// A unit of friction decreases the end velocity by g. A body stays at rest if the force exceeds friction by at
-    /// most `rounding`.
+    /// `v` is the initial velocity, and `p` the end velocity without friction. A unit of friction force decreases the
+    /// end velocity by `g`. A body stays at rest if the force exceeds its friction by at most `rounding`, expressed as
+    /// a velocity change.
     #[must_use]
     pub fn pulse(&self, v: f64, p: f64, g: f64, rounding: f64) -> Pulse {
         if self.stribeck == 0.0 {
@@ -202,13 +208,16 @@ impl FrictionLaw {
         let before = self.mean(0.0, speed);
         let until = speed / (g * before + push);
         let left = 1.0 - until;
-        // From rest: remaining push against remaining friction.
+        // After the reversal, the body starts from rest under the remaining force, against the friction of the
+        // remaining time.
         let back = self.slide(0.0, left * push, left * g).unwrap_or(0.0);
         let force = side * (until * before - left * self.mean(0.0, back));
         Pulse { force, end: -side * back, phase: Phase::Turn }
     }
 
-    /// Return the derivatives of the friction force in a pulse and of the velocity at its end.
+    /// Return the derivatives of the friction force in a pulse and of the velocity at its end with respect to a
+    /// parameter. `v`, `p` and `g` are the arguments of [`FrictionLaw::pulse`], `at` is its result, and `derivatives`
+    /// holds their derivatives.
     #[must_use]
     pub fn slope(&self, v: f64, p: f64, g: f64, at: &Pulse, derivatives: &PulseDerivatives) -> (f64, f64) {
         let of = |mean: &Mean| mean.law.iter().zip(&derivatives.law).map(|(a, b)| a * b).sum::<f64>();

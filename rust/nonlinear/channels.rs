@@ -1,23 +1,23 @@
-//! Channels of equations with non-linear terms, their integral kernels and their forcing.
+//! State channels of equations with non-linear terms, their integral kernels and their forcing.
 
 use super::convolution::{edge_kernel, ConvolutionKernel, MAX_FEEDTHROUGH_ORDER};
 use crate::equation::ORDER_GRAIN;
 use crate::fractional::kernels::kernel_and_slope;
 use crate::signal::block_pulse::PulseJump;
 
-/// Channel of an output that the equations determine.
+/// State channel: a quantity of a simulated output that is solved for in each pulse.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum StateChannel {
-    /// Pulse means of a derivative.
+    /// Pulse means of a derivative of the output.
     Mean {
-        /// Equation of the output.
+        /// Index of the equation of the output.
         equation: usize,
         /// Order of the derivative.
         order: f64,
     },
-    /// Velocity at the ends of pulses minus the initial velocity, on which dry friction acts.
+    /// Velocity of the output at the ends of pulses, minus its initial velocity. Dry friction acts on this channel.
     EndVelocity {
-        /// Equation of the output.
+        /// Index of the equation of the output.
         equation: usize,
     },
 }
@@ -40,7 +40,7 @@ impl StateChannel {
         matches!(self, Self::EndVelocity { .. })
     }
 
-    /// Same channel of the output of another equation.
+    /// Return the same channel for the output of another equation.
     pub(super) fn with_equation(self, equation: usize) -> Self {
         match self {
             Self::Mean { order, .. } => Self::Mean { equation, order },
@@ -55,7 +55,8 @@ impl StateChannel {
     }
 }
 
-/// Kernel of a fractional integral, in pulse means or at the ends of pulses.
+/// Kernel of a fractional integral. Its convolution with pulse means gives pulse means of the integral, or values at
+/// the ends of pulses if `at_ends`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct IntegralKernel {
     pub(super) order: f64,
@@ -63,17 +64,17 @@ pub(super) struct IntegralKernel {
 }
 
 impl IntegralKernel {
-    /// Whether values at pulse ends are averages of neighboring means.
+    /// True if values at pulse ends are averages of neighboring pulse means.
     pub(super) fn is_averaged(self) -> bool {
         self.at_ends && self.order <= MAX_FEEDTHROUGH_ORDER
     }
 
-    /// Kernel of its online convolution.
+    /// Return the kernel for online convolutions over `m` pulses of length `step` \[s\].
     pub(super) fn kernel(self, m: usize, step: f64) -> ConvolutionKernel {
         ConvolutionKernel::of_integral(self.order, self.values_and_slopes(m, step).0)
     }
 
-    /// Kernel values, and their derivatives with respect to the order.
+    /// Return `m` values of the kernel, and their derivatives with respect to the order.
     pub(super) fn values_and_slopes(self, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
         if self.at_ends && !self.is_averaged() {
             edge_kernel(self.order, m, step)
@@ -86,7 +87,7 @@ impl IntegralKernel {
 /// Forcing of the state channels by initial terms and inputs.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ForcingTerms {
-    /// Forcing of each state channel; empty if zero.
+    /// Forcing of each state channel, one value per pulse; empty if zero.
     pub(super) channels: Vec<Vec<f64>>,
     /// Initial output and velocity of each body with friction; empty if zero.
     pub(super) starts: Vec<(f64, f64)>,
@@ -94,14 +95,14 @@ pub(super) struct ForcingTerms {
 
 /// Derivatives of a system with respect to one parameter.
 pub(super) struct SystemDerivatives {
-    /// Derivatives (of the coefficient, of the integration order) of each term, by equation. The last pair belongs to
-    /// the friction force.
+    /// For each equation and term, the derivative of the coefficient and of the integration order. The last pair of an
+    /// equation belongs to the friction force.
     pub(super) terms: Vec<Vec<(f64, f64)>>,
     /// Derivatives of the forcing by initial terms.
     pub(super) forcing: ForcingTerms,
-    /// Derivatives of fc, fs and vs of each friction.
+    /// Derivatives of Coulomb friction, Stribeck friction and Stribeck velocity of each body with friction.
     pub(super) laws: Vec<[f64; 3]>,
-    /// Derivatives of recorded signals that are inputs.
+    /// Derivatives of the inputs that depend on the parameter.
     pub(super) inputs: Vec<InputDerivative>,
 }
 
@@ -111,18 +112,18 @@ pub(super) struct InputDerivative {
     pub(super) signal: usize,
     /// Derivatives of the pulse means.
     pub(super) means: Vec<f64>,
-    /// Derivatives of the share and of the values of each jump within a pulse.
+    /// Derivatives of the position and of the values of each jump within a pulse.
     pub(super) jumps: Vec<PulseJump>,
 }
 
-/// Reason for which a pulse has no solution.
+/// Reason why a pulse has no solution.
 pub(super) enum PulseFailure {
     /// A value overflows.
     Overflow,
-    /// A function has no value for this argument.
+    /// A function has no value: name of the function, and its argument.
     Domain(&'static str, f64),
     /// No friction forces are consistent with the motion.
     Contact,
-    /// No Newton iteration converges.
+    /// The Newton iterations do not converge. The text is the reason.
     Newton(&'static str),
 }

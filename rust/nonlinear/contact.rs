@@ -1,8 +1,8 @@
-//! Dry friction in a simulation: friction force of a pulse, and its derivatives.
+//! Dry friction in a simulation: friction forces of a pulse, and their derivatives.
 //!
-//! The end velocity of a body is e = p − G φ. p is the end velocity without the friction φ, G the linear response
-//! within the pulse. Non-linear terms change p only slightly within a pulse, so the iteration for φ converges in a few
-//! steps.
+//! The velocity of a body at the end of a pulse is e = p − G φ. φ is the friction force, p the end velocity without
+//! friction, and G the decrease of velocity per unit of friction. Non-linear terms change p only slightly within a
+//! pulse, so the iteration for φ converges in a few steps.
 
 use super::channels::{ForcingTerms, PulseFailure, SystemDerivatives};
 use super::jumps::{ForceJumps, Interval};
@@ -11,49 +11,52 @@ use crate::friction::contact::{FrictionProblem, MAX_FRICTION_ERROR_RATIO, VELOCI
 use crate::friction::law::{FrictionLaw, Phase, Pulse as FrictionPulse, PulseDerivatives};
 use crate::linalg::small;
 
-/// Maximum number of iterations in a pulse, each of which solves for the state channels and then for the friction.
+/// Maximum number of iterations in a pulse. Each of them solves for the state channels, then for the friction forces.
 /// Three are usual.
 const MAX_PULSE_ITERATIONS: usize = 60;
-/// Error of a friction force at which the iteration has converged, relative to the velocities.
+/// Error of a friction force at which the iteration has converged, expressed as the velocity change it causes relative
+/// to the velocities of the pulse.
 const FRICTION_ROUNDING_RATIO: f64 = 64.0 * f64::EPSILON;
 
-/// Equations of one pulse with given friction forces.
+/// Equations of one pulse of a simulation, which can be solved at given friction forces.
 pub(super) trait PulseEquations {
     /// True if the state channels are linear in the friction forces.
     fn is_linear(&self) -> bool;
 
-    /// Solve the equations for the state channels with these friction forces.
+    /// Solve the equations for the state channels at the friction forces `frictions`, one per body.
     fn solve_with(&mut self, frictions: &[f64]) -> std::result::Result<(), PulseFailure>;
 
-    /// Value of a state channel.
+    /// Return a mutable reference to the value of a state channel.
     fn channel(&mut self, state: usize) -> &mut f64;
 
-    /// Fix a state channel at a value; None frees it, so that the equations determine it.
+    /// Fix a state channel at a value. With None, the equations determine it.
     fn fix(&mut self, state: usize, value: Option<f64>);
 }
 
 /// Friction problem of a simulation, with the state channels of its bodies.
 pub(super) struct ContactOperators {
-    /// Friction laws, and decrease of the end velocities per unit of each friction force without the non-linear terms.
+    /// Friction laws and gains. A gain is the decrease of a body's velocity at the end of a pulse per unit of friction
+    /// force, without the non-linear terms.
     problem: FrictionProblem,
-    /// State channel of the output of each body.
+    /// Index of the state channel of the output of each body.
     outputs: Vec<usize>,
-    /// State channel of the end velocity of each body.
+    /// Index of the state channel of the velocity of each body at the ends of pulses.
     velocities: Vec<usize>,
     /// Number of state channels.
     states: usize,
-    /// Inverse of the equations of the state channels without non-linear terms.
+    /// Inverse matrix of the equations of a pulse for the state channels, without non-linear terms. Row-major.
     inverse: Vec<f64>,
 }
 
-/// Motion of a body with friction in a simulation.
+/// Motion of one body with friction in a simulation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyMotion {
-    /// Mean friction over each pulse, in the unit of D^α y, at most the breakaway force up to rounding.
+    /// Mean friction force over each pulse, in the unit of the highest derivative D^α y in its equation. Up to
+    /// rounding, its magnitude is at most the breakaway force.
     pub force: Vec<f64>,
-    /// Velocity at the pulse edges, one more than there are pulses. Exactly 0 at rest.
+    /// Velocity at the pulse edges: one value more than there are pulses. Exactly 0 at rest.
     pub velocity: Vec<f64>,
-    /// Phase of the body in each pulse.
+    /// Phase of the body in each pulse: sliding, at rest, or reversing.
     pub phases: Vec<Phase>,
 }
 
@@ -62,13 +65,13 @@ pub struct BodyMotion {
 pub(super) struct BodyState {
     /// Length of the interval as a fraction of the pulse.
     length: f64,
-    /// Change of the velocity that the forces of this interval would cause in a whole pulse without friction.
+    /// Change of velocity in a whole pulse if the forces of this interval acted throughout and there were no friction.
     rate: f64,
-    /// Velocity at the start.
+    /// Velocity at the start of the interval.
     start_velocity: f64,
-    /// Velocity at the end without the friction of the body.
+    /// Velocity at the end of the interval without the body's own friction.
     free_velocity: f64,
-    /// True if the body is at rest in this pulse and in the previous one, so that its mean output is constant.
+    /// True if the body is at rest in the current and the previous pulse, so that its mean output is constant.
     is_resting: bool,
     pulse: FrictionPulse,
 }
@@ -76,55 +79,55 @@ pub(super) struct BodyState {
 /// Motion and friction of each body in each interval of each pulse of a run.
 pub(super) struct ContactStates {
     states: Vec<BodyState>,
-    /// Index of the first state of each pulse, and the number of states.
+    /// Index in `states` of the first state of each pulse. The last entry is the number of states.
     starts: Vec<usize>,
 }
 
 impl ContactStates {
-    /// States of a run without pulses.
+    /// States of a run before its first pulse: an empty list.
     pub(super) fn empty() -> Self {
         Self { states: Vec::new(), starts: vec![0] }
     }
 
-    /// Append a pulse.
+    /// Append the states of one pulse.
     pub(super) fn push(&mut self, states: &[BodyState]) {
         self.states.extend_from_slice(states);
         self.starts.push(self.states.len());
     }
 
-    /// States of a pulse, interval by interval.
+    /// Return the states of one pulse: those of all bodies in its first interval, then in its second, and so on.
     fn of_pulse(&self, pulse: usize) -> &[BodyState] {
         &self.states[self.starts[pulse]..self.starts[pulse + 1]]
     }
 }
 
-/// Derivatives of the bodies with respect to a parameter.
+/// Derivatives of the initial states, gains and friction laws of the bodies with respect to one parameter.
 pub(super) struct BodyDerivatives {
-    /// Initial output and velocity of each body.
+    /// Derivatives of the initial output and velocity of each body.
     pub(super) starts: Vec<(f64, f64)>,
-    /// Derivatives of the gains (a, b), row-major: decrease of the velocity of body a at the end of a pulse per unit of
-    /// the friction force on body b.
+    /// Derivatives of the gains G_ab, row-major. G_ab is the decrease of the velocity of body a at the end of a pulse
+    /// per unit of friction force on body b.
     gains: Vec<f64>,
-    /// Derivatives of fc, fs and vs of each body.
+    /// Derivatives of Coulomb friction, Stribeck friction and Stribeck velocity of each body.
     laws: Vec<[f64; 3]>,
 }
 
-/// Derivatives with respect to a parameter from which those of the friction forces of a pulse follow. Every field is a
-/// derivative.
+/// Derivatives with respect to one parameter of the velocities, gains, friction laws and intervals that determine the
+/// friction forces of a pulse.
 struct PulseInputDerivatives<'a> {
-    /// Velocities at the start.
+    /// Derivatives of the velocities of the bodies at the start of the pulse.
     starts: &'a [f64],
-    /// Velocities at the end without friction.
+    /// Derivatives of the velocities of the bodies at the end of the pulse without friction.
     ends: &'a [f64],
-    /// Gains, as in [`BodyDerivatives`].
+    /// Derivatives of the gains G_ab, as in [`BodyDerivatives`].
     gains: &'a [f64],
-    /// Parameters fc, fs and vs of each body.
+    /// Derivatives of Coulomb friction, Stribeck friction and Stribeck velocity of each body.
     laws: &'a [[f64; 3]],
-    /// Intervals of the pulse.
+    /// Derivatives of the lengths and forces of the intervals of the pulse.
     intervals: &'a [Interval],
 }
 
-/// Workspace of the derivatives of the friction forces of one pulse, one number per body.
+/// Workspace for the derivatives of the friction forces of one pulse. Every vector has one entry per body.
 #[derive(Default)]
 struct DerivativeWorkspace {
     velocities: Vec<f64>,
@@ -135,52 +138,53 @@ struct DerivativeWorkspace {
     ends: Vec<f64>,
 }
 
-/// Derivatives of outputs and velocities of the bodies with respect to a parameter, from pulse to pulse.
+/// Derivatives of the outputs and velocities of the bodies with respect to one parameter. They advance from pulse to
+/// pulse.
 pub(super) struct MotionDerivatives {
     outputs: Vec<f64>,
     velocities: Vec<f64>,
-    /// Velocities at the end of the current pulse without friction.
+    /// Derivatives of the velocities at the end of the current pulse without friction.
     ends: Vec<f64>,
     work: DerivativeWorkspace,
 }
 
 impl MotionDerivatives {
-    /// Derivatives at the start of a run.
+    /// Derivatives of outputs and velocities at the start of a run.
     pub(super) fn start(derivatives: &BodyDerivatives) -> Self {
         let (outputs, velocities): (Vec<f64>, Vec<f64>) = derivatives.starts.iter().copied().unzip();
         Self { ends: vec![0.0; outputs.len()], outputs, velocities, work: DerivativeWorkspace::default() }
     }
 }
 
-/// Responses to friction forces in each pulse of a run, which all parameters share.
+/// Linear responses to the friction forces in each pulse of a run. They are the same for all parameters.
 pub(super) struct ContactResponses {
-    /// Responses of each state channel to each mean friction force, by pulse and body.
+    /// Response of each state channel to a unit of each mean friction force. The indices are pulse, body and channel.
     channels: Vec<f64>,
-    /// Matrix of each pulse, row-major, that turns changes of the mean friction forces without their feedback through
-    /// the state channels into changes with it.
+    /// Matrix of each pulse, row-major. It maps changes of the mean friction forces at fixed state channels to changes
+    /// that include the feedback through the state channels.
     feedback: Vec<f64>,
 }
 
-/// Solver of the friction forces of all bodies, pulse by pulse.
+/// Solver for the friction forces of all bodies, pulse by pulse.
 pub(super) struct ContactSolver<'a> {
     contact: &'a ContactOperators,
     /// Velocities at the start of the run.
     initial_velocities: Vec<f64>,
-    /// Velocities at the start of the pulse.
+    /// Velocities at the start of the current pulse.
     velocities: Vec<f64>,
-    /// Output of each body in the last pulse; true if it was at rest.
+    /// Mean output of each body in the previous pulse, and whether the body was at rest in that pulse.
     last_outputs: Vec<(f64, bool)>,
-    /// True if a body is at rest in this pulse and in the previous one.
+    /// For each body, whether it is at rest in the current and the previous pulse.
     is_resting: Vec<bool>,
-    /// Mean friction forces of the pulse.
+    /// Mean friction force on each body in the current pulse.
     forces: Vec<f64>,
     rounding: Vec<f64>,
-    /// State of each body in each interval of the pulse.
+    /// State of each body in each interval of the current pulse.
     contacts: Vec<BodyState>,
     work: IntervalWorkspace,
 }
 
-/// Workspace of the friction problems of the intervals of a pulse, one entry per body.
+/// Workspace for the friction problems of the intervals of a pulse. Every vector has one entry per body.
 #[derive(Default)]
 struct IntervalWorkspace {
     velocities: Vec<f64>,
@@ -191,9 +195,12 @@ struct IntervalWorkspace {
 }
 
 impl ContactOperators {
-    /// Friction problem of bodies with these friction laws. `channels` holds, for each body, the state channels of its
-    /// output and of its velocity at the end of a pulse. `gains` holds the weight of each source in each state channel
-    /// within a pulse, row-major. The friction forces are the last sources.
+    /// Friction problem of bodies with these friction laws.
+    ///
+    /// `channels` holds, for each body, the state channels of its output and of its velocity at the end of a pulse.
+    /// `gains` holds weights within a pulse, row-major with one row per state channel. Columns are the contributing
+    /// state channels, non-linear terms and friction forces. `states` is the number of state channels. Return an error
+    /// if the equations of a pulse are singular, or if coupled bodies have no unique friction forces.
     pub(super) fn new(
         laws: Vec<FrictionLaw>,
         channels: &[(usize, usize)],
@@ -221,12 +228,12 @@ impl ContactOperators {
         self.problem.count()
     }
 
-    /// State channel of each body's output. It equals the index of the body's equation.
+    /// Return the index of the state channel of each body's output. It equals the index of the body's equation.
     pub(super) fn outputs(&self) -> &[usize] {
         &self.outputs
     }
 
-    /// Motion of each body, from its contact states pulse by pulse.
+    /// Return the motion of each body. `forcing` holds the initial velocities, and `contacts` the states of all pulses.
     pub(super) fn motions(&self, forcing: &ForcingTerms, contacts: &ContactStates) -> Vec<BodyMotion> {
         let of = |(body, start): (usize, &(f64, f64))| {
             let mut motion = BodyMotion { force: Vec::new(), velocity: vec![start.1], phases: Vec::new() };
@@ -243,7 +250,7 @@ impl ContactOperators {
         forcing.starts.iter().enumerate().map(of).collect()
     }
 
-    /// Return the contact solver at the start of a run.
+    /// Return the solver at the start of a run, with the initial outputs and velocities of `forcing`.
     pub(super) fn start(&self, forcing: &ForcingTerms) -> ContactSolver<'_> {
         let initial_velocities: Vec<f64> = forcing.starts.iter().map(|start| start.1).collect();
         let last_outputs = forcing.starts.iter().map(|start| (start.0, true)).collect();
@@ -266,8 +273,8 @@ impl ContactOperators {
         }
     }
 
-    /// Derivatives of the bodies' friction gains, laws and initial states. `gain_derivatives` holds the derivatives of
-    /// the source weights `gains`.
+    /// Return the derivatives of the bodies' gains, friction laws and initial states with respect to a parameter.
+    /// `gains` holds the weights within a pulse ([`ContactOperators::new`]), and `gain_derivatives` their derivatives.
     pub(super) fn derivatives(
         &self,
         gains: &[f64],
@@ -294,7 +301,8 @@ impl ContactOperators {
         Ok(BodyDerivatives { starts, gains: (0..n * n).map(of).collect(), laws })
     }
 
-    /// Write the derivatives of the mean friction forces of a pulse to `work.means`.
+    /// Compute the derivatives of the mean friction force on each body in a pulse and write them to `work.means`. `at`
+    /// holds the solved states of the pulse.
     fn force_derivatives(
         &self,
         at: &[BodyState],
@@ -341,11 +349,11 @@ impl ContactOperators {
         }
     }
 
-    /// Responses of the state channels to the mean friction forces in each pulse, and how these forces respond to each
-    /// other by way of the state channels. `inverses` holds the inverse of the linearized equations of each pulse.
+    /// Return the linear responses to the mean friction forces in each pulse. `inverses` holds the inverse Jacobian of
+    /// the equations of each pulse.
     ///
     /// # Errors
-    /// A singular matrix.
+    /// [`Error::LeadingZero`](crate::error::Error::LeadingZero) for a singular matrix.
     pub(super) fn responses(
         &self,
         contacts: &ContactStates,
@@ -399,9 +407,8 @@ impl ContactOperators {
         Ok(out)
     }
 
-    /// Add the derivatives of the friction forces of a pulse to the derivatives of the sources. Update the derivatives
-    /// of outputs and velocities. `changes` are the derivatives of the intervals of the pulse, `x` those of the sources,
-    /// which are updated in place.
+    /// Compute the derivatives of the friction forces of a pulse, add their effect to the derivatives `x` of all pulse
+    /// means, and update `motion`. `changes` holds the derivatives of the intervals of the pulse.
     pub(super) fn add_friction_derivatives(
         &self,
         (contacts, responses, pulse): (&ContactStates, &ContactResponses, usize),
@@ -439,7 +446,7 @@ impl ContactOperators {
         }
     }
 
-    /// For each body at rest, replace the derivative of its output by the derivative in the last pulse.
+    /// Set the derivative of the output of each body at rest to its value in the previous pulse.
     pub(super) fn fix_resting_outputs(
         &self,
         contacts: &ContactStates,
@@ -456,8 +463,8 @@ impl ContactOperators {
 impl ContactSolver<'_> {
     /// Solve a pulse for its state channels and friction forces.
     ///
-    /// A constant friction cannot balance a force that varies within the pulse, so the mean output of a body at rest
-    /// would drift with the square of the step. The solver keeps it constant from one pulse at rest to the next.
+    /// The mean output of a body at rest is fixed at its value in the previous pulse. It would otherwise drift with the
+    /// square of the step, because a constant friction force cannot balance a force that varies within the pulse.
     pub(super) fn solve(
         &mut self,
         pulse: &mut impl PulseEquations,
@@ -483,7 +490,7 @@ impl ContactSolver<'_> {
         }
     }
 
-    /// True if a body does not move in the whole pulse.
+    /// True if a body is at rest during the whole pulse.
     fn is_at_rest(&self, body: usize) -> bool {
         let mut states = self.contacts.iter().skip(body).step_by(self.contact.count());
         self.velocities[body] == 0.0 && states.all(|state| state.pulse.end == 0.0)
@@ -528,7 +535,8 @@ impl ContactSolver<'_> {
                 break;
             }
             if pulse.is_linear() {
-                // The frictions do not depend on the state channels, which follow from them.
+                // With linear equations, this iteration found the exact friction forces. The state channels follow from
+                // them.
                 pulse.solve_with(&self.forces)?;
                 miss = 0.0;
                 break;
@@ -543,8 +551,8 @@ impl ContactSolver<'_> {
         Ok(())
     }
 
-    /// Solve the friction problem of each interval of the pulse. `free` holds the velocities at its end without
-    /// friction.
+    /// Solve the friction problem of each interval of the pulse. `free` holds the velocity of each body at the end of
+    /// the pulse without friction.
     fn solve_intervals(&mut self, free: &[f64], intervals: &[Interval]) {
         let (problem, n) = (&self.contact.problem, self.contact.count());
         let IntervalWorkspace { velocities, forces, frictionless, rates, at } = &mut self.work;
@@ -557,7 +565,7 @@ impl ContactSolver<'_> {
             for (a, (&free, &start)) in free.iter().zip(&self.velocities).enumerate() {
                 let end = free + (0..n).map(|b| problem.gain(a, b) * pushes[b]).sum::<f64>();
                 rates.push(end - start);
-                // Exactly `free` for a whole pulse.
+                // This value is exactly `free` if the interval is the whole pulse.
                 frictionless.push(length * end + (velocities[a] - length * start));
             }
             problem.solve(*length, (velocities, frictionless), &self.rounding, forces, at);
@@ -575,7 +583,7 @@ impl ContactSolver<'_> {
         }
     }
 
-    /// Advance to the next pulse. Return the contact states of the solved pulse, whose state channels are `z`.
+    /// Advance to the next pulse. `z` holds the state channels of the solved pulse, whose contact states are returned.
     pub(super) fn advance(&mut self, z: &[f64]) -> &[BodyState] {
         for a in 0..self.contact.count() {
             self.last_outputs[a] = (z[self.contact.outputs[a]], self.is_at_rest(a));

@@ -1,29 +1,30 @@
-//! Online convolution, and kernels at the ends of pulses.
+//! Online convolution, and kernels that give values at the ends of pulses.
 //!
-//! As soon as a block of the past is complete, one transform adds its contribution to the following block of equal
-//! length (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6). The cost is O(N log² N). Short blocks are summed
-//! directly. Kernels of integer orders are polynomials in the lag, for which running sums of the signal suffice: O(N).
+//! The signal of an online convolution arrives value by value. When a block of past values is complete, one transform
+//! adds its contribution to the next block of equal length (van der Hoeven, doi:10.1016/S0747-7171(02)90101-6). The
+//! cost is O(N log² N) for N values. Short blocks are summed directly. Kernels of integer orders are polynomials in the
+//! lag, for which running sums of the signal suffice: O(N).
 
 use crate::fractional::kernels::digamma;
 use crate::series::{Buffers, Kernel};
 
-/// Length of a block that is summed directly. Transforms of shorter blocks are slower.
+/// Length of a block that is summed directly. Transforms of shorter blocks are slower than the sum.
 const DIRECT_SUM_LENGTH: usize = 64;
-/// Maximum integer order whose kernel is summed as a polynomial. Running sums of higher orders lose digits on long
+/// Maximum integer order whose kernel is summed as a polynomial. Running sums of higher orders lose digits over long
 /// runs.
 const MAX_POLYNOMIAL_ORDER: usize = 3;
 
-/// Kernel of an online convolution, shared by all signals.
+/// Kernel of online convolutions. One kernel serves any number of signals.
 pub struct ConvolutionKernel {
     values: Vec<f64>,
     memory: Memory,
 }
 
-/// Representation of a kernel for the sum over the past.
+/// Form of a kernel for sums over past values.
 enum Memory {
-    /// Spectra of the first values of the kernel, each twice as long as the previous one.
+    /// Spectra of the first values of the kernel. Each spectrum covers twice as many values as the previous one.
     Blocks(Vec<Kernel>),
-    /// Coefficients of the polynomials 1, n, n(n + 1)/2, … of the lag n whose sum is the kernel from lag 1 on.
+    /// Coefficients of the kernel in the polynomials 1, n, n(n + 1)/2, … of the lag n ≥ 1.
     Polynomial(Vec<f64>),
 }
 
@@ -41,8 +42,8 @@ impl ConvolutionKernel {
         Self { values, memory: Memory::Blocks(spectra) }
     }
 
-    /// Kernel of the integral I^order, whose values are given. For integer orders it is a polynomial in the lag from
-    /// lag 1 on. Running sums then replace the transforms up to order 3.
+    /// Kernel of the fractional integral of the given order. `values` holds the kernel from lag 0 on. For an integer
+    /// order up to 3, the kernel is a polynomial from lag 1 on, and running sums replace the transforms.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn of_integral(order: f64, values: Vec<f64>) -> Self {
@@ -50,7 +51,7 @@ impl ConvolutionKernel {
         if order != degrees as f64 || degrees > MAX_POLYNOMIAL_ORDER || values.len() <= degrees {
             return Self::new(values);
         }
-        // The j-th backward difference of C(n + i − 1, i) at n = 0 is 1 for j = i and 0 for others; the polynomial is
+        // The j-th backward difference of C(n + i − 1, i) at n = 0 is 1 for j = i and 0 otherwise. The polynomial is
         // extended to n ≤ 0 by its differences at 1, 2, ….
         let mut differences: Vec<f64> = values[1..=degrees].to_vec();
         for level in 1..degrees {
@@ -73,7 +74,7 @@ impl ConvolutionKernel {
         Self { values, memory: Memory::Polynomial(coefficients) }
     }
 
-    /// Values of the kernel.
+    /// Values of the kernel from lag 0 on.
     #[must_use]
     pub fn values(&self) -> &[f64] {
         &self.values
@@ -83,8 +84,8 @@ impl ConvolutionKernel {
 /// Online convolution of one signal with a kernel.
 pub struct OnlineConvolution<'a> {
     kernel: &'a ConvolutionKernel,
-    /// Part of each future value of the convolution that the past determines. For a polynomial kernel, the sums Σ_j C(k
-    /// − j + i − 1, i) x_j.
+    /// Contribution of the past values to each future value of the convolution. For a polynomial kernel, the running
+    /// sums Σ_j C(k − j + i − 1, i) x_j for i = 0, 1, …, where k is the next index.
     sums: Vec<f64>,
     signal: Vec<f64>,
     buffers: Buffers,
@@ -143,7 +144,8 @@ impl<'a> OnlineConvolution<'a> {
     }
 }
 
-/// Kernel of I^η, η > 0, from pulse means to values at the ends of pulses, and its derivative with respect to η.
+/// Return the kernel of the integral I^η, η > 0, and its derivative with respect to η, `m` values each. The kernel maps
+/// pulse means to values at the ends of pulses of length `step` \[s\].
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
@@ -163,18 +165,19 @@ pub(crate) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
         .unzip()
 }
 
-/// Integration order below which a signal has direct feedthrough to the velocity at an edge, as the mean of the
-/// neighboring pulses.
+/// Integration order up to which a signal has direct feedthrough to the velocity at a pulse edge. The mean of the two
+/// neighboring pulses is then its value at the edge.
 pub(crate) const MAX_FEEDTHROUGH_ORDER: f64 = 1e-6;
 
-/// Convolution of `series` with a kernel whose spectrum is cached, truncated to the length of `series`.
+/// Return the convolution of `series` with a signal whose spectrum is `cached`, truncated to the length of `series`.
 pub(crate) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; series.len()];
     cached.apply(series, &mut out, &mut Buffers::default());
     out
 }
 
-/// Values at pulse ends from means: averages of neighboring pulses, the last value extrapolated.
+/// Return values at the ends of pulses from pulse means: the averages of neighboring means. The last value is
+/// extrapolated linearly.
 pub(crate) fn average_neighbors(means: &[f64]) -> Vec<f64> {
     let m = means.len();
     let mut out: Vec<f64> = means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();

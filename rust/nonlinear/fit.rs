@@ -1,6 +1,6 @@
-//! Output-error fit of systems with non-linear terms or friction, by Levenberg–Marquardt.
+//! Output-error fit of systems with non-linear terms or friction, by the Levenberg–Marquardt method.
 //!
-//! Orders, coefficients, free parameters of inputs, and the initial states of each run are optimized together.
+//! Orders, coefficients, input parameters, and the initial states of each run are optimized together.
 
 use super::model::{Evaluation, NonlinearModel, Point};
 use crate::error::{check_finite, check_length, Error, Result};
@@ -13,13 +13,13 @@ use crate::parallel::Stop;
 /// Initial guess of a fit.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Start {
-    /// Free orders.
+    /// Values of the free orders.
     pub orders: Vec<f64>,
-    /// Free coefficients.
+    /// Values of the free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free parameters of inputs.
+    /// Values of the free input parameters: delays, saturation and dead-zone limits.
     pub inputs: Vec<f64>,
-    /// Initial states of each run. If empty, they are estimated at the initial guess.
+    /// Initial states of each run. They are estimated at the initial guess if their number is not that of the model.
     pub states: Vec<Vec<f64>>,
 }
 
@@ -27,21 +27,22 @@ pub struct Start {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct NonlinearFit {
-    /// Free orders.
+    /// Values of the free orders.
     pub orders: Vec<f64>,
-    /// Free coefficients.
+    /// Values of the free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free parameters of inputs.
+    /// Values of the free input parameters: delays, saturation and dead-zone limits.
     pub inputs: Vec<f64>,
     /// Initial states of each run.
     pub states: Vec<Vec<f64>>,
-    /// Initial terms of the states, (exponent, coefficient), by run and equation.
+    /// Powers of t that the initial states add, as (exponent, coefficient), by run and equation.
     pub initial: Vec<Vec<Vec<(f64, f64)>>>,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
     /// Residuals with weights, run after run.
     pub residuals: Vec<f64>,
-    /// Derivatives with respect to orders, coefficients and inputs, after projecting out the states.
+    /// Derivatives of the residuals with respect to orders, coefficients and input parameters, one column each. The
+    /// span of the derivatives with respect to the initial states is projected out.
     pub jacobian: Vec<Vec<f64>>,
     /// Number of residual evaluations.
     pub evaluations: usize,
@@ -114,7 +115,8 @@ impl LeastSquaresProblem for OutputError<'_> {
             .map_or(1.0, |j| self.model.model.coordinates[j].derivative(point.coefficients[j]))
     }
 
-    /// Orders, input parameters and forces of friction have bounds.
+    /// Return the distances of a parameter from its lower and upper bound, infinite without a bound. Orders, input
+    /// parameters and friction forces have bounds.
     fn distance_to_bounds(&self, point: &Point, parameter: usize) -> (f64, f64) {
         if let Some(order) = point.orders.get(parameter) {
             let (low, high) = self.model.model.order_bounds[parameter];
@@ -141,7 +143,7 @@ impl LeastSquaresProblem for OutputError<'_> {
     }
 }
 
-/// Least-squares problem of the initial state of one run with all other parameters fixed.
+/// Least-squares problem for the initial state of one run, with all other parameters fixed.
 struct InitialStateProblem<'a> {
     model: &'a NonlinearModel,
     experiment: &'a Experiment,
@@ -196,15 +198,18 @@ impl LeastSquaresProblem for InitialStateProblem<'_> {
 /// Termination criteria of the estimation of an initial state.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 30, tolerance: 1e-6 };
 
-/// Fractions of a run, from its first sample on, that are fitted one after another before the whole run.
+/// Fractions of a run, from its first sample on, to which the initial state is fitted one after another before the
+/// whole run.
 ///
-/// Over a long run the cost has local minima in the initial state, with a wrong phase or a wrong number of oscillations
-/// before a body sticks. Over the first part it has one minimum.
+/// Over a long run, the cost has local minima in the initial state. They have a wrong phase, or a wrong number of
+/// oscillations before a body sticks. Over the first fraction, the cost has one minimum.
 const BEGINNING_SHARES: [f64; 3] = [0.125, 0.25, 0.5];
 
-/// Estimate the initial state of a run with fixed parameters. Local optimizations start from guesses by the first
-/// samples, or from the initial state that fits the first eighth, quarter and half of the run. The best result is
-/// returned.
+/// Estimate the initial state of a run, with all other parameters fixed.
+///
+/// Local optimizations start from guesses based on the first samples. Another one starts from the state fitted to the
+/// first eighth, then quarter, then half of the run. The best result is returned, or the first guess if all
+/// optimizations fail.
 fn estimate_initial_state(
     model: &NonlinearModel,
     (orders, coefficients, inputs): (&[f64], &[f64], &[f64]),
@@ -231,14 +236,14 @@ fn estimate_initial_state(
         match minimize(&problem, guess, INITIAL_STATE_SETTINGS) {
             Ok(found) if found.cost < best.0 => best = (found.cost, found.point),
             Err(Error::Interrupted) => return Err(Error::Interrupted),
-            // A start with a simulation that overflows is skipped.
+            // An initial guess whose simulation fails is skipped.
             _ => {}
         }
     }
     Ok(best.1)
 }
 
-/// Weights of the compared samples: 1 in the first part of a run, 0 after it.
+/// Return the weight of each compared sample of each output: 1 in the first fraction `share` of the run, 0 after it.
 #[allow(clippy::cast_precision_loss)]
 fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
     let count = experiment.compared_count();
@@ -246,11 +251,12 @@ fn beginning_weights(experiment: &Experiment, share: f64) -> Vec<Vec<f64>> {
     vec![(0..count).map(weight).collect(); experiment.samples.len()]
 }
 
-/// Fit of the output error by weighted least squares, from an initial guess.
+/// Fit the parameters by weighted least squares of the output error, from an initial guess.
 ///
 /// # Errors
-/// An initial guess whose simulation fails ([`Error::Diverged`], [`Error::NoSolution`]); an inconsistent model, or
-/// experiments that do not match it ([`NonlinearModel::check`]); [`Error::Interrupted`].
+/// [`Error::Diverged`] or [`Error::NoSolution`] if the simulation of the initial guess fails. [`Error::Length`] or
+/// [`Error::NotFinite`] for an initial guess of the wrong length or with a value that is not finite. The errors of
+/// [`NonlinearModel::check`] for an inconsistent model. [`Error::Interrupted`] after a stop request.
 pub fn fit(
     model: &NonlinearModel,
     experiments: &[Experiment],
@@ -315,6 +321,6 @@ pub fn fit(
     })
 }
 
-/// Relative distance of the response to an initial state from the span of other responses, below which it is linearly
-/// dependent.
+/// Distance of the response to an initial state from the span of other responses, relative to its norm. Below this
+/// value the response counts as linearly dependent.
 const DEPENDENCE_TOLERANCE: f64 = 1e-12;

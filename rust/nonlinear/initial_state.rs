@@ -1,4 +1,4 @@
-//! Initial states and constant forces of a run, as powers of t that enter outputs and velocities.
+//! Initial states and constant forces of a run, as powers of t in outputs and velocities.
 
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
@@ -6,34 +6,36 @@ use crate::fractional::kernels::{kernel, power_means};
 use crate::linalg::small;
 use crate::regressors::is_impulse;
 
-/// Coupling term: a term of an equation whose signal is a simulated output.
+/// Coupling term: term of an equation whose signal is a simulated output.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Link {
-    /// Equation of the output.
+    /// Index of the equation that simulates the signal.
     pub(super) output: usize,
     pub(super) order: f64,
-    /// Integration order: α of the equation minus the order of the term.
+    /// Integration order: order α of the equation minus order of the term.
     pub(super) integration: f64,
     pub(super) coefficient: f64,
 }
 
-/// Effect of initial terms on each output at the ends of pulses: initial output and velocity, and forcing of the
-/// velocity.
+/// Effect of initial terms on outputs and on velocities at the ends of pulses. Every field has one entry per output.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct EndVelocityForcing {
-    /// Contribution to the velocity at pulse ends, relative to the initial velocity.
+    /// Contribution of the initial terms to the velocity of each output at the end of each pulse, minus the initial
+    /// velocity.
     pub(super) velocities: Vec<Vec<f64>>,
-    /// Initial velocities.
+    /// Velocity of each output at t = 0.
     pub(super) initial_velocities: Vec<f64>,
-    /// Initial outputs.
+    /// Value of each output at t = 0.
     pub(super) initial_outputs: Vec<f64>,
 }
 
 impl EndVelocityForcing {
-    /// Forcing by powers of t in the outputs, given as (exponent, coefficient) by equation, with coupling terms.
+    /// Effect of powers of t in the outputs. `powers` holds (exponent, coefficient) of each power, by equation, and
+    /// `links` the coupling terms of each equation.
     ///
-    /// A coupling term integrates an initial level x₀ of its signal, including the jump to that level: it adds c x₀
-    /// t^{η−1}/Γ(η) to the velocity. An initial velocity v₀ of the signal adds c v₀ t^η/Γ(η + 1).
+    /// A coupling term with coefficient c and integration order η integrates the initial level x₀ of its signal,
+    /// including the jump to that level. It adds c x₀ t^{η−1}/Γ(η) to the velocity. An initial velocity v₀ of the
+    /// signal adds c v₀ t^η/Γ(η + 1).
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] if the
@@ -82,7 +84,7 @@ impl EndVelocityForcing {
     }
 }
 
-/// Sum of powers of t with distinct exponents.
+/// Sum of powers of t with distinct exponents: (exponent, coefficient, largest magnitude of an added coefficient).
 #[derive(Debug, Clone, Default)]
 pub(super) struct PowerSum(Vec<(f64, f64, f64)>);
 
@@ -94,16 +96,17 @@ impl PowerSum {
         }
     }
 
-    /// (exponent, coefficient) of the powers that do not cancel up to rounding.
+    /// Iterate over the powers as (exponent, coefficient). Powers that cancel up to rounding are omitted.
     pub(super) fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
         self.0.iter().filter(|r| r.1.abs() > 1e-13 * r.2).map(|r| (r.0, r.1))
     }
 }
 
-/// Return the powers of t in the derivative D^ρ of an output as (exponent, coefficient). `order` is ρ, and `powers`
-/// holds the powers of t in every output.
+/// Return the powers of t in the derivative D^ρ of an equation's output as (exponent, coefficient). `order` is ρ, and
+/// `powers` holds the powers of t in every output. Return an error if the derivative has no mean over the first pulse.
 ///
-/// D^ρ I^η y equals I^η D^ρ y plus powers of t from y(0), y′(0), …. These cancel the powers of Caputo's initial terms.
+/// With the fractional integral I^η, the derivative D^ρ I^η y equals I^η D^ρ y plus powers of t from y(0), y′(0), ….
+/// These cancel the powers of the initial terms of Caputo derivatives.
 pub(super) fn derivative_powers(
     equation: usize,
     order: f64,
@@ -150,7 +153,8 @@ pub(super) fn derivative_powers(
     Ok(out)
 }
 
-/// Pulse means of t^e. For negative exponents they are derivative kernels applied to a step.
+/// Return `m` pulse means of t^e, where e is `exponent`. For e < 0 they are Γ(e + 1) times the derivative of order −e
+/// of a unit step.
 pub(super) fn power_term_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     if exponent >= 0.0 {
         return power_means(exponent, m, step);
@@ -163,7 +167,8 @@ pub(super) fn power_term_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     kernel(exponent, m, step).into_iter().map(summed).collect()
 }
 
-/// Initial outputs or velocities from the given values, with direct feedthrough between equations.
+/// Solve x = `given` + C x for the initial outputs or velocities x of all equations. C holds the coefficients of the
+/// terms with direct feedthrough (integration order 0). Return an error if the equations do not determine x.
 pub(super) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
     let n = given.len();
     if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
@@ -180,31 +185,32 @@ pub(super) fn solve_feedthrough(given: &[f64], links: &[Vec<Link>]) -> Result<Ve
     Ok((0..n).map(|i| (0..n).map(|j| inverse[i * n + j] * given[j]).sum()).collect())
 }
 
-/// Free initial state of a run: a combination of powers of t in one equation.
+/// Free initial state of a run, which adds powers of t to the outputs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum InitialTerm {
-    /// Initial level of the output.
+    /// Initial level of the output of the equation with this index.
     Level(usize),
-    /// Initial velocity of the output.
+    /// Initial velocity of the output of the equation with this index.
     Rate(usize),
-    /// Power of t of a term whose signal does not start at 0.
+    /// Power of t that is due to the initial value of an input, or of a derivative of it.
     Jump {
-        /// Equation and term.
+        /// Indices of the equation and of the term in it.
         at: (usize, usize),
-        /// Number of derivatives of the signal.
+        /// Order of the derivative of the input whose initial value enters: 0 for the input itself.
         more: u32,
     },
-    /// Constant on the right-hand side (0) or ramp (1).
+    /// Constant (0) or ramp (1) on the right-hand side of the equation with the first index.
     Offset(usize, u32),
-    /// Power of t that was requested. −1, −2, …: impulse of an output's filter and its derivatives.
+    /// Explicit exponent of t in the output of the equation with this index. The exponents −1, −2, … denote an impulse,
+    /// and derivatives of an impulse, at the sensor filter of the output.
     Power(usize, f64),
 }
 
 impl InitialTerm {
-    /// Initial states of a run.
+    /// Return the initial states of a run.
     ///
-    /// `free(i, k)` is true if the integration order of term k of equation i depends on a free order. Each output with
-    /// a filter (`filtered`, empty if none) also has the transients of the filter.
+    /// `free(i, k)` is true if the integration order of term k of equation i depends on a free order. `filtered` flags
+    /// the outputs with a sensor filter, whose transients are additional states. It is empty without filters.
     pub(super) fn all(
         equations: &[Equation],
         initial: &Initial,
@@ -244,14 +250,14 @@ impl InitialTerm {
         all
     }
 
-    /// True if the state affects only the filter of an output.
+    /// True if the state affects only the sensor filter of an output.
     pub(super) fn is_impulse(&self) -> bool {
         matches!(self, Self::Power(_, e) if is_impulse(*e))
     }
 
-    /// Powers of t in the outputs per unit of this state, as (equation, exponent, coefficient).
+    /// Return the powers of t in the outputs per unit of this state, as (equation, exponent, coefficient).
     pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
-        // Caputo derivatives of a constant are 0, so only terms of order 0 respond to a level.
+        // Caputo derivatives of a constant are zero, so only terms of order 0 respond to a level.
         let unseen = |output: usize, whole: f64| {
             let mut all = vec![(output, whole, 1.0)];
             for (i, row) in links.iter().enumerate() {
@@ -275,7 +281,8 @@ impl InitialTerm {
     }
 }
 
-/// Merge the powers of t of several states by equation and exponent.
+/// Sum powers of t, given as (equation, exponent, coefficient), by equation and exponent. Return (exponent,
+/// coefficient) for each of `n` equations, with ascending exponents.
 pub(super) fn merge_powers(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
     let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
     for (i, exponent, value) in parts {

@@ -1,9 +1,9 @@
 //! Jumps of the forces on bodies with friction within a pulse.
 //!
-//! A zero-order hold behind a delay that is no whole number of pulses jumps within pulses. A body at rest stays there
-//! until the jump and slides after it, which the mean force of the pulse cannot show. The friction of such a pulse is
-//! therefore computed interval by interval between the jumps. Only terms c u of inputs u are treated
-//! this way. Inputs that are differentiated or in non-linear terms are replaced by their pulse means.
+//! An input with zero-order hold and a delay that is not a multiple of the pulse length jumps within pulses. A body may
+//! rest until the jump and slide after it, which the mean force of the pulse does not represent. The friction of such a
+//! pulse is therefore computed interval by interval between the jumps. Only terms c u of inputs u are treated this way.
+//! Inputs that are differentiated or enter non-linear terms are replaced by their pulse means.
 
 use std::borrow::Cow;
 
@@ -12,49 +12,50 @@ use super::system::NonlinearSystem;
 use crate::equation::ORDER_GRAIN;
 use crate::regressors::Record;
 
-/// Interval of a pulse between jumps, or its derivative with respect to a parameter.
+/// Interval of a pulse between two jumps, or the derivative of such an interval with respect to a parameter.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Interval {
     /// Length as a fraction of the pulse.
     pub(super) length: f64,
-    /// External force on each body minus its mean over the pulse, in the unit of D^α y.
+    /// External force on each body minus its mean over the pulse, in the unit of the highest derivative D^α y in the
+    /// equation of the body.
     pub(super) forces: Vec<f64>,
 }
 
-/// Jump of an input within a pulse.
+/// Jump of an input by `size` in the pulse with index `pulse`. `share` is the fraction of the pulse before the jump.
 #[derive(Debug, Clone, Copy)]
 struct InputJump {
     pulse: usize,
     share: f64,
     size: f64,
     signal: usize,
-    /// Index of the jump among those of its signal.
+    /// Index of the jump among the jumps of its signal.
     index: usize,
 }
 
-/// Term c u of the equation of a body: input u acts on it with the force c u.
+/// Term c u of the equation of a body: the input u acts on the body with the force c u.
 #[derive(Debug, Clone, Copy)]
 struct InputForce {
     signal: usize,
     body: usize,
-    /// Index of the equation and of the term in it.
+    /// Indices of the equation and of the term in it.
     at: (usize, usize),
     coefficient: f64,
 }
 
 /// Jumps of the forces on the bodies of a system.
 pub(super) struct ForceJumps {
-    /// Jumps in the sequence of time.
+    /// Jumps in chronological order.
     jumps: Vec<InputJump>,
     forces: Vec<InputForce>,
-    /// Intervals of a pulse without jumps: one of length 1.
+    /// Intervals of a pulse without jumps: one interval of length 1.
     whole: [Interval; 1],
-    /// Derivatives of these intervals, which are zero.
+    /// Derivatives of `whole`: zero.
     whole_derivative: [Interval; 1],
 }
 
 impl ForceJumps {
-    /// Collect the jumps of those inputs of a record that act as forces on bodies.
+    /// Collect the jumps of the inputs of a record that act as forces on bodies with friction.
     pub(super) fn new(system: &NonlinearSystem, record: &Record) -> Self {
         let mut forces = Vec::new();
         for (body, &(i, _)) in system.frictions.iter().enumerate() {
@@ -91,7 +92,7 @@ impl ForceJumps {
         &self.jumps[first..first + count]
     }
 
-    /// Intervals of a pulse between its jumps.
+    /// Return the intervals of a pulse between its jumps.
     pub(super) fn intervals(&self, pulse: usize) -> Cow<'_, [Interval]> {
         let jumps = self.of_pulse(pulse);
         if jumps.is_empty() {
@@ -102,7 +103,7 @@ impl ForceJumps {
         Cow::Owned(self.split(jumps, |jump| jump.share, 1.0, size, mean))
     }
 
-    /// Derivatives of the intervals of a pulse with respect to a parameter.
+    /// Return the derivatives of the intervals of a pulse with respect to a parameter.
     pub(super) fn interval_derivatives(&self, pulse: usize, derivatives: &SystemDerivatives) -> Cow<'_, [Interval]> {
         let jumps = self.of_pulse(pulse);
         if jumps.is_empty() {
@@ -121,11 +122,12 @@ impl ForceJumps {
         Cow::Owned(self.split(jumps, |jump| slope(jump).0, 0.0, size, mean))
     }
 
-    /// Intervals of a pulse with these jumps. If the functions return derivatives, the result is the derivatives of the
-    /// intervals.
+    /// Split a pulse at its jumps and return the intervals. If the functions return derivatives, the result holds the
+    /// derivatives of the intervals.
     ///
-    /// `place` is the position of a jump, `end` that of the end of the pulse. `size` is the step of a force at a jump,
-    /// `mean` the contribution of this step to the mean of the force.
+    /// `place` returns the position of a jump as a fraction of the pulse, and `end` is the position of the end of the
+    /// pulse. `size` returns the change of a force at a jump. `mean` returns the contribution of this change to the
+    /// mean force.
     fn split(
         &self,
         jumps: &[InputJump],

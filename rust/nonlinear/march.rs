@@ -1,11 +1,11 @@
-//! Simulation of equations with non-linear terms, pulse by pulse, and its sensitivities.
+//! Simulation of equations with non-linear terms, pulse by pulse, and its sensitivities to parameters.
 //!
-//! A state channel is an output, or a derivative D^ρ of an output that enters an expression. Its pulse means z are the
-//! sum of L and of κ_η ∗ (w x) over all terms. L is the part due to inputs and initial terms, κ_η the kernel of I^η, and
-//! x a channel of a linear term or the value of an expression, with weight w. The autoregressive terms are not inverted,
-//! so no kernel grows exponentially, and an unstable linear part loses no digits. The scheme is implicit; Newton
-//! iterations that start at the last pulse solve it. Sensitivities obey the same sums, linearized at the simulation, and
-//! need no iteration.
+//! A state channel is an output, or a derivative D^ρ of an output that enters an expression. Its pulse means are L + Σ
+//! κ_η ∗ (w x), summed over the terms of its equation. L is the part due to inputs and initial terms. κ_η is the kernel
+//! of the fractional integral I^η. w is the coefficient of the term, and x a state channel or the value of an
+//! expression. The autoregressive terms are not inverted, so no kernel grows exponentially, and an unstable linear part
+//! loses no digits. The scheme is implicit. Newton iterations solve each pulse, starting from an extrapolation of the
+//! last two pulses. Sensitivities satisfy the same equations, linearized at the simulation, and need no iteration.
 
 use super::channels::{ForcingTerms, IntegralKernel, PulseFailure, StateChannel, SystemDerivatives};
 use super::contact::{
@@ -24,24 +24,25 @@ use crate::linalg::small;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 
-/// Maximum number of Newton iterations of a pulse. Three are usual.
+/// Maximum number of Newton iterations in a pulse. Three are usual.
 const MAX_NEWTON_ITERATIONS: usize = 50;
-/// Maximum number of halvings of a Newton step that does not reduce the residual.
+/// Maximum number of times that a Newton step is halved if it does not reduce the residual.
 const MAX_STEP_HALVINGS: usize = 12;
-/// Newton step at which the iteration has converged, relative to the terms of the channel. Convergence is quadratic, so
-/// the next step would be below rounding error. The linearization before this step has this relative error.
+/// Newton step at which the iteration has converged, relative to the sum of the magnitudes of the channel's terms.
+/// Convergence is quadratic, so the next step would be below rounding error. The Jacobian is computed before this step
+/// and therefore has a relative error of this size.
 const NEWTON_TOLERANCE: f64 = 1e-8;
-/// Residual of a channel that is rounding error, relative to its terms.
+/// Rounding error of the residual of a channel, relative to the sum of the magnitudes of the channel's terms.
 const ROUNDING_RATIO: f64 = 16.0 * f64::EPSILON;
 
-/// Channel of an expression: a state channel, or a known signal or derivative.
+/// Argument of an expression, by its index: a state channel, or a known channel (an input or a derivative of one).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Place {
     State(usize),
     Known(usize),
 }
 
-/// Non-linear term of an equation.
+/// Non-linear term of an equation: indices of equation, term and derived signal, and the arguments of its expression.
 struct NonlinearTerm {
     equation: usize,
     term: usize,
@@ -49,7 +50,8 @@ struct NonlinearTerm {
     places: Vec<Place>,
 }
 
-/// Contribution of a source to a state channel through a kernel: term k of equation i.
+/// Contribution of a source to a state channel. A source is a state channel, a non-linear term or a friction force.
+/// `at` holds the indices of the equation and of the term in it.
 #[derive(Debug, Clone, Copy)]
 struct Contribution {
     source: usize,
@@ -57,14 +59,14 @@ struct Contribution {
     weight: f64,
 }
 
-/// Contributions to one state channel through one kernel, summed by one online convolution.
+/// Contributions to one state channel that share a kernel. One online convolution of their weighted sum computes them.
 struct Lane {
     state: usize,
     kernel: usize,
     contributions: Vec<Contribution>,
 }
 
-/// Contribution of an input to a state channel.
+/// Contribution of an input to a state channel. `at` holds the indices of the equation and of the term in it.
 struct InputLane {
     state: usize,
     kernel: usize,
@@ -72,43 +74,45 @@ struct InputLane {
     signal: usize,
 }
 
-/// Operators of a system on a record.
+/// System discretized on the pulses of a record: channels, kernels and weights.
 pub(super) struct Operators {
     m: usize,
     step: f64,
     outputs: usize,
     states: Vec<StateChannel>,
-    /// Signal and order of each known channel, and its means.
+    /// Inputs, or derivatives of inputs, that enter expressions: (signal, order of the derivative), and pulse means.
     known: Vec<((usize, f64), Vec<f64>)>,
     terms: Vec<NonlinearTerm>,
     integrals: Vec<IntegralKernel>,
-    /// Kernel of each integral.
+    /// Convolution kernel of each entry of `integrals`.
     kernels: Vec<ConvolutionKernel>,
     lanes: Vec<Lane>,
     inputs: Vec<InputLane>,
-    /// Weight of each source in each state channel within a pulse, row-major.
+    /// Weights within a pulse, row-major. A row is a state channel. Columns are the state channels, the non-linear
+    /// terms and the friction forces that contribute to it.
     gains: Vec<f64>,
-    /// True if the value of an expression depends on itself in the same pulse, because it enters its channel without
-    /// integration.
+    /// True if the value of a non-linear term depends on itself in the same pulse, because it enters a state channel
+    /// without integration.
     algebraic: bool,
-    /// Dry friction; None without friction.
+    /// Dry friction of the bodies; None without friction.
     contact: Option<ContactOperators>,
-    /// Jumps of the forces on bodies with friction within pulses.
+    /// Jumps of the forces on bodies with friction that occur within pulses.
     jumps: ForceJumps,
 }
 
-/// Simulation with its linearization at every pulse.
+/// Simulation of a run with the linearization of its equations in every pulse.
 pub(super) struct LinearizedRun {
-    /// State channels, then means of the non-linear terms, then means of the friction forces.
+    /// Pulse means of each source: state channels, then non-linear terms, then friction forces.
     pub(super) sources: Vec<Vec<f64>>,
-    /// Derivatives of the non-linear terms with respect to state channels, then to known channels, pulse by pulse.
+    /// Derivatives of the non-linear terms with respect to the state channels, then the known channels. One row-major
+    /// matrix per pulse, with additional zero rows for friction forces.
     slopes: Vec<f64>,
-    /// Inverse of the linearized equations of each pulse.
+    /// Inverse Jacobian of the equations in each pulse, row-major.
     inverses: Vec<f64>,
     contacts: ContactStates,
 }
 
-/// Pulse at which a simulation ends early, and the reason.
+/// Early end of a simulation: index of the pulse that has no solution, and the reason.
 pub(super) struct End {
     pub(super) index: usize,
     pub(super) why: String,
@@ -127,7 +131,7 @@ impl End {
     }
 }
 
-/// Index of a kernel in a list; a new kernel is appended.
+/// Return the index of a kernel in a list. A kernel that is not in the list is appended.
 fn kernel_index(kernels: &mut Vec<IntegralKernel>, order: f64, at_ends: bool) -> usize {
     let is_same = |known: &IntegralKernel| known.at_ends == at_ends && (known.order - order).abs() < ORDER_GRAIN;
     kernels.iter().position(is_same).unwrap_or_else(|| {
@@ -157,7 +161,7 @@ impl Operators {
                 terms.push(NonlinearTerm { equation: i, term: k, signal, places });
             }
         }
-        // Same error as for a step that is too long, so that an optimizer shortens it.
+        // The optimizer shortens its step after this error.
         let beyond = || Error::Diverged { what: "order of a term above alpha; simulation".into(), index: 0 };
         let (mut integrals, mut lanes, mut inputs) = (Vec::new(), Vec::<Lane>::new(), Vec::new());
         let mut algebraic = false;
@@ -254,12 +258,13 @@ impl Operators {
         self.states.len() + self.values()
     }
 
-    /// Number of non-linear terms and friction forces.
+    /// Number of non-linear terms plus number of friction forces.
     fn values(&self) -> usize {
         self.terms.len() + self.contact.as_ref().map_or(0, ContactOperators::count)
     }
 
-    /// Forcing by initial terms, given as (exponent, coefficient) by equation.
+    /// Return the forcing of the state channels by initial terms. `powers` holds (exponent, coefficient) of the powers
+    /// of t in the output of each equation. Return an error if a power has no finite mean over the first pulse.
     pub(super) fn initial_forcing(&self, system: &NonlinearSystem, powers: &[Vec<(f64, f64)>]) -> Result<ForcingTerms> {
         let links = &system.links();
         let mut out = ForcingTerms { channels: vec![vec![0.0; self.m]; self.states.len()], starts: Vec::new() };
@@ -294,7 +299,7 @@ impl Operators {
         Ok(out)
     }
 
-    /// Add the inputs to the forcing of the state channels.
+    /// Add the contributions of the inputs to the forcing of the state channels.
     pub(super) fn add_inputs(&self, system: &NonlinearSystem, record: &Record, forcing: &mut ForcingTerms) {
         for (signal, lanes) in self.inputs_by_signal() {
             let spectrum = Kernel::new(record.signal(signal));
@@ -306,7 +311,8 @@ impl Operators {
         }
     }
 
-    /// Fractional integral of a signal by a kernel of the list, or its derivative with respect to the order.
+    /// Return the fractional integral of a signal that is given by its spectrum. `series` holds the values of the
+    /// kernel with index `kernel`, or their derivatives with respect to its order.
     fn integrate(&self, signal: &Kernel, kernel: usize, series: &[f64]) -> Vec<f64> {
         let out = product(signal, series);
         if self.integrals[kernel].is_averaged() {
@@ -327,14 +333,15 @@ impl Operators {
         out
     }
 
-    /// Motion of each body with friction in the simulation.
+    /// Return the motion of each body with friction in a simulated run.
     pub(super) fn body_motions(&self, forcing: &ForcingTerms, run: &LinearizedRun) -> Vec<BodyMotion> {
         self.contact.as_ref().map_or_else(Vec::new, |contact| contact.motions(forcing, &run.contacts))
     }
 
-    /// Simulation with a forcing of the state channels.
+    /// Simulate with the given forcing of the state channels.
     ///
-    /// Second result: pulse and reason if the simulation ends early, with the outputs up to that pulse.
+    /// The second result is None for a complete run. If the simulation ends early, it holds the pulse and the reason,
+    /// and the run consists of the pulses before it.
     pub(super) fn run(&self, system: &NonlinearSystem, forcing: &ForcingTerms) -> (LinearizedRun, Option<End>) {
         let (states, count) = (self.states.len(), self.sources());
         let width = states + self.known.len();
@@ -364,8 +371,8 @@ impl Operators {
                 let (why, is_overflow) = match failure {
                     PulseFailure::Overflow => (String::new(), true),
                     PulseFailure::Domain(name, argument) => (format!("{name} of {argument:.6} has no value"), false),
-                    // Integrals of short pulses are small, so that only growth within a pulse has no solution.
                     PulseFailure::Contact => ("no friction force is consistent with the motion".into(), false),
+                    // Without algebraic terms, short pulses have a solution unless a value grows without bound in one.
                     PulseFailure::Newton(why) => (why.into(), !self.algebraic),
                 };
                 return (run, Some(End { index: k, why, is_overflow }));
@@ -392,7 +399,8 @@ impl Operators {
     }
 }
 
-/// Index of a known channel, which is computed if it is new.
+/// Return the index of an input, or of a derivative of an input, in `known`. A new entry is computed from the record
+/// and appended.
 fn known_index(known: &mut Vec<((usize, f64), Vec<f64>)>, channel: (usize, f64), record: &Record) -> Result<usize> {
     if let Some(at) = known.iter().position(|(of, _)| *of == channel) {
         return Ok(at);
@@ -401,7 +409,8 @@ fn known_index(known: &mut Vec<((usize, f64), Vec<f64>)>, channel: (usize, f64),
     Ok(known.len() - 1)
 }
 
-/// Means of a derivative of known means.
+/// Return the pulse means of the derivative of a signal from its pulse means. Return [`Error::OutOfRange`] for an order
+/// above [`MAX_EXCESS`].
 fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
     if order < ORDER_GRAIN {
         return Ok(means.to_vec());
@@ -417,24 +426,25 @@ fn derivative(means: &[f64], order: f64, step: f64) -> Result<Vec<f64>> {
     Ok(product(&Kernel::new(means), &kernel(-order, means.len(), step)))
 }
 
-/// Workspace of the Newton iterations of one pulse.
+/// Equations of one pulse, with the current iterate of the Newton iterations and work arrays.
 struct Pulse<'a> {
     operators: &'a Operators,
     system: &'a NonlinearSystem,
     free: Vec<f64>,
-    /// Values at which state channels are fixed; None if free.
+    /// Value at which each state channel is fixed; None if the equations determine it.
     fixed: Vec<Option<f64>>,
-    /// State channels that were fixed when the inverse was computed. Without non-linear terms it depends only on these.
+    /// For each state channel, whether it was fixed when `inverse` was computed. Without non-linear terms, the inverse
+    /// depends on these flags only.
     inverted_for: Vec<bool>,
     known: Vec<f64>,
     z: Vec<f64>,
-    /// Values of the non-linear terms at z, then friction forces.
+    /// Values of the non-linear terms at `z`, followed by the friction forces.
     values: Vec<f64>,
     slopes: Vec<f64>,
     inverse: Vec<f64>,
     determinant: f64,
     residual: Vec<f64>,
-    /// Sum of the magnitudes of the terms of each state channel.
+    /// Sum of the magnitudes of the terms in the equation of each state channel.
     sizes: Vec<f64>,
     matrix: Vec<f64>,
     step: Vec<f64>,
@@ -474,7 +484,7 @@ impl<'a> Pulse<'a> {
         self.z.get(index).copied().unwrap_or_else(|| self.values[index - self.z.len()])
     }
 
-    /// Evaluate terms, derivatives and residual at z; return the norm of the residual.
+    /// Evaluate non-linear terms, their derivatives and the residual at `z`. Return the Euclidean norm of the residual.
     fn evaluate(&mut self) -> f64 {
         let (states, width) = (self.z.len(), self.z.len() + self.known.len());
         self.slopes.fill(0.0);
@@ -512,7 +522,8 @@ impl<'a> Pulse<'a> {
         norm
     }
 
-    /// Set z to the linear extrapolation of the last two pulses.
+    /// Set `z` to the linear extrapolation of the last two pulses. The second pulse starts at the value of the first
+    /// pulse, and the first pulse at the forcing.
     fn predict(&mut self, sources: &[Vec<f64>]) {
         for ((z, row), free) in self.z.iter_mut().zip(sources).zip(&self.free) {
             *z = match row.as_slice() {
@@ -523,7 +534,8 @@ impl<'a> Pulse<'a> {
         }
     }
 
-    /// Invert the linearized equations; false if they are singular or not finite.
+    /// Compute the inverse Jacobian of the equations of the pulse. Return false if the Jacobian is singular or the
+    /// inverse is not finite.
     fn linearize(&mut self) -> bool {
         let (states, count, width) = (self.z.len(), self.operators.sources(), self.z.len() + self.known.len());
         let is_fixed = self.fixed.iter().map(Option::is_some);
@@ -552,7 +564,7 @@ impl<'a> Pulse<'a> {
         true
     }
 
-    /// Solve a pulse without non-linear terms for its state channels, with the current friction forces.
+    /// Solve a pulse without non-linear terms for its state channels, at the friction forces in `values`.
     fn solve_linear(&mut self) -> std::result::Result<(), PulseFailure> {
         if !self.linearize() {
             return Err(PulseFailure::Newton("its linearization is singular"));
@@ -573,7 +585,7 @@ impl<'a> Pulse<'a> {
         }
     }
 
-    /// Solve the pulse by Newton iterations from the current z, with the current friction forces.
+    /// Solve the pulse by Newton iterations from the current `z`, at the friction forces in `values`.
     fn solve(&mut self) -> std::result::Result<(), PulseFailure> {
         if self.is_linear() {
             return self.solve_linear();
@@ -581,7 +593,7 @@ impl<'a> Pulse<'a> {
         let states = self.z.len();
         let mut norm = self.evaluate();
         if !norm.is_finite() && self.free.iter().all(|v| v.is_finite()) {
-            // The last pulses may lead beyond what the expressions allow with the present inputs.
+            // The extrapolation may lie outside the domain of an expression. The iteration then starts at the forcing.
             self.z.clone_from(&self.free);
             norm = self.evaluate();
         }
@@ -596,7 +608,7 @@ impl<'a> Pulse<'a> {
             for a in 0..states {
                 let row = &self.inverse[a * states..(a + 1) * states];
                 self.step[a] = row.iter().zip(&self.residual).map(|(v, r)| v * r).sum();
-                // A channel of small terms receives the rounding of large ones.
+                // A channel with small terms receives the rounding errors of channels with large terms.
                 let rounding: f64 = row.iter().zip(&self.sizes).map(|(v, size)| (v * size).abs()).sum();
                 let tolerance = NEWTON_TOLERANCE * self.sizes[a] + ROUNDING_RATIO * rounding;
                 is_small &= self.step[a].abs() <= tolerance;
@@ -651,13 +663,14 @@ impl PulseEquations for Pulse<'_> {
     }
 }
 
-/// Magnitude of an argument above which a function without a value counts as overflow, not as outside of its domain.
+/// Magnitude of an argument above which a function without a value counts as overflow. Below it, the argument lies
+/// outside the function's domain.
 const OVERFLOW_SIZE: f64 = 1e60;
-/// Reason of failure if no Newton step reduces the residual.
+/// Failure of a pulse in which no Newton step reduces the residual, or whose iteration does not converge.
 const NO_DESCENT: PulseFailure = PulseFailure::Newton("no Newton step reduces its residual");
 
-/// Products of sources with kernels and with their derivatives, and responses to friction forces, computed when first
-/// needed.
+/// Cache for the sensitivities of one simulated run. It contains convolutions of simulated pulse means with kernels and
+/// with derivatives of kernels, and responses to friction forces. Each is computed when it is first needed.
 pub(super) struct FrozenProducts<'a> {
     operators: &'a Operators,
     run: &'a LinearizedRun,
@@ -674,7 +687,7 @@ impl<'a> FrozenProducts<'a> {
         Self { operators, run, spectra, slopes, found: std::collections::BTreeMap::new(), contacts: None }
     }
 
-    /// Compute the responses to friction forces if they are not known.
+    /// Compute the responses to friction forces unless they are cached.
     fn linearize_contacts(&mut self) -> Result<()> {
         if let (Some(contact), None) = (&self.operators.contact, &self.contacts) {
             let Operators { jumps, gains, .. } = self.operators;
@@ -683,12 +696,14 @@ impl<'a> FrozenProducts<'a> {
         Ok(())
     }
 
-    /// Derivative of a kernel with respect to its order.
+    /// Return the derivative of the values of a kernel with respect to its order.
     fn kernel_slope(&mut self, kernel: usize) -> &[f64] {
         let Operators { m, step, ref integrals, .. } = *self.operators;
         self.slopes[kernel].get_or_insert_with(|| integrals[kernel].values_and_slopes(m, step).1)
     }
 
+    /// Return the convolution of a source (a state channel, a non-linear term or a friction force) with a kernel. If
+    /// `is_slope`, use the derivative of the kernel with respect to its order.
     fn of(&mut self, kernel: usize, source: usize, is_slope: bool) -> &[f64] {
         let key = (kernel, source, is_slope);
         if !self.found.contains_key(&key) {
@@ -713,7 +728,8 @@ impl<'a> FrozenProducts<'a> {
 }
 
 impl Operators {
-    /// Derivatives of the pulse means of the outputs with respect to one parameter.
+    /// Return the derivatives of the pulse means of each output with respect to one parameter. `derivatives` holds the
+    /// derivatives of the system with respect to it.
     pub(super) fn sensitivity(
         &self,
         system: &NonlinearSystem,
@@ -780,7 +796,7 @@ impl Operators {
         self.linear_run(run, &forcing, &known, bodies, (derivatives, frozen.contacts.as_ref()))
     }
 
-    /// Derivatives of the weights of the sources within a pulse, row-major.
+    /// Return the derivatives of `gains` with respect to a parameter, in the same layout.
     fn gain_derivatives(&self, derivatives: &SystemDerivatives, frozen: &mut FrozenProducts<'_>) -> Vec<f64> {
         let count = self.sources();
         let mut out = vec![0.0; self.gains.len()];
@@ -795,8 +811,12 @@ impl Operators {
         out
     }
 
-    /// Simulate the linearized equations. The inputs are a forcing, changes of the known channels, and changes of the
-    /// bodies' friction.
+    /// Simulate the linearized equations. Return the derivatives of the pulse means of each output with respect to a
+    /// parameter.
+    ///
+    /// `forcing` holds the derivatives of the forcing of each state channel. `known` holds indices of known channels
+    /// and the derivatives of their pulse means. `bodies` holds the derivatives of the initial states, gains and
+    /// friction laws of the bodies.
     fn linear_run(
         &self,
         run: &LinearizedRun,

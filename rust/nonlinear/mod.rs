@@ -1,10 +1,11 @@
 //! Equations with non-linear terms and dry friction: simulation pulse by pulse, sensitivities, output error.
 //!
-//! D^α y = Σ c D^ν s + Σ k D^μ n − F(Dy) sgn(Dy), where n is an expression over signals and derivatives of them
-//! ([`DerivedSignal`](crate::expression::DerivedSignal)) and F a [`FrictionLaw`](crate::friction::FrictionLaw). Orders
-//! of the derivatives of outputs are at most α − μ. The scheme is of second order in the step, and implicit: Newton
-//! iterations solve for the non-linear terms of a pulse, the contact law for its friction. The past enters only through
-//! online convolutions with the kernels of fractional integrals.
+//! An equation is D^α y = Σ c D^ν s + Σ k D^μ n − F(Dy) sgn(Dy) with coefficients c and k. s is a signal, and n the
+//! value of an expression over signals and their derivatives ([`DerivedSignal`](crate::expression::DerivedSignal)). F
+//! is a [`FrictionLaw`](crate::friction::FrictionLaw). In n, derivatives of outputs have orders of at most α − μ. The
+//! scheme is of second order in the step and implicit. Newton iterations solve for the non-linear terms of a pulse, and
+//! the contact law gives its friction. The past enters only through online convolutions with the kernels of fractional
+//! integrals.
 
 mod channels;
 mod contact;
@@ -25,28 +26,29 @@ pub use system::NonlinearSystem;
 use crate::error::{check_length, Result};
 use crate::regressors::{add_impulses, split_impulses, Record};
 
-/// Simulation of a system.
+/// Simulation of a system: its outputs, and the motion of its bodies with friction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeRun {
-    /// Pulse means of each output.
+    /// Pulse means of each output; NaN from the first pulse that overflows.
     pub outputs: Vec<Vec<f64>>,
     /// Motion of each body with friction.
     pub bodies: Vec<BodyMotion>,
 }
 
 impl NonlinearSystem {
-    /// Simulate with initial terms, given as (exponent, coefficient) of powers of t by equation.
+    /// Simulate the system with initial terms, which are powers of t. `initial` holds (exponent, coefficient) of each
+    /// power, by equation.
     ///
-    /// Outputs are NaN from the first pulse that overflows. O(d m log² m) for d convolutions of m pulses; O(d m) for
-    /// integer orders.
+    /// Outputs are NaN from the first pulse that overflows. The cost is O(d m log² m) for d convolutions of m pulses,
+    /// and O(d m) for integer orders.
     ///
-    /// The exponents −1, −2, … add an impulse and its derivatives to the output alone; the equations do not contain
-    /// them. After the filter of an output they become its initial transient.
+    /// The exponents −1, −2, … add an impulse and its derivatives to the output alone; they do not enter the equations.
+    /// At the output of a sensor filter they become the initial transient of the filter.
     ///
     /// # Errors
     /// [`Error::NoSolution`](crate::error::Error::NoSolution) for a pulse whose equations have no solution although no
-    /// value overflows; [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction on
-    /// this grid; as [`NonlinearSystem::check`].
+    /// value overflows. [`Error::Diverged`](crate::error::Error::Diverged) if coupled bodies have no unique friction
+    /// forces at this step. The errors of [`NonlinearSystem::check`] for an invalid system.
     ///
     /// ```
     /// # use ftlm::signal::block_pulse::PulseMeans;

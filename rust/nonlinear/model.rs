@@ -13,19 +13,19 @@ use crate::parallel::Stop;
 use crate::regressors::{add_impulses, split_impulses, Record};
 use crate::signal::block_pulse::PulseJump;
 
-/// Friction law with free parameters, each a multiple of one coefficient.
+/// Friction law with free coefficients. Each of its parameters is a multiple of one free coefficient, or constant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeFrictionLaw {
-    /// Coulomb friction fc.
+    /// Coulomb friction fc, in the unit of the highest derivative D^α y in the equation.
     pub coulomb: Monomial,
-    /// Stribeck friction fs.
+    /// Stribeck friction fs: excess of the static friction over fc.
     pub stribeck: Monomial,
-    /// Stribeck velocity vs.
+    /// Stribeck velocity vs: speed at which the excess has fallen to fs/e.
     pub speed: Monomial,
 }
 
 impl FreeFrictionLaw {
-    /// Friction that does not depend on speed.
+    /// Coulomb friction alone: a friction force that does not depend on speed.
     #[must_use]
     pub fn coulomb(coulomb: Monomial) -> Self {
         let known = |factor: f64| Monomial { factor, powers: Vec::new() };
@@ -36,24 +36,27 @@ impl FreeFrictionLaw {
         [&self.coulomb, &self.stribeck, &self.speed]
     }
 
-    /// Friction law with these values of the coefficients.
+    /// Return the friction law at the given values of all free coefficients.
     pub(super) fn at(&self, coefficients: &[f64]) -> FrictionLaw {
         let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
         FrictionLaw { coulomb, stribeck, speed }
     }
 
-    /// Derivatives of fc, fs and vs with respect to a coefficient.
+    /// Return the derivatives of Coulomb friction, Stribeck friction and Stribeck velocity with respect to the free
+    /// coefficient with index `coefficient`.
     pub(super) fn slope(&self, coefficients: &[f64], coefficient: usize) -> [f64; 3] {
         self.numbers().map(|number| number.slope(coefficients, coefficient))
     }
 
-    /// Whether a coefficient is a force of this law, which must not be negative.
+    /// True if a free coefficient scales the Coulomb or Stribeck friction of this law and must therefore not be
+    /// negative.
     pub(super) fn is_force(&self, coefficient: usize) -> bool {
         [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
     }
 }
 
-/// Flag of each output: true if it passes a filter before the comparison.
+/// Return a flag for each output: true if it passes the sensor filter before it is compared with the measurement. The
+/// flags are those of the first experiment; the vector is empty without a filter.
 #[must_use]
 pub fn filtered_outputs(experiments: &[Experiment]) -> Vec<bool> {
     experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
@@ -62,25 +65,26 @@ pub fn filtered_outputs(experiments: &[Experiment]) -> Vec<bool> {
 /// Model with free parameters: equations with non-linear terms and dry friction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonlinearModel {
-    /// Equations over recorded signals and, after these, derived ones.
+    /// Equations, whose signals are the recorded ones, followed by the derived ones.
     pub model: FreeModel,
-    /// Expressions of the derived signals, which follow the recorded ones.
+    /// Expressions of the derived signals, in the sequence of their signal indices.
     pub derived: Vec<DerivedSignal>,
-    /// Index of each equation with dry friction − F(Dy) sgn(Dy), and its law F.
+    /// Index of each equation with dry friction, and the law F of the friction force −F(Dy) sgn(Dy) on its output y.
     pub frictions: Vec<(usize, FreeFrictionLaw)>,
-    /// Flag of each output: true if it passes the filter of every experiment before the comparison. Empty without
-    /// filters.
+    /// Flag of each output: true if it passes the sensor filter before it is compared with the measurement. All
+    /// experiments must have the same flags. Empty without filters.
     pub filtered: Vec<bool>,
 }
 
-/// Step of central differences of initial terms, which are smooth in orders and at most quadratic in coefficients.
+/// Step of the central differences for derivatives of initial terms, relative to max(1, |coefficient|) for a
+/// coefficient and absolute for an order. Initial terms are smooth in orders and at most quadratic in coefficients.
 const DIFFERENCE_STEP: f64 = 1e-5;
 
-/// Number of samples for the estimate of the initial velocity of a run.
+/// Number of first samples of a run from which the initial velocity is estimated.
 const FIRST_SAMPLES: usize = 8;
 
-/// Constant forces tried as initial guesses, relative to each friction. The rest position depends on the sign of the
-/// net force, which a local optimization does not change.
+/// Constant forces tried as initial guesses, relative to the breakaway force of each body. The position at which a body
+/// comes to rest depends on the sign of the net force, which a local optimization does not change.
 const INITIAL_FORCE_RATIOS: [f64; 2] = [0.5, -0.5];
 
 /// Values of all free parameters.
@@ -88,13 +92,13 @@ const INITIAL_FORCE_RATIOS: [f64; 2] = [0.5, -0.5];
 pub(super) struct Point {
     pub(super) orders: Vec<f64>,
     pub(super) coefficients: Vec<f64>,
-    /// Free parameters of inputs.
+    /// Values of the free input parameters: delays, saturation and dead-zone limits.
     pub(super) inputs: Vec<f64>,
     /// Initial states of each run.
     pub(super) states: Vec<Vec<f64>>,
 }
 
-/// Residuals at a point, with intermediate results of each experiment for their derivatives.
+/// Residuals with weights at a point, and intermediate results of each experiment from which their derivatives follow.
 pub(super) struct Evaluation {
     pub(super) residuals: Vec<f64>,
     pub(super) size: f64,
@@ -102,7 +106,7 @@ pub(super) struct Evaluation {
 }
 
 impl Evaluation {
-    /// Evaluation before any experiment.
+    /// Evaluation of no experiment: no residuals.
     pub(super) fn empty() -> Self {
         Self { residuals: Vec::new(), size: 0.0, parts: Vec::new() }
     }
@@ -110,18 +114,19 @@ impl Evaluation {
 
 /// Parameter with respect to which a derivative is taken.
 pub(super) enum Parameter {
-    /// Free order by index.
+    /// Index of a free order.
     Order(usize),
-    /// Free coefficient by index.
+    /// Index of a free coefficient.
     Coefficient(usize),
-    /// Initial state by run and index.
+    /// Index of the run, and index of the initial state in it.
     InitialTerm(usize, usize),
-    /// Free parameter of an input.
+    /// Index of a free input parameter.
     Input(usize),
 }
 
 impl Parameter {
-    /// Parameters at a point: orders, coefficients and inputs if `numbers`, then the states of run after run.
+    /// Return all parameters at a point: orders, coefficients and input parameters if `numbers` is true, followed by
+    /// the initial states of each run.
     pub(super) fn all(point: &Point, numbers: bool) -> Vec<Self> {
         let mut all = Vec::new();
         if numbers {
@@ -135,7 +140,7 @@ impl Parameter {
     }
 }
 
-/// Intermediate results of an experiment for its derivatives.
+/// Intermediate results of one experiment, from which the derivatives of its residuals follow.
 pub(super) struct Part {
     system: NonlinearSystem,
     record: Option<Record>,
@@ -168,7 +173,8 @@ impl NonlinearModel {
         (InitialTerm::all(&equations, &self.model.initial, &self.filtered, is_order_free), equations)
     }
 
-    /// Forcing by the initial states of a run.
+    /// Return the forcing of the state channels by the initial states of a run. The tuple holds the free orders, the
+    /// free coefficients and the initial states.
     fn initial_forcing(
         &self,
         operators: &Operators,
@@ -178,7 +184,7 @@ impl NonlinearModel {
         operators.initial_forcing(&self.system(orders, coefficients, usize::MAX), &powers)
     }
 
-    /// Derivatives of the system with respect to a parameter.
+    /// Return the derivatives of the system of a run with respect to the parameter `moved`.
     fn derivatives(&self, point: &Point, run: usize, part: &Part, moved: &Parameter) -> Result<SystemDerivatives> {
         let (values, equations) = (&point.states[run], &self.model.equations);
         let mut derivatives = SystemDerivatives {
@@ -247,7 +253,9 @@ impl NonlinearModel {
         Ok(derivatives)
     }
 
-    /// Record with transformed inputs, and their derivatives in the free parameters. None without free inputs.
+    /// Apply saturations, dead zones and delays with the given parameters to the inputs. Return the resulting record,
+    /// and the derivative of each input with respect to its parameter. The record is None without free input
+    /// parameters.
     fn transform_inputs(
         &self,
         experiment: &Experiment,
@@ -280,7 +288,9 @@ impl NonlinearModel {
     /// Return an error for an inconsistent model, or for experiments that do not match it.
     ///
     /// # Errors
-    /// [`Error::Structure`], [`Error::Length`]; as [`FreeModel::check`].
+    /// [`Error::Length`] without experiments. [`Error::Structure`] for an index out of range, an invalid friction
+    /// coefficient, nonuniform samples, or runs with different filters. A friction coefficient must be a non-negative
+    /// multiple of one free coefficient. The errors of [`FreeModel::check`] occur as well.
     pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
         let refuse = |what: &str, remedy: &str| Err(Error::Structure { what: what.into(), remedy: remedy.into() });
         let Some(recorded) = experiments.iter().map(|e| e.record.len()).min() else {
@@ -315,35 +325,36 @@ impl NonlinearModel {
         self.model.initial.check()
     }
 
-    /// Whether a coefficient must not be negative, as a friction force must not.
+    /// True if a free coefficient scales a friction force and must therefore not be negative.
     pub(super) fn is_nonnegative(&self, coefficient: usize) -> bool {
         self.frictions.iter().any(|(_, law)| law.is_force(coefficient))
     }
 
-    /// True if the cost has kinks, so that its gradient need not vanish at a minimum. With friction, the times at which
-    /// a body stops or reverses move from pulse to pulse with any parameter.
+    /// True if the cost has kinks, so that its gradient need not vanish at a minimum. With friction, the pulse in which
+    /// a body stops or reverses changes with the parameters.
     pub(super) fn has_kinks(&self) -> bool {
         !self.frictions.is_empty()
     }
 
-    /// Return an error for invalid free orders.
+    /// Return an error if an equation is invalid at these free orders.
     pub(super) fn check_orders(&self, orders: &[f64]) -> Result<()> {
         let system = self.system(orders, &vec![0.0; self.model.coordinates.len()], usize::MAX);
         system.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
     }
 
-    /// Initial guesses of the states of a run from its first samples; all guesses have the same length.
+    /// Return initial guesses of the states of a run from its first samples. Each guess holds all states of the run.
     pub(super) fn state_guesses(&self, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<Vec<f64>> {
         let frictions = self.system(orders, coefficients, usize::MAX).frictions;
         state_guesses(&self.states(orders), &frictions, experiment)
     }
 
-    /// Number of states of each run.
+    /// Return the number of initial states of each run.
     pub(super) fn state_count(&self, orders: &[f64]) -> usize {
         self.states(orders).0.len()
     }
 
-    /// Initial terms of a run's states by equation: (exponent, coefficient).
+    /// Return the powers of t in the output of each equation for the initial states `values`, as (exponent,
+    /// coefficient).
     pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
         let system = self.system(orders, coefficients, usize::MAX);
         let links = system.links();
@@ -354,7 +365,8 @@ impl NonlinearModel {
         merge_powers(system.equations.len(), parts)
     }
 
-    /// Residuals at a point.
+    /// Return the weighted residuals of all experiments at a point. Return an error if a simulation overflows or has no
+    /// solution, or after a stop request.
     pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point, stop: &Stop) -> Result<Evaluation> {
         let mut out = Evaluation::empty();
         for (experiment, values) in experiments.iter().zip(&point.states) {
@@ -362,7 +374,7 @@ impl NonlinearModel {
             let (acting, input_slopes) = self.transform_inputs(experiment, &point.inputs)?;
             let record = acting.as_ref().unwrap_or(&experiment.record);
             let system = self.system(&point.orders, &point.coefficients, record.len());
-            // Same error as for a step that is too long, so that an optimizer shortens it.
+            // The optimizer shortens its step after this error.
             let far = |_| Error::Diverged { what: "orders out of range; simulation".into(), index: 0 };
             system.check().map_err(far)?;
             let operators = Operators::new(&system, record)?;
@@ -388,7 +400,8 @@ impl NonlinearModel {
         Ok(out)
     }
 
-    /// Derivatives of the residuals with respect to [`Parameter::all`].
+    /// Return the derivatives of the weighted residuals, one column for each parameter of [`Parameter::all`] with the
+    /// same `numbers`.
     pub(super) fn jacobian(
         &self,
         experiments: &[Experiment],
@@ -410,12 +423,12 @@ impl NonlinearModel {
                 }
                 stop.check()?;
                 let slopes = match moved {
-                    // An order that fell below an integer has fewer initial terms than at the initial guess.
+                    // If an order has fallen below an integer, there are fewer initial terms than at the initial guess.
                     Parameter::InitialTerm(_, state) if *state >= states.len() => {
                         vec![vec![0.0; record.m()]; self.model.equations.len()]
                     }
                     Parameter::InitialTerm(_, state) if states[*state].is_impulse() => {
-                        // A filter transient does not enter the equations.
+                        // The transient of a filter does not enter the equations.
                         let mut slopes = vec![vec![0.0; record.m()]; self.model.equations.len()];
                         let mut own = vec![Vec::new(); self.model.equations.len()];
                         if let InitialTerm::Power(i, e) = states[*state] {
@@ -440,8 +453,9 @@ impl NonlinearModel {
     }
 }
 
-/// Guesses of the initial states from the first samples of a run: positions and velocities of the outputs, and several
-/// constant forces up to the friction forces. All other states are 0.
+/// Return guesses of the initial states from the first samples of a run. Every guess holds the initial positions and
+/// velocities of the outputs. Further guesses add a constant force of half the breakaway force on one body, in either
+/// direction. All other states are 0.
 fn state_guesses(
     (states, equations): &(Vec<InitialTerm>, Vec<Equation>),
     frictions: &[(usize, FrictionLaw)],
@@ -469,7 +483,7 @@ fn state_guesses(
     guesses
 }
 
-/// Initial position and velocity of an output from its first samples.
+/// Return the initial position and velocity of an output by linear regression over its first samples.
 fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
     let near = &samples[..samples.len().min(FIRST_SAMPLES)];
     #[allow(clippy::cast_precision_loss)]

@@ -1,4 +1,4 @@
-//! Systems of equations with non-linear terms and dry friction at known orders and coefficients.
+//! Systems of equations with non-linear terms and dry friction, with given orders and coefficients.
 
 use super::channels::StateChannel;
 use super::convolution::MAX_FEEDTHROUGH_ORDER;
@@ -10,34 +10,35 @@ use crate::friction::contact::is_p_matrix;
 use crate::friction::FrictionLaw;
 use crate::linalg::small;
 
-/// Minimum integration order of a linear term.
+/// Minimum integration order of a linear term: order of the equation minus order of the term.
 pub(super) const MIN_INTEGRATION_ORDER: f64 = 1e-3;
 
-/// Equations with non-linear terms at known orders and coefficients.
+/// Equations with non-linear terms and dry friction, with given orders and coefficients.
 ///
-/// The signals from `recorded` on are derived signals.
+/// Signals with an index of `recorded` or more are derived signals.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NonlinearSystem {
-    /// D^α y = Σ c D^ν s over recorded and derived signals.
+    /// Equations D^α y = Σ c D^ν s over recorded and derived signals s.
     pub equations: Vec<Equation>,
-    /// Expressions of the derived signals.
+    /// Expressions of the derived signals, in the sequence of their signal indices.
     pub derived: Vec<DerivedSignal>,
     /// Number of recorded signals.
     pub recorded: usize,
-    /// Whether outputs enter other equations as simulated, not as measured.
+    /// True if outputs enter other equations as simulated, false if as measured.
     pub coupled: bool,
-    /// Index of each equation with dry friction − F(Dy) sgn(Dy), and its law F.
+    /// Index of each equation with dry friction, and the law F of the friction force −F(Dy) sgn(Dy) on its output y.
     pub frictions: Vec<(usize, FrictionLaw)>,
 }
 
 impl NonlinearSystem {
-    /// Linear equations with dry friction, whose outputs enter each other's equations as simulated.
+    /// System of linear equations with dry friction. Outputs enter other equations as simulated.
     #[must_use]
     pub fn with_friction(equations: Vec<Equation>, frictions: Vec<(usize, FrictionLaw)>, recorded: usize) -> Self {
         Self { equations, derived: Vec::new(), recorded, coupled: true, frictions }
     }
 
-    /// Index of the simulated output that a signal of equation i is; None for an input.
+    /// Return the index of the equation whose simulated output is `signal`, as it enters equation `i`. None if `signal`
+    /// is an input of equation `i`.
     pub(crate) fn output_index(&self, i: usize, signal: usize) -> Option<usize> {
         if self.coupled {
             self.equations.iter().position(|e| e.structure.output == signal)
@@ -46,10 +47,14 @@ impl NonlinearSystem {
         }
     }
 
-    /// Return an error for signal indices out of range, and for invalid coefficients, orders or frictions.
+    /// Return an error for an inconsistent system.
     ///
     /// # Errors
-    /// [`Error::Structure`], [`Error::OutOfRange`], [`Error::NotFinite`]; as [`Equation::check`].
+    /// [`Error::Structure`] for a signal or equation index out of range, two equations with the same output, or two
+    /// friction laws in one equation. With friction, the same error occurs for coupled equations that do not determine
+    /// their outputs, or whose coupling accelerates a body against a force. [`Error::OutOfRange`] or
+    /// [`Error::NotFinite`] for orders and friction parameters that are not supported. The errors of
+    /// [`Equation::check`] for an invalid equation.
     pub fn check(&self) -> Result<()> {
         let signals = self.recorded + self.derived.len();
         let refuse = |what: String, remedy: &str| Err(Error::Structure { what, remedy: remedy.into() });
@@ -70,7 +75,7 @@ impl NonlinearSystem {
         }
     }
 
-    /// Return an error for friction in an equation that is not a body, and for orders that friction does not support.
+    /// Return an error for an invalid friction law, and for an equation whose orders do not support friction.
     fn check_frictions(&self) -> Result<()> {
         let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
@@ -106,7 +111,7 @@ impl NonlinearSystem {
             return Ok(());
         }
         for (i, Equation { structure, .. }) in self.equations.iter().enumerate() {
-            // An input must not jump in a velocity. Other bodies, which friction moves, may depend on each other's
+            // An input must not cause a jump of a velocity. Bodies with friction may depend on each other's
             // accelerations.
             let above = |order: f64| order >= structure.order - ORDER_GRAIN;
             if let Some(term) =
@@ -136,9 +141,10 @@ impl NonlinearSystem {
         Ok(())
     }
 
-    /// Return an error if the coupling lets a force accelerate a body in the opposite direction.
+    /// Return an error if the coupling makes a force accelerate a body against the force.
     ///
-    /// Friction would then have no unique solution. Improper terms are checked on the grid instead.
+    /// Friction would then have no unique solution. A system with improper terms is checked after its discretization
+    /// instead.
     fn check_response_to_forces(&self) -> Result<()> {
         let (n, links) = (self.equations.len(), self.links());
         let bodies: Vec<usize> = self.frictions.iter().map(|friction| friction.0).collect();
@@ -168,7 +174,7 @@ impl NonlinearSystem {
         })
     }
 
-    /// Terms of each equation with a simulated output as signal.
+    /// Return the terms of each equation whose signal is a simulated output.
     pub(super) fn links(&self) -> Vec<Vec<Link>> {
         let of = |(i, Equation { structure, coefficients }): (usize, &Equation)| {
             (structure.terms.iter().zip(coefficients))
@@ -181,15 +187,15 @@ impl NonlinearSystem {
         self.equations.iter().enumerate().map(of).collect()
     }
 
-    /// True if the velocity of an equation at the end of a pulse is computed from the pulse means of another output, as
-    /// if this output were an input. It holds for outputs of an order up to 1, such as outputs of actuators, because
-    /// they have no velocity at a pulse end.
+    /// True if the velocity of an equation at the end of a pulse uses the pulse means of another equation's output,
+    /// like those of an input. This applies to outputs of equations of order 1 or less, such as actuators, because they
+    /// have no velocity at the end of a pulse.
     pub(super) fn couples_by_means(&self, equation: usize, output: usize, integration: f64) -> bool {
         let order = self.equations[output].structure.order;
         output != equation && order <= 1.0 + MAX_FEEDTHROUGH_ORDER && integration > 1.0 + MAX_FEEDTHROUGH_ORDER
     }
 
-    /// State channels: the outputs, then the derivatives that expressions, friction and coupled terms need.
+    /// Return the state channels: all outputs, then the derivatives that expressions, friction and coupling terms need.
     pub(super) fn state_channels(&self) -> Vec<StateChannel> {
         let mut states: Vec<StateChannel> =
             (0..self.equations.len()).map(|equation| StateChannel::Mean { equation, order: 0.0 }).collect();
@@ -208,8 +214,8 @@ impl NonlinearSystem {
             }
         }
         self.frictions.iter().for_each(|&(equation, _)| add(&mut states, StateChannel::EndVelocity { equation }));
-        // A derivative of an output has terms with the same derivative of the outputs coupled to it, except for those that
-        // enter its end velocity by their means.
+        // A derivative of an output depends on the same derivative of each output coupled to it. Outputs that enter its
+        // end velocity by their pulse means are the exception.
         let mut done = 0;
         while done < states.len() {
             let channel = states[done];
@@ -228,7 +234,7 @@ impl NonlinearSystem {
     }
 }
 
-/// Error for non-linear terms in combination with an option that does not support them.
+/// Return the error for non-linear terms in combination with an option that does not support them.
 pub(crate) fn unsupported_with(what: &str, remedy: &str) -> Error {
     Error::Structure { what: format!("non-linear terms in combination with {what}"), remedy: remedy.into() }
 }

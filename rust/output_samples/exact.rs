@@ -1,4 +1,4 @@
-//! Exact samples of models with integer orders on uniform samples, by their state space.
+//! Exact samples of models with integer orders at uniform sample times, by their state space.
 
 use super::initial_terms::{fit_initial_terms, OutputSamples};
 use super::richardson::Rows;
@@ -12,12 +12,13 @@ use crate::state_space::{self, InputSignal};
 impl OutputSimulation {
     /// Return exact samples of a model with integer orders. None if the model must be discretized by block pulses.
     ///
-    /// Block pulses are needed for fractional orders, friction, a sensor filter, nonuniform samples, missing samples of
-    /// inputs, and equations that are singular or nearly singular.
+    /// Block pulses are needed for fractional orders or exponents, friction, non-linear terms, a sensor filter,
+    /// nonuniform samples, free input parameters, and missing samples of inputs. They are also needed if the equations
+    /// are singular or nearly singular.
     ///
     /// # Errors
-    /// Invalid equations or samples ([`state_space::respond`]); initial terms that do not match the equations
-    /// ([`fit_initial_terms`]).
+    /// The errors of [`state_space::respond`], for invalid equations or samples. The errors of [`fit_initial_terms`],
+    /// for initial terms that do not match the equations.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
@@ -93,7 +94,8 @@ impl OutputSimulation {
             && (0..recording.channels().len()).all(usable)
     }
 
-    /// Samples of all outputs, from the inputs if `is_driven`; None if there is no state-space form.
+    /// Return the samples of all outputs, with the inputs if `is_driven` and without inputs otherwise. None if there is
+    /// no state-space form.
     fn respond(&self, terms: &Terms, is_driven: bool, stop: &Stop) -> Result<Option<Rows>> {
         let together = |equations: &[Equation], terms: &[Vec<(f64, f64)>]| {
             let (rows, step) = (self.recording.len(), self.recording.step());
@@ -130,8 +132,8 @@ impl OutputSimulation {
     }
 }
 
-/// True if an order is so close to an integer that differences of two such orders are integers within the tolerance of
-/// the state space.
+/// True if an order is so close to an integer that differences of two such orders are integers within
+/// [`ORDER_TOLERANCE`].
 fn is_integer(order: f64) -> bool {
     (order - order.round()).abs() <= 0.5 * ORDER_TOLERANCE
 }

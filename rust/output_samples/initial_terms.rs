@@ -1,4 +1,4 @@
-//! Initial terms of a simulation, by least squares on the measured samples.
+//! Fit of the initial terms of a simulation to the measured samples, by least squares.
 
 use super::richardson::{add_multiple, Rows};
 use crate::error::{check_length, Error, Result};
@@ -6,20 +6,21 @@ use crate::linalg::dense::minimum_norm_solution;
 use crate::linalg::orthogonal::norm;
 use crate::signal::statistics::mean;
 
-/// Relative distance of the response to an initial term from the span of the other responses, below which it is
-/// collinear, as in the joint fit.
+/// Singular value of the responses to initial terms, relative to the largest one, below which the responses count as
+/// collinear. The joint fit uses the same value.
 const COLLINEARITY_TOLERANCE: f64 = 1e-12;
 
-/// Samples of a simulation.
+/// Samples of a simulation, and its initial terms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutputSamples {
-    /// Samples of each output, filtered if it was measured through the sensor filter; not finite if the model diverges.
+    /// Samples of each output. They are filtered if the output was measured through the sensor filter, and not finite
+    /// if the simulation diverges.
     pub outputs: Vec<Vec<f64>>,
-    /// (exponent, coefficient) of the initial terms of each equation.
+    /// Initial terms of each equation as (exponent, coefficient).
     pub initial: Vec<Vec<(f64, f64)>>,
 }
 
-/// Weight of an output: 1 over the standard deviation of its measured samples.
+/// Return the weight of an output: 1 over the standard deviation of its measured samples, or 1 if these are constant.
 pub(super) fn weight(measured: &[f64]) -> f64 {
     let finite: Vec<f64> = measured.iter().copied().filter(|v| !v.is_nan()).collect();
     let level = mean(&finite);
@@ -31,15 +32,16 @@ pub(super) fn weight(measured: &[f64]) -> f64 {
     }
 }
 
-/// Add the initial terms that fit measured samples best to the samples of a simulation from rest.
+/// Add the initial terms that fit the measured samples best to the samples `driven` of a simulation from rest.
 ///
-/// `columns` are the samples of all outputs per unit of each term, and `units` its equation and exponent. With
-/// `has_level`, the level of each output is an additional term with the exponent ∞. Outputs are weighted by the inverse
-/// of their standard deviation. Missing samples are NaN and have no weight. Collinear terms have the solution of
-/// minimum norm.
+/// `units` holds (index of the equation, exponent) of each term, and `columns` the samples of all outputs per unit of
+/// it. With `has_level`, the level of each output is an additional term with the exponent ∞. The weight of an output is
+/// the inverse of the standard deviation of its measurement. Missing samples are NaN and have weight 0. If terms are
+/// collinear, the solution of minimum norm is used.
 ///
 /// # Errors
-/// [`Error::Length`] for other numbers of samples or terms.
+/// [`Error::Length`] if the numbers of samples, outputs or terms differ. [`Error::Structure`] for an equation index out
+/// of range.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {

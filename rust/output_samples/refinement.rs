@@ -1,5 +1,5 @@
-//! Refinement of the step until samples have converged. Long records use superposition of responses to single samples,
-//! which are refined only where they change.
+//! Refinement of the step until samples have converged. Long records are simulated by superposition of responses to
+//! single samples, and these responses are refined only where they change.
 
 use std::sync::Arc;
 
@@ -12,42 +12,43 @@ use crate::recording::Role;
 use crate::series;
 use crate::signal::nonuniform::interpolate_gaps;
 
-/// Pulses per sampling interval of the coarsest grid. With at least two, a sample does not depend on a jump of a
-/// zero-order-hold input at its time.
+/// Number of pulses per sampling interval of the coarsest grid. With two or more, a sample does not depend on a jump of
+/// a zero-order-hold input at its time.
 pub(super) const FIRST_REFINEMENT: usize = 2;
-/// Ratio of the end times of successive pieces of a response. The shortest piece has [`MIN_PIECE_INTERVALS`]. With this
-/// ratio, halving the step on a piece costs as much as the whole response on the coarser grid.
+/// Ratio of the end times of successive time ranges into which responses are divided. The shortest range has at least
+/// [`MIN_PIECE_INTERVALS`] sampling intervals. With this ratio, halving the step on a range costs as much as the whole
+/// response on the coarser grid.
 const PIECE_RATIO: usize = 8;
 const MIN_PIECE_INTERVALS: usize = 128;
-/// Pulses per interval of the grids that cover the whole response. The coarsest grid is not used for the first piece,
-/// where responses have jumps.
+/// Pulses per sampling interval of the grids that cover whole responses. The coarsest of these grids is not used for
+/// the first time range, in which responses have jumps.
 const FULL_GRID_REFINEMENTS: [usize; 3] = [1, 2, 4];
 const FINEST_FULL_GRID: usize = 4;
-/// Ratio of the peaks in the second and the first half of a response. Above it the model counts as unstable, because
-/// the sum of responses would lose digits.
+/// Maximum ratio of the peak in the second half of a response to the peak in the first half. Above it the model counts
+/// as unstable, because the sum of responses would lose digits.
 const MAX_GROWTH_RATIO: f64 = 1e3;
 
-/// Samples of a simulation in the limit of zero step.
+/// Samples of a simulation, extrapolated to zero step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RefinedSamples {
-    /// The samples.
+    /// Samples and initial terms in the limit of zero step.
     pub samples: OutputSamples,
-    /// Pulses per sampling interval of the finest grid.
+    /// Number of pulses per sampling interval of the finest grid.
     pub refinement: usize,
-    /// Change of each output when the step was last halved, relative to the largest value of the output. It is infinite
-    /// with fewer than three grids.
+    /// Change of each output when the step was last halved, relative to the largest magnitude of the output. It is
+    /// infinite with fewer than three grids.
     pub change: Vec<f64>,
 }
 
 /// Options of the step refinement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
-    /// Tolerance of the change of each output when the step is halved, relative to the largest value of the output. The
-    /// refinement ends at this change.
+    /// Tolerance for the change of each output when the step is halved, relative to the largest magnitude of the
+    /// output. The refinement ends when no change exceeds it.
     pub tolerance: f64,
-    /// Maximum number of pulses.
+    /// Maximum number of pulses of a grid.
     pub max_pulses: usize,
-    /// Minimum number of sampling intervals. Longer records are simulated by superposition of responses.
+    /// Number of sampling intervals from which on a record is simulated by superposition of responses.
     pub long_record_intervals: usize,
     /// Memory limit \[bytes\].
     pub memory: usize,
@@ -58,8 +59,8 @@ impl OutputSimulation {
     /// or until the number of pulses reaches its maximum.
     ///
     /// # Errors
-    /// As [`OutputSimulation::samples`], if the equations are singular on two grids in a row;
-    /// [`Error::Memory`] for a first grid above the memory limit; [`Error::Interrupted`] after a stop.
+    /// The errors of [`OutputSimulation::samples`]. Equations that are singular on one grid only are not an error.
+    /// [`Error::Memory`] if the first grid exceeds the memory limit. [`Error::Interrupted`] after a stop request.
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};
@@ -92,7 +93,8 @@ impl OutputSimulation {
             stop.check()?;
             let last = intervals.saturating_mul(2 * every) > options.max_pulses;
             let OutputSamples { outputs, initial: terms } = match self.samples(every, initial) {
-                // An autoregressive coefficient c meets 1 = c h^α / Γ(α + 2) on one step, not on two.
+                // The equations are singular if a coefficient c of the output satisfies 1 = c h^α / Γ(α + 2). This can
+                // be true for one step h, but not for two.
                 Err(error) if error.kind() == Kind::Model && failures != 1 => self.unknown_samples(initial),
                 long_samples => long_samples?,
             };
@@ -102,7 +104,8 @@ impl OutputSimulation {
             table.add(outputs, values, &relative_change);
             let long_samples = table.estimate(&owners.collect::<Vec<_>>(), options.tolerance, &relative_change);
             let limit = long_samples.ok_or_else(|| Error::Internal { what: "no grid for the simulation".into() })?;
-            // A stiff equation may have no stable scheme on a coarse grid. One that has none on two in a row has none.
+            // The scheme of a stiff equation may be unstable on a coarse grid. If it is unstable on two grids in
+            // succession, finer grids are not tried.
             failures = if finite || every == FIRST_REFINEMENT { 0 } else { failures + 1 };
             if last || failures == 2 || limit.change.iter().all(|c| *c <= options.tolerance) {
                 let mut values = limit.terms.into_iter();
@@ -116,7 +119,7 @@ impl OutputSimulation {
         }
     }
 
-    /// Memory of a grid for each of its pulses \[bytes\]: signals, series and spectra of the system, and responses.
+    /// Return the memory of a grid per pulse \[bytes\]: signals, series and spectra of the system, and responses.
     fn bytes_per_pulse(&self, initial: &InitialTerms) -> usize {
         let units = match initial {
             InitialTerms::Given(_) => 0,
@@ -128,7 +131,7 @@ impl OutputSimulation {
         size_of::<f64>() * (2 * self.recording.channels().len() + (10 * n + 2 * units + 8) * n)
     }
 
-    /// Samples that are all NaN, for a grid on which the equations are singular.
+    /// Return samples that are all NaN, for a grid on which the equations are singular.
     fn unknown_samples(&self, initial: &InitialTerms) -> OutputSamples {
         let count = self.times.as_ref().map_or(self.recording.len(), Vec::len);
         let n = self.equations.len();
@@ -140,18 +143,20 @@ impl OutputSimulation {
     }
 }
 
-/// Simulation as a sum of responses: to every sample of the inputs, to first samples, and to initial terms.
+/// Simulation by superposition of responses: to every sample of the inputs, to the first samples of linear inputs, and
+/// to initial terms.
 struct SampleResponses<'a> {
     simulation: &'a OutputSimulation,
-    /// Each nonzero input: signal, samples after its limits, and true if it is linear between samples. The first sample
-    /// of a linear input has a different response from later samples.
+    /// Nonzero inputs: index of the signal, samples with saturations and dead zones applied, and true if the input is
+    /// linear between samples. The first sample of a linear input has a different response from later samples.
     inputs: Vec<(usize, Vec<f64>, bool)>,
-    /// Equation and exponent of the initial terms.
+    /// (index of the equation, exponent) of each initial term.
     units: Vec<(usize, f64)>,
     stop: &'a Stop,
 }
 
-/// Piece of all responses on its finest grid, and its limit of zero step.
+/// Time range of all responses: first sample, end, pulses per sampling interval of its finest grid, and Richardson
+/// table.
 struct Piece {
     first: usize,
     end: usize,
@@ -160,7 +165,7 @@ struct Piece {
 }
 
 impl<'a> SampleResponses<'a> {
-    /// Responses for a recording; None if superposition does not apply.
+    /// Prepare the superposition of responses for a simulation; None if superposition does not apply.
     fn new(simulation: &'a OutputSimulation, units: Vec<(usize, f64)>, stop: &'a Stop) -> Option<Self> {
         let OutputSimulation { recording, equations, times, .. } = simulation;
         let special = !simulation.is_linear() || recording.is_all_filtered() || recording.has_nonuniform_samples();
@@ -175,7 +180,8 @@ impl<'a> SampleResponses<'a> {
                     continue;
                 }
                 let direct = (term.order - structure.order).abs() <= ORDER_TOLERANCE;
-                // Inputs before the run, and at its last sample, are no response to one of its samples.
+                // A delayed input depends on values before the run, and direct feedthrough has a value at the last
+                // sample. Neither is a response to one of its samples.
                 let delay = channel.delay.unwrap_or(0.0);
                 let late = delay > 0.0 && (direct || !recording.is_at_rest);
                 if channel.role == Role::Derived || delay < 0.0 || late {
@@ -194,7 +200,9 @@ impl<'a> SampleResponses<'a> {
         self.simulation.equations.len()
     }
 
-    /// All responses on a grid, one block of rows per response; NaN if the equations are singular on the grid.
+    /// Return the responses to unit input samples, to first samples and to initial terms, on a grid of `every` pulses
+    /// per sampling interval. Each response is a block of one row per output. It is NaN if the equations are singular
+    /// on the grid.
     fn compute(&self, every: usize, intervals: usize) -> Result<Rows> {
         match self.try_compute(every, intervals) {
             Err(error) if error.kind() == Kind::Model => {
@@ -210,7 +218,8 @@ impl<'a> SampleResponses<'a> {
         let rest = InitialTerms::Given(vec![Vec::new(); self.outputs()]);
         for (signal, samples, is_linear) in &self.inputs {
             self.stop.check()?;
-            // A signal that is linear between samples rises to a sample before it falls.
+            // The unit sample of a signal that is linear between samples is a triangle, which begins one interval
+            // earlier.
             let ramp = usize::from(*is_linear);
             let mut block = self.unit(Some((*signal, ramp)), intervals + ramp).samples(every, &rest)?.outputs;
             if *is_linear {
@@ -237,7 +246,8 @@ impl<'a> SampleResponses<'a> {
         Ok(rows)
     }
 
-    /// Simulation of a run from rest with a single unit sample of one signal.
+    /// Return the simulation of a run with zero initial conditions in which one sample (signal, row) is 1. With None,
+    /// all samples are 0.
     fn unit(&self, sample: Option<(usize, usize)>, intervals: usize) -> OutputSimulation {
         let recording = Arc::new(self.simulation.recording.unit_recording(intervals + 1, sample));
         OutputSimulation { recording, ..self.simulation.clone() }
@@ -247,7 +257,8 @@ impl<'a> SampleResponses<'a> {
         self.inputs.iter().filter(|(_, samples, is_linear)| *is_linear && samples[0] != 0.0).map(|(_, s, _)| s[0])
     }
 
-    /// Superpose responses from one interval on, with these coefficients of the initial terms.
+    /// Superpose responses whose rows start at sample `first`. Return the samples of the outputs from this sample on.
+    /// `terms` holds the coefficients of the initial terms.
     fn superpose(&self, responses: &Rows, first: usize, terms: &[f64]) -> Rows {
         let (n, count) = (self.outputs(), self.simulation.recording.len() - first);
         let mut out = vec![vec![0.0; count]; n];
@@ -263,7 +274,7 @@ impl<'a> SampleResponses<'a> {
         out
     }
 
-    /// Samples with the initial terms, which are given or fitted to the measured samples.
+    /// Return the samples with the initial terms, whose coefficients are given or fitted to the measured samples.
     fn samples(&self, responses: &Rows, initial: &InitialTerms) -> Result<OutputSamples> {
         let n = self.outputs();
         match initial {
@@ -289,9 +300,9 @@ impl<'a> SampleResponses<'a> {
     }
 }
 
-/// Refine a long record as [`OutputSimulation::refine`] does; None if superposition does not apply.
+/// Refine the step for a long record by superposition of responses; return None if superposition does not apply.
 ///
-/// The refinement in the result is that of the finest full grid.
+/// The refinement in the result is that of the finest grid that covers the whole record.
 fn refine_long_record(
     simulation: &OutputSimulation,
     initial: &InitialTerms,
@@ -372,7 +383,7 @@ fn refine_long_record(
     Ok(Some(RefinedSamples { samples: responses.samples(&best, initial)?, refinement, change }))
 }
 
-/// Divide responses of `intervals` sampling intervals into pieces; return the range of each piece.
+/// Divide responses over `intervals` sampling intervals into time ranges. Return (first sample, end) of each range.
 fn piece_ranges(intervals: usize) -> Vec<(usize, usize)> {
     let ends = std::iter::successors(Some(intervals + 1), |end| Some(end / PIECE_RATIO));
     let mut ends: Vec<usize> =
@@ -382,7 +393,7 @@ fn piece_ranges(intervals: usize) -> Vec<(usize, usize)> {
     firsts.zip(ends.iter().copied()).collect()
 }
 
-/// True if responses grow so little that their sum does not lose digits.
+/// True if the responses are finite and grow so little that their sum does not lose digits.
 fn decays(rows: &Rows) -> bool {
     rows.iter().all(|row| {
         let (first, second) = row.split_at(row.len() / 2);

@@ -1,23 +1,25 @@
 //! Richardson table: limit of samples for zero step, from grids with 1, 1/2, 1/4, … of a step.
 
-/// Samples or pulse means of each output.
+/// Samples or pulse means, one row per output.
 pub(super) type Rows = Vec<Vec<f64>>;
 
-/// Powers of the step in the error of a sample: 2 from the block-pulse scheme, 3 from extrapolation to a sample time, 4
-/// from the next term of both. A slope discontinuity t^η adds powers in between, which these columns do not eliminate.
-/// No column increases such an error by more than a small factor.
+/// Powers of the step in the error of a sample. The block-pulse scheme has the power 2, and the extrapolation to a
+/// sample time 3. The next term of both has the power 4. A slope discontinuity t^η adds intermediate powers, which the
+/// columns of the table do not eliminate. No column increases such an error by more than a small factor.
 const ERROR_POWERS: [i32; 3] = [2, 3, 4];
-/// Minimum ratio of a measured reduction to 2^power. The reduction is the factor by which a change shrinks when the
-/// step is halved. Above this ratio the error of a column is proportional to step^power.
+/// Minimum ratio of the measured reduction factor to 2^power. The reduction factor is the change at the previous
+/// halving of the step divided by the change at the last halving. Above this ratio, the error of a column counts as
+/// proportional to step^power.
 const MIN_POWER_RATIO: f64 = 0.5;
-/// Minimum factor by which the change must shrink when the step is halved, if the power of the error is unknown. It is
-/// slightly below the square root of two.
+/// Minimum reduction factor of the change per halving of the step, for an error of unknown power. It is slightly below
+/// √2.
 const MIN_REDUCTION_FACTOR: f64 = 1.4;
 const MIN_EFFECTIVE_SAMPLES: f64 = 8.0;
 /// Number of grids that are needed to estimate a reduction factor and to test it.
 const RATIO_TEST_GRIDS: usize = 4;
 
-/// Function (finer rows, coarser rows) that returns the change of each output relative to its largest value.
+/// Function of the rows on a finer and on a coarser grid. It returns the largest change of each output, relative to the
+/// largest magnitude of the output.
 pub(super) type Measure<'a> = &'a dyn Fn(&Rows, &Rows) -> Vec<f64>;
 
 /// Return the largest absolute value; NaN if any value is NaN.
@@ -42,14 +44,15 @@ pub(super) fn add_multiple(sum: &mut [f64], factor: f64, values: &[f64]) {
     sum.iter_mut().zip(values).for_each(|(sum, v)| *sum += factor * v);
 }
 
-/// Estimate of the limit for zero step.
+/// Estimate of samples and initial terms in the limit of zero step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct LimitEstimate {
-    /// Samples in the limit.
+    /// Samples of each output in the limit.
     pub samples: Vec<Vec<f64>>,
-    /// Change of each output on another halving, relative to its largest value; infinite before there are three grids.
+    /// Change of each output that is expected if the step is halved again, relative to its largest magnitude. It is
+    /// infinite with fewer than three grids.
     pub change: Vec<f64>,
-    /// Initial terms in the limit.
+    /// Coefficients of the initial terms in the limit.
     pub terms: Vec<f64>,
 }
 
@@ -64,22 +67,23 @@ fn largest_change(change: &[f64]) -> f64 {
     change.iter().fold(0.0, |most: f64, c| if c.is_nan() { f64::INFINITY } else { most.max(*c) })
 }
 
-/// Row of the Richardson table for one grid. The first column holds the samples, and each further column eliminates one
-/// more power of the step. Initial terms are an additional row of values. Each column also has its change on halving
-/// the step.
+/// Row of the Richardson table for one grid. Each column holds samples and the coefficients of initial terms. The first
+/// column is not extrapolated, and each further column eliminates one more power of the step. `changes` holds the
+/// change of each column from the previous grid.
 struct Grid {
     columns: Vec<(Rows, Vec<f64>)>,
     changes: Vec<Vec<f64>>,
 }
 
-/// Richardson table of recent grids, finest last.
+/// Richardson table of the most recent grids, finest last.
 #[derive(Default)]
 pub(super) struct RichardsonTable {
     grids: Vec<Grid>,
 }
 
 impl RichardsonTable {
-    /// Add samples and initial terms on the next grid; samples that are not finite restart the table.
+    /// Add the samples and initial terms on the next grid, whose step is half of the last one. Extrapolation starts
+    /// anew after samples that are not finite.
     pub(super) fn add(&mut self, samples: Rows, terms: Vec<f64>, measure: Measure<'_>) {
         let finite = |rows: &Rows| rows.iter().flatten().all(|v| v.is_finite());
         let unknown = vec![f64::INFINITY; samples.len()];
@@ -93,7 +97,7 @@ impl RichardsonTable {
             let terms = fine_terms.iter().zip(terms).map(|(f, c)| less(*f, *c)).collect();
             columns.push((combine(fine, rows, less), terms));
         }
-        // The change of the samples themselves is not used: their extrapolation changes less.
+        // The change of the samples themselves is not used, because their extrapolation changes less.
         let changes = columns.iter().zip(before).enumerate().map(|(k, ((new, _), (old, _)))| match k {
             0 => unknown.clone(),
             _ => measure(new, old),
@@ -105,10 +109,10 @@ impl RichardsonTable {
         }
     }
 
-    /// Estimate with the smallest expected change on another halving of the step.
+    /// Return the estimate with the smallest expected change if the step is halved again; None without grids.
     ///
-    /// `owners` are the outputs of the initial terms. If the change of a column is at most `enough`, no other estimate
-    /// is tried. None without grids.
+    /// `owners` holds the output index of each initial term. If no output of the best column changes by more than
+    /// `enough`, no other estimate is tried.
     pub(super) fn estimate(&self, owners: &[usize], enough: f64, measure: Measure<'_>) -> Option<LimitEstimate> {
         let grid = self.grids.last()?;
         let (column, change) = self.best_column(grid);
@@ -127,7 +131,8 @@ impl RichardsonTable {
         Some(best)
     }
 
-    /// Extrapolate a column with an error of unknown power, if the previous grid gave a reduction factor as well.
+    /// Extrapolate a column whose error has an unknown power of the step. None unless the last two halvings of the step
+    /// both give a reduction factor.
     ///
     /// Slope discontinuities t^η add intermediate powers, and coinciding orders add logarithms, which the table does
     /// not eliminate.
@@ -146,7 +151,7 @@ impl RichardsonTable {
         Some(LimitEstimate { samples, change, terms })
     }
 
-    /// Column with the smallest expected change on another halving of the step, and that change.
+    /// Return the column with the smallest expected change if the step is halved again, and this change of each output.
     fn best_column(&self, grid: &Grid) -> (usize, Vec<f64>) {
         let count = grid.columns.len();
         let mut best = (if count <= 2 { count - 1 } else { 1 }, vec![f64::INFINITY; grid.columns[0].0.len()]);
@@ -155,7 +160,7 @@ impl RichardsonTable {
             let mut columns = vec![(column, change.clone())];
             if let (Some(before), true) = (older.get(column), column + 1 < count) {
                 let factor = 2.0_f64.powi(ERROR_POWERS[column]);
-                // The next column eliminates the remaining error of a column that has the error of its power.
+                // If the error of a column is proportional to its power of the step, the next column eliminates it.
                 if change.iter().zip(before).all(|(c, b)| c * (MIN_POWER_RATIO * factor) <= *b) {
                     columns.push((column + 1, change.iter().map(|c| c / (factor - 1.0)).collect()));
                 }
@@ -170,9 +175,11 @@ impl RichardsonTable {
     }
 }
 
-/// Ratio of the remaining change to the last change of each output, for changes that shrink by a constant factor.
+/// Return, for each output, the ratio of the remaining change to the last change, if changes decrease by a constant
+/// factor.
 ///
-/// This is Aitken's method with one factor for all samples of an output. None if few samples change, or do not converge.
+/// This is Aitken's method with one factor for all samples of an output. None if only few samples of an output change,
+/// or if the changes decrease too slowly.
 fn remaining_change_ratios(older: &Rows, old: &Rows, new: &Rows) -> Option<Vec<f64>> {
     let (now, before) = (combine(new, old, |n, o| n - o), combine(old, older, |n, o| n - o));
     let of = |(now, before): (&Vec<f64>, &Vec<f64>)| {
@@ -192,8 +199,9 @@ fn remaining_change_ratios(older: &Rows, old: &Rows, new: &Rows) -> Option<Vec<f
 
 /// Extrapolate samples and initial terms on grids with 1, 1/2, 1/4, … of a step to zero step.
 ///
-/// The estimate is a column of the Richardson table, or its extrapolation by Aitken's method. The choice has the
-/// smallest expected change on another halving of the step. None without grids.
+/// Each grid is (samples of each output, coefficients of the initial terms), and `owners` holds the output index of
+/// each initial term. The estimate is a column of the Richardson table, or its extrapolation by Aitken's method. The
+/// one with the smallest expected change if the step is halved again is returned. None without grids.
 ///
 /// ```
 /// use ftlm::output_samples::richardson_limit;

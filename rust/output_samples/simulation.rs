@@ -1,4 +1,4 @@
-//! Simulation of a model on a recording: samples of its outputs on one grid.
+//! Simulation of a model on a recording: samples of its outputs on one grid of block pulses.
 
 use std::sync::Arc;
 
@@ -19,25 +19,25 @@ use crate::series;
 use crate::signal::block_pulse::{point_samples, SampleInterpolation};
 use crate::simulate;
 
-/// (exponent, coefficient) of the initial terms of each equation.
+/// Initial terms of each equation as (exponent, coefficient).
 pub(super) type Terms = Vec<Vec<(f64, f64)>>;
 
-/// Difference below which two orders are equal.
+/// Difference of two orders below which they count as equal.
 pub(super) const ORDER_TOLERANCE: f64 = 1e-9;
-/// Integration order from which on pulses resolve a slope discontinuity.
+/// Integration order from which on pulse means resolve a slope discontinuity without a correction.
 const SMOOTH_INTEGRATION_ORDER: f64 = 2.0;
-/// Termination criteria of the fit of initial states, if the run is not linear in them.
+/// Termination criteria of the fit of initial states for models with friction or non-linear terms.
 const INITIAL_STATE_SETTINGS: MinimizationSettings = MinimizationSettings { evaluations: 60, tolerance: 1e-12 };
 
-/// Initial terms of a simulation. The exponents −1, −2, … are an impulse and its derivatives before the sensor filter.
-/// The exponent ∞ is the level of an output.
+/// Initial terms of a simulation: powers of t in the outputs. The exponents −1, −2, … denote an impulse and its
+/// derivatives at the sensor filter. The exponent ∞ denotes the level of an output.
 #[derive(Debug, Clone, PartialEq)]
 pub enum InitialTerms {
-    /// (exponent, coefficient) of each equation.
+    /// Terms with given coefficients as (exponent, coefficient), by equation.
     Given(Vec<Vec<(f64, f64)>>),
-    /// Exponents of each equation, fitted to the measured samples by least squares.
+    /// Terms whose coefficients are fitted to the measured samples by least squares.
     Fitted {
-        /// Exponents by equation.
+        /// Exponents of the terms, by equation.
         exponents: Vec<Vec<f64>>,
         /// True if each output also has an unknown level.
         has_level: bool,
@@ -50,7 +50,7 @@ pub enum InitialTerms {
     },
 }
 
-/// Model with known orders and coefficients on a recording.
+/// Model with known orders and coefficients on a recording, whose outputs can be simulated.
 #[derive(Debug, Clone)]
 pub struct OutputSimulation {
     pub(super) recording: Arc<Recording>,
@@ -61,11 +61,14 @@ pub struct OutputSimulation {
 }
 
 impl OutputSimulation {
-    /// Simulation of equations in the sequence of the recording's outputs. `frictions` holds (equation, friction law).
-    /// `times` are the sample times \[s\]; None for the uniform samples of the recording.
+    /// Simulation of linear equations, with optional friction, in the sequence of the recording's outputs.
+    ///
+    /// `frictions` holds (index of the equation, friction law). `times` holds the sample times \[s\]; None stands for
+    /// the uniform samples of the recording.
     ///
     /// # Errors
-    /// Equations with signals that the recording lacks, or with other outputs.
+    /// The errors of [`Equation::check`] for an invalid equation. [`Error::Structure`] if the outputs of the equations
+    /// are not those of the recording.
     ///
     /// ```
     /// use ftlm::equation::{Equation, Structure, Term};
@@ -105,12 +108,13 @@ impl OutputSimulation {
         Ok(Self { recording, equations, frictions, times, derived: Vec::new() })
     }
 
-    /// Simulation of equations with non-linear terms, some of them with friction. Non-linear terms are terms of derived
-    /// signals, which are numbered after the signals of the recording.
+    /// Simulation of equations with non-linear terms and optional friction. A non-linear term is a term whose signal is
+    /// derived. Derived signals are numbered after the signals of the recording.
     ///
     /// # Errors
-    /// As [`NonlinearSystem::check`]. [`Error::Structure`] if the recording lacks an output, or if a measured signal of
-    /// the equations passed the sensor filter. [`Error::OutOfRange`] for an input term with the order of its equation.
+    /// The errors of [`NonlinearSystem::check`] for an invalid system. [`Error::Structure`] if the outputs of the
+    /// equations are not those of the recording, or if a measured signal in the equations has passed the sensor filter.
+    /// [`Error::OutOfRange`] for an input term whose order is not below the order of its equation.
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};
@@ -173,7 +177,7 @@ impl OutputSimulation {
         Ok(simulation)
     }
 
-    /// Equations with their derived signals.
+    /// Return the equations, derived signals and friction laws as one system.
     fn system(&self) -> NonlinearSystem {
         NonlinearSystem {
             equations: self.equations.clone(),
@@ -184,20 +188,20 @@ impl OutputSimulation {
         }
     }
 
-    /// True if outputs are linear in inputs and initial terms.
+    /// True if the outputs are linear in inputs and initial terms.
     pub(super) fn is_linear(&self) -> bool {
         self.frictions.is_empty() && self.derived.is_empty()
     }
 
-    /// Fit the initial terms of a model with friction or non-linear terms to the measured outputs. The result holds
-    /// (exponent e, coefficient c) of each initial term c t^e, by equation. The simulation uses `every` block pulses
-    /// per sampling interval.
+    /// Fit the initial terms of a model with friction or non-linear terms to the measured outputs. Return (exponent e,
+    /// coefficient c) of each initial term c t^e, by equation. The simulation uses `every` block pulses per sampling
+    /// interval.
     ///
-    /// Outputs are not linear in the initial terms, so these are found by optimization. It starts from level and
-    /// velocity at the start of the run.
+    /// The outputs are not linear in the initial terms, which are therefore found by local optimization. It starts from
+    /// the measured position and velocity at the start of the run.
     ///
     /// # Errors
-    /// Errors of [`Recording::experiment`] (invalid grid or too few samples) and of [`nonlinear::fit`].
+    /// The errors of [`Recording::experiment`], for an invalid grid or too few samples, and of [`nonlinear::fit`].
     ///
     /// ```
     /// use ftlm::equation::{Equation, Initial, Structure, Term};
@@ -253,11 +257,12 @@ impl OutputSimulation {
         Ok(optimum.initial.into_iter().flatten().collect())
     }
 
-    /// Samples on a grid of `every` pulses per sampling interval; not finite if the model diverges there.
+    /// Return the samples of the outputs, simulated on a grid of `every` block pulses per sampling interval. They are
+    /// not finite if the simulation diverges.
     ///
     /// # Errors
-    /// Errors of [`Recording::pulses`] (invalid grid), [`simulate::respond`] (linear models) and
-    /// [`NonlinearSystem::run`] (other models).
+    /// The errors of [`Recording::pulses`] for an invalid grid, of [`simulate::respond`] for linear models, and of
+    /// [`NonlinearSystem::run`] for other models.
     ///
     /// ```
     /// # use ftlm::equation::{Equation, Structure, Term};
@@ -302,30 +307,31 @@ impl OutputSimulation {
         fit_initial_terms(&self.recording.compared_rows(every)?, driven, &units, columns, has_level)
     }
 
-    /// Equation and exponent of each initial term.
+    /// Return (index of the equation, exponent) of each initial term.
     pub(super) fn unit_terms(&self, exponents: &[Vec<f64>]) -> Result<Vec<(usize, f64)>> {
         check_length("exponents of the initial terms", self.equations.len(), exponents.len())?;
         Ok(exponents.iter().enumerate().flat_map(|(i, own)| own.iter().map(move |e| (i, *e))).collect())
     }
 
-    /// Equation whose simulated output is this signal, if terms use simulated outputs.
+    /// Return the index of the equation whose simulated output is this signal. None for inputs, and if outputs enter
+    /// other equations as measured.
     pub(super) fn simulated_output(&self, signal: usize) -> Option<usize> {
         self.equations.iter().position(|e| self.recording.is_coupled && e.structure.output == signal)
     }
 
-    /// Whether a term is improper: above the order of its equation.
+    /// True if an equation has an improper term, whose order is above the order of its equation.
     pub(super) fn has_improper_term(&self) -> bool {
         let above = |e: &Equation| e.structure.terms.iter().any(|t| t.order > e.structure.order + ORDER_TOLERANCE);
         self.equations.iter().any(above)
     }
 }
 
-/// Coefficient of an initial term, 0 without one.
+/// Return the coefficient of the initial term with this exponent, or 0 if there is no such term.
 fn coefficient(terms: &[(f64, f64)], exponent: f64) -> f64 {
     terms.iter().find(|term| term.0 == exponent).map_or(0.0, |term| term.1)
 }
 
-/// Rows multiplied by a square matrix; unchanged rows without a matrix.
+/// Multiply rows by a square, row-major matrix. Without a matrix, return the rows unchanged.
 fn apply(matrix: Option<&Vec<f64>>, rows: Rows) -> Rows {
     let (Some(matrix), n) = (matrix, rows.len()) else { return rows };
     let of = |i: usize| {
@@ -338,8 +344,10 @@ fn apply(matrix: Option<&Vec<f64>>, rows: Rows) -> Rows {
     (0..n).map(of).collect()
 }
 
-/// Gain of a sensor filter of relative degree 0 for a jump. For a higher relative degree it is the jump of the response
-/// to the lowest derivative of an impulse that causes a jump. It is 0 if the relative degree is not `degree`.
+/// Return the ratio of the leading coefficients of a sensor filter, or 0 if its relative degree is not `degree`.
+///
+/// For degree 0, this is the gain of the filter for a jump. For a degree n > 0, it is the jump of its response to the
+/// derivative of order n − 1 of an impulse.
 fn leading_gain(filter: &Filter, degree: f64) -> f64 {
     let of = |part: &[(f64, f64)]| {
         let highest = part.iter().filter(|(c, _)| *c != 0.0).fold(0.0, |most: f64, (_, order)| most.max(*order));
@@ -359,12 +367,13 @@ fn relative_degree(filter: &Filter) -> f64 {
     (highest(&filter.denominator) - highest(&filter.numerator) + ORDER_TOLERANCE).trunc()
 }
 
-/// Pulse means of a recording on one grid, and positions of the samples in it.
+/// Pulse means of a recording on one grid of block pulses, and positions of the samples on the grid.
 pub(super) struct Grid<'a> {
     simulation: &'a OutputSimulation,
     every: usize,
     record: Record,
-    /// Series of the sensor filter of the simulated outputs; None if the record itself is filtered, or without one.
+    /// Sensor filter of the simulated outputs as a power series in the one-step delay. None without a filter, or if the
+    /// record itself is filtered.
     output_filter: Option<Vec<f64>>,
     at: Option<SampleInterpolation>,
 }
@@ -385,7 +394,7 @@ impl<'a> Grid<'a> {
         Ok(Self { simulation, every, record, output_filter, at })
     }
 
-    /// Pulse means of the outputs before the sensor filter.
+    /// Return the pulse means of the outputs before the sensor filter, with these initial terms.
     fn respond(&self, terms: &Terms) -> Result<Rows> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         if !self.simulation.is_linear() {
@@ -400,13 +409,14 @@ impl<'a> Grid<'a> {
         Ok(alone.collect::<Result<Vec<_>>>()?.concat())
     }
 
-    /// Pulse means from rest, and for a unit of each initial term without inputs.
+    /// Return the pulse means of the outputs with zero initial conditions, and those for a unit of each initial term
+    /// without inputs.
     pub(super) fn rest_and_units(&self, units: &[(usize, f64)]) -> Result<(Rows, Vec<Rows>)> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         if recording.is_coupled {
             return simulate::respond_and_units(equations, &self.record, units);
         }
-        // Each equation alone: an initial term moves its own output.
+        // Each equation is simulated alone, because an initial term affects only the output of its own equation.
         let mut rest = Vec::with_capacity(equations.len());
         let mut responses = vec![vec![vec![0.0; self.record.m()]; equations.len()]; units.len()];
         for (i, equation) in equations.iter().enumerate() {
@@ -419,35 +429,34 @@ impl<'a> Grid<'a> {
         Ok((rest, responses))
     }
 
-    /// Samples for a unit of an initial term without inputs, from its pulse means.
+    /// Return the samples of the outputs for a unit of one initial term without inputs, from their pulse means.
     pub(super) fn unit_samples(&self, (equation, exponent): (usize, f64), means: &Rows) -> Result<Rows> {
         let mut terms = vec![Vec::new(); means.len()];
         terms[equation].push((exponent, 1.0));
         self.samples(means, &terms, false)
     }
 
-    /// Samples from pulse means, with direct feedthrough from the values of the inputs at the samples.
+    /// Return the samples of the outputs from their pulse means. Direct feedthrough uses the values of the inputs at
+    /// the sample times.
     ///
-    /// The last two pulses before each sample time are extrapolated to it.
-    ///
-    /// These pulses contain no jump of a zero-order-hold input, so the extrapolation crosses no slope discontinuity
-    /// t^α. At nonuniform sample times jumps may be anywhere. There, samples follow from the pulses around them and the
-    /// kink correction.
+    /// The last two pulses before each sample time are extrapolated to it. These pulses contain no jump of a
+    /// zero-order-hold input, so the extrapolation crosses no slope discontinuity t^α. Nonuniform sample times may be
+    /// close to any jump. Their samples are interpolated from the surrounding pulses, and kink corrections are added.
     fn samples(&self, means: &Rows, terms: &Terms, is_driven: bool) -> Result<Rows> {
         let OutputSimulation { recording, equations, times, .. } = self.simulation;
         let (n, m, every) = (means.len(), self.record.m(), self.every);
         let count = times.as_ref().map_or(m / every + 1, Vec::len);
         let mut system = identity(n);
         let (mut now, mut start) = (vec![vec![0.0; count]; n], vec![vec![0.0]; n]);
-        // As long as the grid, so allocated only where something feeds through.
+        // This array is as long as the grid, so it is allocated only for direct feedthrough.
         let mut drive: Option<Rows> = None;
         let degree = recording.filter.as_ref().map_or(0.0, relative_degree);
         let after_filter = |i: usize| {
             recording.filter.as_ref().map_or(0.0, |f| coefficient(&terms[i], -degree) * leading_gain(f, degree))
         };
         for (i, Equation { structure, coefficients }) in equations.iter().enumerate() {
-            // The whole equation passes the filter, and so do the initial terms of its output. Of these the filter makes
-            // a jump of one.
+            // In a filtered record, the initial terms pass the filter as well. The filter turns one of them into a
+            // jump.
             start[i][0] = if self.record.is_filtered() { after_filter(i) } else { coefficient(&terms[i], 0.0) };
             for (k, (term, &c)) in structure.terms.iter().zip(coefficients).enumerate() {
                 if structure.integration(k).abs() > ORDER_TOLERANCE || self.is_derived(term.signal) {
@@ -493,7 +502,7 @@ impl<'a> Grid<'a> {
                 let mut out: Rows = rest.iter().map(|row| at.interpolate(row)).collect();
                 for (i, (row, kinks)) in out.iter_mut().zip(kinks).enumerate() {
                     add_multiple(row, 1.0, &kinks);
-                    // At the very start nothing has been integrated yet.
+                    // At t = 0 no input has been integrated yet.
                     let begins = gains[i] * start[i][0] + offsets[i];
                     row.iter_mut().zip(times).filter(|(_, t)| **t <= 0.0).for_each(|(v, _)| *v = begins);
                 }
@@ -512,8 +521,9 @@ impl<'a> Grid<'a> {
                         } else if at == m {
                             row[m - 1] + 0.5 * row[m - 2] - 0.5 * row[m - 3]
                         } else {
-                            // A term above its equation's order differentiates, nearly as Tustin's rule does at one
-                            // above: pulses have a part of alternating sign, which those on both sides eliminate.
+                            // An improper term differentiates. At one order above its equation this is nearly Tustin's
+                            // rule, so the pulse means have a component of alternating sign. The average of the pulses
+                            // on both sides eliminates it.
                             let early = early.as_ref().filter(|_| gains[i] == 1.0).map_or(0.0, |early| early[i][k]);
                             0.5 * (row[at - 1] + row[at]) - early
                         });
@@ -529,7 +539,7 @@ impl<'a> Grid<'a> {
         Ok(out)
     }
 
-    /// True if a signal is derived, so that the record lacks it.
+    /// True if a signal is a derived signal, which the record does not contain.
     fn is_derived(&self, signal: usize) -> bool {
         signal >= self.record.len()
     }
@@ -538,7 +548,7 @@ impl<'a> Grid<'a> {
         self.simulation.recording.channels()[signal].is_filtered
     }
 
-    /// Values of a signal just after the sample times.
+    /// Return the values of a signal just after the sample times.
     fn values_at_samples(&self, signal: usize) -> Result<Vec<f64>> {
         let OutputSimulation { recording, times, .. } = self.simulation;
         let (channel, means) = (recording.channel(signal)?, self.record.signal(signal));
@@ -547,7 +557,7 @@ impl<'a> Grid<'a> {
         }
         let filtered = self.record.is_filtered() && !channel.is_filtered;
         if !filtered && channel.delay.unwrap_or(0.0) == 0.0 {
-            // Between two pulses there may be a slope discontinuity, which their mean rounds off.
+            // The signal may have a slope discontinuity at the sample, which a mean over pulses would round off.
             return Ok(recording.acting_samples(signal).into_owned());
         }
         if filtered || !channel.is_held_input() {
@@ -556,17 +566,16 @@ impl<'a> Grid<'a> {
         Ok(means.iter().copied().step_by(self.every).chain(means.last().copied()).collect())
     }
 
-    /// Return, for each inner sample of each output, the part of the pulse means that occurs after the sample. A sample
-    /// is the mean of the pulses before and after it, so this part must be subtracted.
+    /// Return, for each inner sample of each output, the part of the averaged pulse means that occurs after the sample
+    /// time. A sample is the average of the pulses before and after it, so this part must be subtracted.
     ///
-    /// It is half of the response in the first pulse after a jump or a slope discontinuity of the inputs.
-    ///
-    /// At the sample only the direct gain acts, as in the joint fit.
+    /// It is half of the response in the first pulse after a jump or a slope discontinuity of an input. At the sample
+    /// time only direct feedthrough acts, as in the joint fit.
     fn early_responses(&self) -> Result<Rows> {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         let (n, m, every) = (equations.len(), self.record.m(), self.every);
         let signals = recording.channels().len();
-        // First pulse, and direct gain.
+        // Gains over the first pulse, and gains of direct feedthrough.
         let mut systems = [identity(n), identity(n)];
         let mut driven = [vec![0.0; n * signals], vec![0.0; n * signals]];
         let mut halves: Vec<Option<Vec<f64>>> = vec![None; signals];
@@ -578,7 +587,7 @@ impl<'a> Grid<'a> {
                 if own.is_none()
                     && (channel.role == Role::Derived || (self.record.is_filtered() && !channel.is_filtered))
                 {
-                    // The filter made it smooth, or only its means are known.
+                    // The filter smooths this signal, or only its pulse means are known.
                     continue;
                 }
                 let gains = [first_coefficient(eta, self.record.step()), f64::from(eta.abs() <= ORDER_TOLERANCE)];
@@ -611,9 +620,11 @@ impl<'a> Grid<'a> {
         Ok(out)
     }
 
-    /// Kink correction at nonuniform sample times: slope discontinuities of input jumps and of initial terms.
+    /// Return the kink corrections at nonuniform sample times, for the slope discontinuities due to input jumps and
+    /// initial terms.
     ///
-    /// It includes the direct path of a jump and one pass through the terms of the output, as in the joint fit.
+    /// A correction includes the direct path of a jump and one pass through each term of the output, as in the joint
+    /// fit.
     fn kink_corrections(&self, at: &SampleInterpolation, terms: &Terms, is_driven: bool) -> Rows {
         let OutputSimulation { recording, equations, .. } = self.simulation;
         let step = self.record.step();
@@ -646,7 +657,7 @@ impl<'a> Grid<'a> {
     }
 }
 
-/// Row-major identity matrix.
+/// Return the n × n identity matrix, row-major.
 fn identity(n: usize) -> Vec<f64> {
     (0..n * n).map(|k| f64::from(u8::from(k % (n + 1) == 0))).collect()
 }

@@ -14,14 +14,14 @@ use crate::estimation::multi_innovation::Prior;
 use crate::expression::{DerivedSignal, Expression, Instruction};
 use crate::regressors::Record;
 
-/// Maximum number of values of a two-dimensional array: eight gigabytes.
+/// Maximum number of values of a two-dimensional array, which take eight gigabytes.
 const MAX_VALUES: usize = 1 << 30;
 
-/// Record as (step, signals as rows, series of the sensor filter or None).
+/// Record: (step, signals as rows, power series of the sensor filter or None).
 #[derive(FromPyObject)]
 pub enum RecordArg<'py> {
-    /// Record with nonzero initial conditions. It adds flags of sensor filter transients, initial levels of the
-    /// signals, and filter responses to an impulse and its derivatives as rows.
+    /// Record with nonzero initial conditions. The last element is (flag of a filter transient in each signal, initial
+    /// levels, filter responses or None). Rows of the filter responses belong to an impulse and its derivatives.
     WithInitialState(
         f64,
         PyReadonlyArray2<'py, f64>,
@@ -30,21 +30,22 @@ pub enum RecordArg<'py> {
     ),
     Plain(f64, PyReadonlyArray2<'py, f64>, Option<PyReadonlyArray1<'py, f64>>),
 }
-/// Structure as (output, alpha, [(signal, order), …]).
+/// Structure: (output, alpha, [(signal, order), …]).
 pub type StructureArg = (usize, f64, List<(usize, f64)>);
-/// Equation as (structure, coefficients).
+/// Equation: (structure, coefficients).
 pub type EquationArg = (StructureArg, List<f64>);
-/// Initial terms as (true for Caputo's powers, exponents otherwise).
+/// Initial terms: (true for the powers of t of Caputo derivatives, explicit exponents otherwise).
 #[derive(FromPyObject)]
 pub enum InitialArg {
-    /// Initial terms with an offset and a number of impulses of a filter transient.
+    /// Initial terms with an offset, and with the number of impulses of a filter transient.
     Filtered(bool, List<f64>, u8, u8),
     /// Initial terms with an offset: 0 for none, 1 for a constant, 2 for a constant and a ramp, 3 for an output level.
     Offset(bool, List<f64>, u8),
     Plain(bool, List<f64>),
 }
 
-/// Expression as a signal: instructions (name, number) of its expression, and (signal, order of the derivative) of its channels.
+/// Signal of an expression: ([(name, number), …] of the instructions of its expression, [(signal, order of the
+/// derivative), …] of its channels).
 pub type DerivedArg = (List<(String, f64)>, List<(usize, f64)>);
 
 pub fn derived_signals(arguments: List<DerivedArg>) -> PyResult<Vec<DerivedSignal>> {
@@ -55,20 +56,21 @@ pub fn derived_signals(arguments: List<DerivedArg>) -> PyResult<Vec<DerivedSigna
     Ok(arguments.into_iter().map(of).collect::<Result<_, Error>>()?)
 }
 
-/// One-dimensional array as a vector. Return an error for a value that is not finite.
+/// Copy a one-dimensional array to a vector. Return an error for a value that is not finite.
 pub fn vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
     let values = copy_vector(name, array)?;
     check_finite(name, &values)?;
     Ok(values)
 }
 
-/// One-dimensional array as a vector, without a check of its values.
+/// Copy a one-dimensional array to a vector, without a check of its values.
 pub fn copy_vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
     check_points(&format!("length of {name}"), array.len())?;
     Ok(array.as_array().iter().copied().collect())
 }
 
-/// Check the size of a two-dimensional array. An array with zero strides may seem larger than memory.
+/// Return an error for a two-dimensional array that is too large. An array with zero strides may seem larger than
+/// memory.
 pub fn check_size(array: &PyReadonlyArray2<'_, f64>) -> PyResult<()> {
     let [rows, columns] = [array.shape()[0], array.shape()[1]];
     check_points("rows of an array", rows)?;
@@ -80,7 +82,7 @@ pub fn check_size(array: &PyReadonlyArray2<'_, f64>) -> PyResult<()> {
     Ok(())
 }
 
-/// Rows of a two-dimensional array.
+/// Copy the rows of a two-dimensional array to vectors.
 pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
     check_size(array)?;
     Ok(array.as_array().outer_iter().map(|row| row.iter().copied().collect()).collect())
@@ -108,7 +110,7 @@ pub fn records(arguments: &[RecordArg<'_>]) -> PyResult<Vec<Record>> {
     arguments.iter().map(record).collect()
 }
 
-/// Structure for a record with this number of signals. `inputs` marks the inputs among them.
+/// Build and check a structure for a record with this number of signals. `inputs` is true for the inputs among them.
 pub fn structure(argument: StructureArg, signals: usize, inputs: &[bool]) -> PyResult<Structure> {
     let structure = Structure {
         output: argument.0,
@@ -131,7 +133,7 @@ pub fn equations(arguments: List<EquationArg>, signals: usize, inputs: &[bool]) 
         .collect()
 }
 
-/// Prior covariance of multi-innovation least squares; None for a weak prior.
+/// Return the prior covariance of multi-innovation least squares; None stands for a weak prior.
 pub fn prior(covariance: Option<f64>) -> Prior {
     covariance.map_or(Prior::WEAK, Prior::Absolute)
 }
@@ -152,18 +154,18 @@ pub fn initial(argument: InitialArg) -> PyResult<Initial> {
     Ok(under.with_offset(offset)?.with_states(states))
 }
 
-/// Row-major matrix as an array.
+/// Convert a row-major matrix with `rows` rows to an array.
 pub fn matrix<'py>(py: Python<'py>, values: Vec<f64>, rows: usize) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let columns = values.len().checked_div(rows).unwrap_or(0);
     PyArray1::from_vec(py, values).reshape([rows, columns])
 }
 
-/// Vectors of equal length as the rows of an array.
+/// Stack vectors of equal length as the rows of an array.
 pub fn stack_rows<'py>(py: Python<'py>, vectors: &[Vec<f64>]) -> PyResult<Bound<'py, PyArray2<f64>>> {
     matrix(py, vectors.concat(), vectors.len())
 }
 
-/// Length of the last axis.
+/// Return the length of the last axis of an array.
 pub fn columns(array: &PyReadonlyArray2<'_, f64>) -> usize {
     array.shape()[1]
 }
@@ -172,7 +174,7 @@ pub fn columns(array: &PyReadonlyArray2<'_, f64>) -> usize {
 /// need no limit.
 const MAX_ITEMS: usize = 1 << 24;
 
-/// Vector from any Python sequence.
+/// Vector that can be extracted from any Python sequence.
 #[derive(IntoPyObject)]
 #[pyo3(transparent)]
 pub struct List<T>(Vec<T>);
@@ -250,12 +252,12 @@ impl<T> IntoIterator for List<T> {
     }
 }
 
-/// Lists of lists as vectors of vectors.
+/// Convert lists of lists to vectors of vectors.
 pub fn to_vectors<T>(lists: List<List<T>>) -> Vec<Vec<T>> {
     lists.into_iter().map(Vec::from).collect()
 }
 
-/// Vectors of vectors as lists of lists.
+/// Convert vectors of vectors to lists of lists.
 pub fn to_lists<T>(vectors: Vec<Vec<T>>) -> List<List<T>> {
     vectors.into_iter().map(List::from).collect()
 }

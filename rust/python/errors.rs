@@ -1,4 +1,4 @@
-//! Python exceptions: one class for each category of errors, and panics as InternalError.
+//! Python exceptions: one class for each category of errors. A panic becomes InternalError.
 
 use std::panic::{catch_unwind, AssertUnwindSafe};
 
@@ -38,15 +38,14 @@ fn raise(class: &str, message: String) -> PyErr {
 
 /// Run a computation of the core without the Python interpreter lock. A panic becomes InternalError.
 ///
-/// Every `#[pyfunction]` and every method converts its arguments and then makes one call of this or of
-/// [`run_attached`]. `tests/rust/bindings.rs` checks that.
+/// Every `#[pyfunction]` and every method converts its arguments, and then calls this function or [`run_attached`] one
+/// time. `tests/rust/bindings.rs` checks this rule.
 pub fn run_detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Error> + Send) -> PyResult<T> {
     Ok(py.detach(|| catch_panic(work))?)
 }
 
-/// Run work of microseconds with the Python interpreter lock, because its release would take longer.
-///
-/// A panic becomes InternalError.
+/// Run `work` that takes microseconds without releasing the Python interpreter lock, because the release would take
+/// longer. A panic becomes InternalError.
 pub fn run_attached<T>(work: impl FnOnce() -> Result<T, Error>) -> PyResult<T> {
     Ok(catch_panic(work)?)
 }

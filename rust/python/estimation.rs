@@ -21,15 +21,16 @@ use crate::python::order_search::watch::run_interruptible;
 use crate::regressors::Record;
 use crate::signal::block_pulse::{Jumps, SampleInterpolation};
 
-/// Tuple of (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
+/// (coefficients, coefficients of the initial terms by record, exponents of the initial terms, [(record, position), …]
+/// of the initial terms that were excluded as linearly dependent).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
 
-/// Total number of pulses of all records.
+/// Return the total number of pulses of all records.
 pub fn pulses(records: &[Record]) -> usize {
     records.iter().map(Record::m).sum()
 }
 
-/// Total number of pulses of all experiments times the largest number of evaluations.
+/// Return the total number of pulses of all experiments times the maximum number of evaluations.
 pub fn count_evaluated_pulses(experiments: &[joint::Experiment], evaluations: usize) -> usize {
     experiments.iter().map(|e| e.record.m()).sum::<usize>().saturating_mul(evaluations)
 }
@@ -55,7 +56,7 @@ pub fn least_squares(
     Ok(tuple(run_interruptible(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
 }
 
-/// Output error and coefficients of a point; None if they are not finite.
+/// (output error, coefficients) of a point; None if they are not finite.
 type PointTuple = Option<(f64, Vec<f64>)>;
 
 #[pyfunction]
@@ -113,7 +114,8 @@ pub fn multi_innovation<'py>(
     Ok((tuple(estimate), None))
 }
 
-/// Result of refined instrumental variables.
+/// Result of refined instrumental variables: estimate and covariance of each equation, and convergence of the
+/// iteration.
 #[derive(IntoPyObject)]
 pub struct InstrumentalFit {
     estimates: Vec<EstimateTuple>,
@@ -158,12 +160,13 @@ pub fn instrumental_variables(
     Ok(InstrumentalFit { estimates, covariances, iterations, converged, damped })
 }
 
-/// Nonuniform samples: (sample positions in pulses, positions and sizes of the jumps of each held signal).
+/// Nonuniform samples: (sample positions in pulses, (positions in pulses, sizes) of the jumps of each held signal or
+/// None).
 pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
-/// Experiment from a dictionary with the names of these fields as keys. `samples` and `robust_weights` have one row per
-/// output. `filter` is (series, flag per output) of the filter of simulated outputs. `signals` holds (values at the
-/// samples, true for a zero-order hold) of each signal.
+/// Experiment from a dictionary with these fields as keys. `samples` and `robust_weights` have one row per output.
+/// `filter` holds (power series, flag of each output) of the filter for simulated outputs. `signals` holds (values at
+/// the samples, true for a zero-order hold) of each signal.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct ExperimentFields<'py> {
@@ -179,13 +182,13 @@ pub struct ExperimentFields<'py> {
 
 /// Experiment that the core sampled, or a dictionary of its fields.
 #[derive(FromPyObject)]
-#[allow(clippy::large_enum_variant)] // there are as many as runs
+#[allow(clippy::large_enum_variant)] // one value per run
 pub enum ExperimentArg<'py> {
     Sampled(Py<Experiment>),
     Given(ExperimentFields<'py>),
 }
 
-/// Jumps of a held signal near the sample times.
+/// Return the jumps of a held signal near the sample times. Return an error if the times of the jumps do not ascend.
 pub fn jumps_near(
     readings: &SampleInterpolation,
     places: &PyReadonlyArray1<'_, f64>,
@@ -241,7 +244,7 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     })
 }
 
-/// Termination status of an optimization as text.
+/// Return the termination status of an optimization as text.
 pub fn status(status: joint::Status) -> &'static str {
     match status {
         joint::Status::Converged => "converged",
@@ -251,7 +254,7 @@ pub fn status(status: joint::Status) -> &'static str {
     }
 }
 
-/// Return true if s^alpha minus the autoregressive terms (coefficient, order) has a zero in the closed right
+/// Return true if s^alpha minus the terms c s^order of (c, order) in `own_terms` has a zero in the closed right
 /// half-plane.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
@@ -263,8 +266,8 @@ pub fn has_unstable_pole(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>
     })
 }
 
-/// Multi-innovation recursion, (44) of the paper, on a stream of samples; see module `estimation::streaming` of the
-/// core.
+/// Multi-innovation recursion, eq. (44) of the paper, on a stream of samples. See module `estimation::streaming` of
+/// the core.
 #[pyclass(module = "ftlm._core")]
 pub struct Streaming {
     inner: StreamingFit,
@@ -294,7 +297,8 @@ impl Streaming {
         Ok(Self { inner })
     }
 
-    /// Append samples, shape (n, signals). Return the coefficients of all equations after each.
+    /// Append samples, shape (n, signals). Return the coefficients of all equations after each sample, shape (n,
+    /// coefficients).
     #[allow(clippy::needless_pass_by_value)]
     fn push<'py>(
         &mut self,

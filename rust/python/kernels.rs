@@ -1,4 +1,4 @@
-//! Bindings of operators on batches of signals: one signal per row. Several rows can share one set of parameters.
+//! Bindings of operators on batches of signals, one signal per row. Several rows can share one set of parameters.
 
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -39,8 +39,8 @@ impl Batch {
 
     /// Apply `work` to the rows of each group in place.
     ///
-    /// Its arguments are the number of the group and its rows, one after another. `groups` contains the group of each
-    /// row, from 0 to `count` − 1.
+    /// `work` receives the index of a group and up to 64 of its rows, one after another. `groups` holds the group of
+    /// each row, from 0 to `count` − 1.
     fn change_groups(
         &mut self,
         groups: &[usize],
@@ -75,7 +75,8 @@ impl Batch {
 /// Number of rows between two checks for a stop request.
 const MAX_BLOCK_ROWS: usize = 64;
 
-/// Kernels of fractional integrals of several orders, or their derivatives by the order, as rows.
+/// Return the kernels of fractional integrals of several orders as rows of `m` values. With `derivative`, return their
+/// derivatives with respect to the order.
 #[pyfunction]
 #[pyo3(signature = (orders, m, step, *, derivative = false))]
 pub fn block_pulse_kernels<'py>(
@@ -106,11 +107,11 @@ pub fn block_pulse_kernels<'py>(
     PyArray1::from_vec(py, values).reshape([count, m])
 }
 
-/// Operation of one kernel on its rows, in place.
+/// Operation on rows, in place, with one kernel.
 type KernelWork = fn(&[f64], &mut [f64], &Stop) -> Result<()>;
 
-/// Apply `work` to rows and the first columns of their Toeplitz matrices. `groups` contains the matrix number of each
-/// row.
+/// Apply `work` to rows, each with the first column of its Toeplitz matrix. `groups` holds the index of the matrix of
+/// each row.
 fn with_kernels<'py>(
     py: Python<'py>,
     first_columns: &PyReadonlyArray2<'py, f64>,
@@ -130,7 +131,8 @@ fn with_kernels<'py>(
     batch.into_matrix(py, count)
 }
 
-/// Products of lower triangular Toeplitz matrices with rows; `groups` has the number of the matrix of each row.
+/// Return the products of lower triangular Toeplitz matrices with rows. `groups` holds the index of the matrix of each
+/// row.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn toeplitz_apply<'py>(
@@ -145,7 +147,7 @@ pub fn toeplitz_apply<'py>(
     })
 }
 
-/// Solutions of lower triangular Toeplitz systems; `groups` has the number of the matrix of each right-hand side.
+/// Solve lower triangular Toeplitz systems. `groups` holds the index of the matrix of each right-hand side.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn toeplitz_solve<'py>(
@@ -163,7 +165,8 @@ pub fn toeplitz_solve<'py>(
     })
 }
 
-/// Means of sampled signals over m equal pulses, one signal a row.
+/// Return the means of sampled signals over `m` equal pulses, one row per signal. Signals are held between samples if
+/// `hold`, otherwise linear.
 #[pyfunction]
 pub fn pulse_mean_rows<'py>(
     py: Python<'py>,
@@ -187,10 +190,10 @@ pub fn pulse_mean_rows<'py>(
     PyArray1::from_vec(py, values).reshape([count, m])
 }
 
-/// Multi-innovation estimates of X in m = Q X, (44) of the paper. Problems of `count` rows follow one after another in
-/// `q` and `m`.
+/// Return multi-innovation estimates of X in m = Q X, eq. (44) of the paper. `q` and `m` hold several problems of
+/// `count` rows one after another.
 ///
-/// The result has one row per problem, or with `path` the coefficients after every row.
+/// The result has one row of coefficients per problem. With `path`, it has the coefficients after every row.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn multi_innovation_rows<'py>(

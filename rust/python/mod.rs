@@ -1,6 +1,7 @@
-//! Python bindings, the only users of pyo3 and numpy.
+//! Python bindings. Only these modules use the crates `pyo3` and `numpy`.
 //!
-//! Arrays are checked here. The Python interpreter lock is released during every computation.
+//! They check arrays, and release the Python interpreter lock during every computation that takes longer than
+//! microseconds.
 
 mod convert;
 mod errors;
@@ -77,7 +78,7 @@ mod _core {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        // NumPy's C API and its borrow checker are imported on first use, and would panic on a Ctrl-C at that moment.
+        // NumPy imports its C API and its borrow checker on first use. A Ctrl-C at that moment would cause a panic.
         module.py().import("numpy")?;
         crate::python::errors::run_attached(|| {
             drop(numpy::PyArrayMethods::readonly(&numpy::PyArray1::<f64>::zeros(module.py(), 0, false)));

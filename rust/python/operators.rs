@@ -49,7 +49,7 @@ fn map_rows<'py>(
     PyArray1::from_vec(py, values).reshape([count, width])
 }
 
-/// Number of rows of a matrix, their length, and their values one after another.
+/// Return the number of rows of a matrix, their length, and all values, row after row.
 fn flat(x: &PyReadonlyArray2<'_, f64>) -> PyResult<(usize, usize, Vec<f64>)> {
     check_size(x)?;
     Ok((x.as_array().nrows(), columns(x), x.as_array().iter().copied().collect()))
@@ -150,7 +150,7 @@ pub fn fractional_integral<'py>(
     PyArray1::from_vec(py, values).reshape([count, width])
 }
 
-/// Number of values of a batch that are integrated between two checks for a stop request.
+/// Number of values that are integrated between two checks for a stop request.
 const MAX_BLOCK_POINTS: usize = 1 << 17;
 
 #[pyfunction]

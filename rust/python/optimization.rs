@@ -13,7 +13,7 @@ use crate::estimation::optimization::damped_step::{LeastSquaresProblem, Lineariz
 use crate::estimation::optimization::levenberg_marquardt::{minimize as find_minimum, MinimizationSettings};
 use crate::signal::statistics::inner;
 
-/// Violation of a constraint that counts as rounding error, relative to the step.
+/// Violation of a constraint that counts as rounding error, relative to the terms of the constraint in a step.
 const CONSTRAINT_TOLERANCE: f64 = 1e-9;
 const CONSTRAINT_ROUNDING: f64 = 1e-14;
 
@@ -34,7 +34,8 @@ struct CallbackProblem<'py> {
 }
 
 impl<'py> CallbackProblem<'py> {
-    /// Result of a callback at these values.
+    /// Call a callback with these values and convert its result. An exception is stored in `raised`, and
+    /// [`Error::Interrupted`] is returned.
     fn call<T>(
         &self,
         callback: &Bound<'py, PyAny>,
@@ -98,10 +99,13 @@ impl LeastSquaresProblem for CallbackProblem<'_> {
     }
 }
 
-/// Result of an optimization: values, sum of squares, termination status, number of evaluations, active constraints.
+/// Result of an optimization: (values, sum of squares, termination status, number of evaluations, indices of the active
+/// constraints).
 type MinimumTuple<'py> = (Bound<'py, PyArray1<f64>>, f64, &'static str, usize, Vec<usize>);
 
-/// Minimize a sum of squares from a feasible initial guess under rows · values ≤ limits.
+/// Minimize a sum of squares from a feasible initial guess, under the constraints `rows` · values ≤ `limits`.
+///
+/// `residuals` and `jacobian` are functions of the values. `jacobian` returns one row per residual.
 #[pyfunction]
 #[pyo3(signature = (residuals, jacobian, start, rows, limits, *, signal_norm=0.0, evaluations=120))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]

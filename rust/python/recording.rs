@@ -18,9 +18,9 @@ use crate::signal::nonuniform::NonuniformSignal;
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 type Table<'py> = Bound<'py, PyArray2<f64>>;
 
-/// Signal from a dictionary with these keys: name, samples, samples at the nonuniform times of the run, role, delay
-/// \[s\], limits as (law, value or None if free), flag of a sensor filter, flag of a signal in the equation of another
-/// output.
+/// Signal from a dictionary with these fields as keys. `nonuniform` holds the samples at the nonuniform sample times of
+/// the run, and `delay` is in seconds. `limits` holds (law, value or None if free) of each saturation and dead zone.
+/// `enters_others` is true if the signal enters the equation of another output.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct ChannelArg<'py> {
@@ -34,10 +34,11 @@ pub struct ChannelArg<'py> {
     enters_others: bool,
 }
 
-/// (coefficient, order) pairs of numerator and denominator.
+/// (coefficient, order) pairs of the numerator and of the denominator.
 type FilterArg = (List<(f64, f64)>, List<(f64, f64)>);
 
-/// Run from a dictionary with these keys. `free` has signal and law of each free delay or limit.
+/// Run from a dictionary with these fields as keys. `free` holds (index of the signal, law) of each free delay,
+/// saturation and dead zone.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct RunArg<'py> {
@@ -54,7 +55,7 @@ pub struct RunArg<'py> {
     free: List<(usize, String)>,
 }
 
-/// Law of an input by name.
+/// Return the law of an input by its name: `delay`, `saturation` or `dead_zone`.
 pub fn input_law(name: &str) -> Result<InputLaw> {
     match name {
         "delay" => Ok(InputLaw::Delay),
@@ -93,11 +94,11 @@ fn channel(argument: &ChannelArg<'_>) -> PyResult<Channel> {
     })
 }
 
-/// Pulse means: (step, signals as rows, series of the sensor filter or None), and the initial state: (signals with a
-/// filter transient, initial levels, filter responses as rows or None).
+/// Pulse means: (step, means of each signal as rows, power series of the sensor filter or None, initial state). The
+/// initial state is (flag of a filter transient in each signal, initial levels, filter responses as rows or None).
 type PulsesTuple<'py> = (f64, Table<'py>, Option<Array<'py>>, (Vec<bool>, Vec<f64>, Option<Table<'py>>));
 
-/// Run that the core samples on any grid.
+/// Run that the core can sample on any grid.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct Recording {
     pub(super) inner: Arc<recording::Recording>,
@@ -125,7 +126,8 @@ impl Recording {
         })
     }
 
-    /// Means of all signals over `m` pulses. If `filtered`, signals that were not filtered pass the sensor filter.
+    /// Return the means of all signals over `m` pulses. If `filtered`, the sensor filter is applied to signals that
+    /// were not measured through it.
     fn pulses<'py>(&self, py: Python<'py>, m: usize, filtered: bool) -> PyResult<PulsesTuple<'py>> {
         let run = Arc::clone(&self.inner);
         let points = m.saturating_mul(run.channels().len());
@@ -142,8 +144,8 @@ impl Recording {
         ))
     }
 
-    /// Experiment with `every` pulses per sampling interval and decimated samples. It has weights of the outputs, and
-    /// robust weights of the compared samples as rows.
+    /// Return the experiment with `every` pulses per sampling interval and decimated samples. `weights` holds the
+    /// weights of the outputs, and `shares` the robust weights of the compared samples, one row per output.
     #[pyo3(signature = (every, decimation, weights, shares=None))]
     #[allow(clippy::needless_pass_by_value)]
     fn experiment(
@@ -166,14 +168,14 @@ impl Recording {
         Ok(Experiment { inner })
     }
 
-    /// Times \[s\] and sizes of the jumps of a zero-order-hold input; None for other signals.
+    /// Return the times \[s\] and sizes of the jumps of a zero-order-hold input; None for other signals.
     fn jumps<'py>(&self, py: Python<'py>, signal: usize) -> PyResult<Option<(Array<'py>, Array<'py>)>> {
         self.inner.channel(signal)?;
         let discontinuities = run_detached(py, || Ok(self.inner.jumps(signal)))?;
         Ok(discontinuities.map(|(times, sizes)| (PyArray1::from_vec(py, times), PyArray1::from_vec(py, sizes))))
     }
 
-    /// Values of a signal just after given times \[s\]; None for a derived signal.
+    /// Return the values of a signal just after the given times \[s\]; None for a derived signal.
     #[allow(clippy::needless_pass_by_value)]
     fn values_at<'py>(
         &self,
@@ -186,14 +188,15 @@ impl Recording {
         Ok(run_detached(py, || Ok(self.inner.values_at(signal, &times)))?.map(|values| PyArray1::from_vec(py, values)))
     }
 
-    /// Samples of a signal as they enter the equations: after its limits, without the transient of its sensor filter.
+    /// Return the samples of a signal as it enters the equations. Known saturations and dead zones are applied, and the
+    /// initial transient of the sensor filter is removed.
     fn acting_samples<'py>(&self, py: Python<'py>, signal: usize) -> PyResult<Array<'py>> {
         self.inner.channel(signal)?;
         Ok(PyArray1::from_vec(py, run_detached(py, || Ok(self.inner.acting_samples(signal).into_owned()))?))
     }
 }
 
-/// Run sampled on one grid, to compare a simulation with.
+/// Run sampled on one grid, with the samples to compare with a simulation.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct Experiment {
     pub(super) inner: output_error::Experiment,
@@ -219,7 +222,8 @@ impl Experiment {
     }
 }
 
-/// Exact means over `m` pulses of a signal at nonuniform times, held or linear between them.
+/// Return the exact means of a signal with nonuniform sample times over `m` pulses of length `step` \[s\]. The signal
+/// is held between samples if `hold`, otherwise linear.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn nonuniform_means<'py>(
@@ -236,7 +240,8 @@ pub fn nonuniform_means<'py>(
     Ok(PyArray1::from_vec(py, means.into_vec()))
 }
 
-/// Runs of a fit with this number of signals and free input parameters, and with these outputs.
+/// Return the runs of a fit. Return an error unless they have these numbers of signals and free input parameters, and
+/// these outputs.
 pub fn recordings(runs: &[Py<Recording>], signals: usize, outputs: &[usize], free: usize) -> Result<Recordings> {
     let runs = Recordings::new(runs.iter().map(|run| recording::Recording::clone(&run.get().inner)).collect())?;
     if let Some(run) = runs.runs().first() {

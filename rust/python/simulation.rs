@@ -1,4 +1,4 @@
-//! Bindings of simulation, output and equation error, explicit Euler, metrics and correlations.
+//! Bindings of simulation, output error, equation error, explicit Euler, metrics and correlations.
 
 use std::sync::Arc;
 
@@ -170,25 +170,26 @@ pub fn kink_correction<'py>(
     Ok(PyArray1::from_vec(py, lacking))
 }
 
-/// (exponent, coefficient) of the initial terms by equation.
+/// [(exponent, coefficient), …] of the initial terms by equation.
 type TermsList = Vec<Vec<(f64, f64)>>;
 
-/// Tuple of samples of the outputs as rows, and the initial terms.
+/// (samples of the outputs as rows, initial terms).
 type SamplesTuple<'py> = (Bound<'py, PyArray2<f64>>, TermsList);
 
 fn samples_tuple<'py>(py: Python<'py>, found: OutputSamples) -> PyResult<SamplesTuple<'py>> {
     Ok((stack_rows(py, &found.outputs)?, found.initial))
 }
 
-/// Model with known orders and coefficients on a recording.
+/// Model with known orders and coefficients on a recording, whose outputs can be simulated.
 #[pyclass(module = "ftlm._core", frozen)]
 pub struct OutputSimulation {
     inner: Arc<output_samples::OutputSimulation>,
-    /// Number of values on a grid of one pulse per sampling interval.
+    /// Number of values of all signals on a grid of one pulse per sampling interval.
     points: usize,
 }
 
-/// Initial terms: (true to fit coefficients, (exponent, coefficient) by equation, true to fit levels as well).
+/// Initial terms: (true to fit their coefficients, [(exponent, coefficient), …] by equation, true to fit levels as
+/// well).
 type TermsArg = (bool, List<List<(f64, f64)>>, bool);
 
 fn initial_terms((fitted, terms, has_level): TermsArg) -> InitialTerms {
@@ -231,7 +232,7 @@ impl OutputSimulation {
         })
     }
 
-    /// Samples on a grid of `every` pulses per sampling interval, and initial terms.
+    /// Return (samples, initial terms) of a simulation on a grid of `every` pulses per sampling interval.
     #[pyo3(signature = (every, terms, stop=None))]
     fn samples<'py>(
         &self,
@@ -245,7 +246,7 @@ impl OutputSimulation {
         samples_tuple(py, run_interruptible(py, points, stop, move |_| inner.samples(every, &initial))?)
     }
 
-    /// Exact samples of a model with integer orders, and initial terms; None if it needs a grid.
+    /// Return (exact samples, initial terms) of a model with integer orders. None if the model needs a grid.
     #[pyo3(signature = (terms, stop=None))]
     fn exact_samples<'py>(
         &self,
@@ -258,8 +259,8 @@ impl OutputSimulation {
         exact.map(|samples| samples_tuple(py, samples)).transpose()
     }
 
-    /// Samples in the limit of zero step, initial terms, pulses per sampling interval, and remaining relative change by
-    /// output.
+    /// Refine the step. Return ((extrapolated samples, initial terms), pulses per sampling interval of the finest grid,
+    /// change). The change is the remaining change of each output, relative to its largest magnitude.
     #[pyo3(signature = (terms, tolerance, max_pulses, long_record_intervals, memory, stop=None))]
     #[allow(clippy::too_many_arguments)]
     fn refine<'py>(
@@ -274,7 +275,7 @@ impl OutputSimulation {
     ) -> PyResult<(SamplesTuple<'py>, usize, Bound<'py, PyArray1<f64>>)> {
         let (inner, initial) = (Arc::clone(&self.inner), initial_terms(terms));
         let options = Refinement { tolerance, max_pulses, long_record_intervals, memory };
-        // How far a simulation is refined is not known.
+        // The number of refinements is not known beforehand, so the work always runs on a separate thread.
         let samples = run_interruptible(py, usize::MAX, stop, move |stop| inner.refine(&initial, options, stop))?;
         Ok((samples_tuple(py, samples.samples)?, samples.refinement, PyArray1::from_vec(py, samples.change)))
     }
@@ -303,8 +304,8 @@ impl OutputSimulation {
         })
     }
 
-    /// Fit the initial terms of a model with friction or non-linear terms on a grid; return (exponent, coefficient) by
-    /// equation.
+    /// Fit the initial terms of a model with friction or non-linear terms to the measured outputs. Return (exponent,
+    /// coefficient) of each term, by equation.
     #[pyo3(signature = (start, every, stop=None))]
     fn fit_initial_states(
         &self,
@@ -318,8 +319,8 @@ impl OutputSimulation {
     }
 }
 
-/// Extrapolate samples on grids with 1, 1/2, 1/4, … of a step to zero step. Return the samples, the change of each
-/// output, and the extrapolated additional values, where `owners` is the output of each additional value.
+/// Extrapolate samples on grids with 1, 1/2, 1/4, … of a step to zero step. Return (samples, relative change of each
+/// output, extrapolated additional values). `owners` holds the output index of each additional value.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn richardson_limit<'py>(

@@ -11,7 +11,7 @@ use crate::rig::arm_model::{Arm, Parameters, SIGNAL_COUNT};
 use crate::rig::safety_guard::{self, Fault};
 use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
-/// Number of columns of a sample: two written currents, four angles, two measured currents, delay.
+/// Number of columns of a sample: two commanded currents, four angles, two measured currents, delay.
 const SAMPLE_COLUMNS: usize = 9;
 
 #[derive(FromPyObject)]
@@ -60,7 +60,7 @@ impl From<GuardSettings> for safety_guard::GuardSettings {
     }
 }
 
-/// Safety guard of one run, see module `rig::guard` of the core.
+/// Safety guard of one run; see module `rig::safety_guard` of the core.
 #[pyclass(module = "ftlm._core")]
 pub struct Guard {
     inner: safety_guard::Guard,
@@ -191,7 +191,7 @@ impl VirtualArm {
         Ok(Self { plant, step, pace: None, rows: Vec::new() })
     }
 
-    /// Start the arm with real-time deadlines from now on, or without deadlines, as fast as possible.
+    /// Start the arm. If `paced`, its deadlines count from now on in real time; otherwise it runs as fast as possible.
     fn start(&mut self, paced: bool) -> PyResult<()> {
         run_attached(|| {
             self.pace = if paced { Some(Pace::new(self.step)?) } else { None };
@@ -228,9 +228,11 @@ impl VirtualArm {
         run_attached(|| self.plant.inject(injection))
     }
 
-    /// Simulate the arm with 0 V at both motors, one sample for each row of `noise` (N × 4, in the units of the
-    /// sensors). The guard checks each reading. Each sample is written to `output`. The simulation ends early if a
-    /// fault is latched.
+    /// Simulate the arm with 0 V at both motors, one sample for each row of `noise` (N × 4, standard normal). The guard
+    /// checks each reading. The simulation ends early if a fault is latched.
+    ///
+    /// `output` is called with the two voltages of each sample. It returns (voltages at the amplifiers, true if these
+    /// are enabled).
     #[allow(clippy::needless_pass_by_value)]
     fn rest(
         &mut self,
@@ -255,7 +257,8 @@ impl VirtualArm {
         Ok(())
     }
 
-    /// Run samples with commands, until the commands end or a fault is latched. `take` returns the readings.
+    /// Simulate the arm with `commands` (N × 2, currents \[A\]) and `noise` (N × 4, standard normal), until the
+    /// commands end or a fault is latched. `output` is the same function as in `rest`. `take` returns the samples.
     #[allow(clippy::needless_pass_by_value)]
     fn run(
         &mut self,
@@ -281,7 +284,7 @@ impl VirtualArm {
                 let v = guard.inner.read(&reading, late);
                 let volts = guard.inner.command([command[0], command[1]]);
                 let [i1, i2] = guard.inner.last_currents();
-                // A reading that is not finite raises a fault and is not recorded.
+                // A reading that is not finite latches a fault and is not stored.
                 if v.iter().all(|x| x.is_finite()) {
                     self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
                 }
@@ -330,7 +333,7 @@ impl VirtualArm {
         }
     }
 
-    /// Write volts to the output stage, and advance the arm by one sample with the resulting volts.
+    /// Call `output` with two voltages, and advance the arm by one sample with the voltages that it returns.
     fn write(&mut self, output: &Bound<'_, PyAny>, volts: [f64; 2]) -> PyResult<()> {
         let (through, enabled): ([f64; 2], bool) = output.call1((volts[0], volts[1]))?.extract()?;
         run_attached(|| {
@@ -340,8 +343,9 @@ impl VirtualArm {
     }
 }
 
-/// Fractional integral I^q of a signal that is linear between samples, computed online by a sum of exponentials, as in
-/// the virtual arm.
+/// Return the fractional integral I^q of a signal that is linear between samples, and the number of history states. As
+/// in the virtual arm, a sum of exponentials computes it online. q is `order`, and `tolerance` the relative accuracy of
+/// the sum.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fractional_memory<'py>(

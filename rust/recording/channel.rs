@@ -9,40 +9,42 @@ use crate::signal::block_pulse::Intersample;
 /// Role of a signal in a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
-    /// Input of the machine, with its behavior between samples.
+    /// Input, with its behavior between samples.
     Input(Intersample),
     /// Output, linear between samples.
     Output,
-    /// Signal computed from others, held between samples; its values at single times are not known.
+    /// Signal computed from other signals and held between samples. Its values at single times are not known.
     Derived,
 }
 
-/// Saturation or dead zone of an input; the value is None while it is to be estimated.
+/// Saturation or dead zone of an input, and its value in the unit of the input. The value is None if it is to be
+/// estimated.
 pub type Nonlinearity = (InputLaw, Option<f64>);
 
 /// One signal of a recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Channel {
-    /// Name for messages.
+    /// Name of the signal for messages.
     pub name: String,
     /// Samples on the uniform grid of the recording; NaN for missing samples of an output.
     pub samples: Vec<f64>,
-    /// Samples at the nonuniform sample times of the recording, if it has any; NaN for missing samples of an output.
+    /// Samples at the nonuniform sample times of the recording, if it has such times; NaN for missing samples of an
+    /// output.
     pub nonuniform: Option<Vec<f64>>,
-    /// Input, output or derived signal.
+    /// Role of the signal: input, output or derived signal.
     pub role: Role,
-    /// Delay of an input \[s\]; None if the structure has no delay of this input.
+    /// Delay of an input \[s\]; None if the structure does not define a delay for it.
     pub delay: Option<f64>,
     /// Saturations and dead zones in the order in which they act.
     pub nonlinearities: Vec<Nonlinearity>,
-    /// Whether the signal was measured through the sensor filter.
+    /// True if the signal was measured through the sensor filter.
     pub is_filtered: bool,
-    /// Whether the signal enters an equation of another output.
+    /// True if the signal enters the equation of another output.
     pub enters_others: bool,
 }
 
 impl Channel {
-    /// Uniformly sampled signal without delay, non-linearity or filter.
+    /// Uniformly sampled signal without delay, saturation, dead zone or filter.
     #[must_use]
     pub fn new(name: &str, samples: Vec<f64>, role: Role) -> Self {
         Self {
@@ -57,10 +59,11 @@ impl Channel {
         }
     }
 
-    /// Return an error for invalid samples or limits.
+    /// Return an error for invalid samples, delay, saturations or dead zones.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] for a sample of an input, [`Error::OutOfRange`] for a limit below 0.
+    /// [`Error::NotFinite`] for a sample of an input or a delay that is not finite. [`Error::OutOfRange`] for a
+    /// saturation or dead zone that is negative or not finite.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Role};
@@ -85,7 +88,7 @@ impl Channel {
         }
     }
 
-    /// Behavior between samples.
+    /// Return the behavior of the signal between its samples.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Role};
@@ -101,17 +104,17 @@ impl Channel {
         }
     }
 
-    /// Whether the signal is an input that is held between samples.
+    /// True if the signal is an input with zero-order hold.
     pub(crate) fn is_held_input(&self) -> bool {
         self.role == Role::Input(Intersample::Hold)
     }
 
-    /// Delay \[s\].
+    /// Delay \[s\]; 0 without a delay.
     pub(crate) fn lag(&self) -> f64 {
         self.delay.unwrap_or(0.0)
     }
 
-    /// Apply the known saturations and dead zones of the channel to samples.
+    /// Return samples with the known saturations and dead zones of the channel applied.
     pub(super) fn behind_limits<'a>(&self, samples: &'a [f64]) -> Cow<'a, [f64]> {
         let mut limited = Cow::Borrowed(samples);
         for (law, limit) in self.nonlinearities.iter().filter_map(|(law, value)| value.map(|value| (law, value))) {
@@ -123,7 +126,7 @@ impl Channel {
         limited
     }
 
-    /// Channel of the first `rows` uniform and the first `nonuniform` nonuniform samples.
+    /// Return the channel with the first `rows` uniform and the first `nonuniform` nonuniform samples.
     pub(super) fn leading_part(&self, rows: usize, nonuniform: usize) -> Self {
         let first = |samples: &[f64], count: usize| samples[..count.min(samples.len())].to_vec();
         Self {

@@ -1,10 +1,10 @@
-//! Recordings: measured runs that are sampled on any grid of block pulses, as source of a joint fit.
+//! Recordings: measured runs that can be sampled on any grid of block pulses, for joint fits.
 //!
-//! A recording contains the uniform samples of every signal of a structure, and the nonuniform samples if there are
-//! any. It also has gaps, delays, saturations, dead zones and the sensor filter. It computes the pulse means of the
-//! signals in the equations ([`Recording::pulses`]), and the samples for comparison with a simulation
-//! ([`Recording::experiment`]). Outputs are linear between samples, inputs as they were recorded. Missing samples are
-//! interpolated where pulse means need them, and have weight 0 where samples are compared.
+//! A recording contains the uniform samples of every signal of a structure, and nonuniform samples if there are any. It
+//! also describes gaps, delays, saturations, dead zones and the sensor filter. [`Recording::pulses`] computes the pulse
+//! means of the signals in the equations. [`Recording::experiment`] adds the samples to compare with a simulation.
+//! Outputs are linear between samples, and inputs are held or linear, as declared. Missing samples are interpolated for
+//! pulse means, and have weight 0 in the comparison.
 
 mod channel;
 mod recordings;

@@ -1,4 +1,4 @@
-//! Recordings of one structure, as source of a joint fit.
+//! Recordings of one structure: the measured runs of a joint fit.
 
 use super::channel::{Channel, Role};
 use super::run::{Recording, Sampling};
@@ -7,7 +7,7 @@ use crate::estimation::output_error::Experiment;
 use crate::regressors::Record;
 use crate::signal::block_pulse::Intersample;
 
-/// Recordings of one structure: the runs of a joint fit.
+/// Recordings with the same signals and outputs: the runs of a joint fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recordings {
     runs: Vec<Recording>,
@@ -18,7 +18,8 @@ impl Recordings {
     /// Recordings with the same signals.
     ///
     /// # Errors
-    /// [`Error::Length`] for different numbers of signals or free inputs, [`Error::Structure`] for different outputs.
+    /// [`Error::Length`] for different numbers of signals or free input parameters, [`Error::Structure`] for different
+    /// outputs.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -44,7 +45,7 @@ impl Recordings {
         Ok(Self { runs, memory: usize::MAX })
     }
 
-    /// Set the memory limit of all experiments in bytes.
+    /// Return the recordings with a memory limit \[bytes\] for all experiments together.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
@@ -61,23 +62,24 @@ impl Recordings {
         Self { memory: bytes, ..self }
     }
 
-    /// The runs.
+    /// The recordings, one per run.
     #[must_use]
     pub fn runs(&self) -> &[Recording] {
         &self.runs
     }
 
-    /// Sampling interval and duration of each run \[s\].
+    /// Return the sampling interval and the duration of each run \[s\].
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn spans(&self) -> Vec<(f64, f64)> {
         self.runs.iter().map(|run| (run.step(), run.len() as f64 * run.step())).collect()
     }
 
-    /// The runs on a grid.
+    /// Return the experiment of each run on a grid of block pulses.
     ///
     /// # Errors
-    /// [`Error::Memory`] for a grid above the memory limit; as [`Recording::experiment`].
+    /// [`Error::Memory`] for a grid above the memory limit. The errors of [`Recording::experiment`] for an invalid
+    /// grid.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role, Sampling};
@@ -98,7 +100,8 @@ impl Recordings {
         self.runs.iter().map(|run| run.experiment(sampling)).collect()
     }
 
-    /// Intersample behavior of each input, a hold if it is held in any run; None for other signals.
+    /// Return the behavior of each input between samples: a hold if the input is held in any run. None for other
+    /// signals.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role};
@@ -121,10 +124,10 @@ impl Recordings {
         self.runs.first().into_iter().flat_map(|run| run.channels().iter().enumerate()).map(of).collect()
     }
 
-    /// Uniform samples of a signal by run; NaN for missing samples.
+    /// Return the uniform samples of a signal in each run; NaN for missing samples.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a signal that does not exist.
+    /// [`Error::Structure`] for a signal index out of range.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role};
@@ -141,12 +144,14 @@ impl Recordings {
         self.runs.iter().map(of).collect()
     }
 
-    /// Records of the measured signals with `m` block pulses, all filtered by the sensor filter, with these values of
-    /// the free input parameters. Missing samples are interpolated.
+    /// Return the record of each run over `m` block pulses, with all signals filtered by the sensor filter. Missing
+    /// samples are interpolated.
+    ///
+    /// `inputs` holds the values of the free input parameters. Outputs enter other equations as measured.
     ///
     /// # Errors
-    /// An invalid number of pulses or a signal that is too small ([`Recording::pulses`]); a wrong number of values in
-    /// `inputs` ([`Recording::with_free_inputs`]).
+    /// The errors of [`Recording::pulses`], for an invalid number of pulses or a signal that is too small. The errors
+    /// of [`Recording::with_free_inputs`], for a wrong number of values in `inputs`.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Recordings, Role};

@@ -1,4 +1,5 @@
-//! Recording of one run on any grid: pulse means of its signals, and samples for comparison with a simulation.
+//! Recording of one run that can be sampled on any grid: pulse means of its signals, and samples to compare with a
+//! simulation.
 
 use std::borrow::Cow;
 
@@ -17,25 +18,25 @@ use crate::signal::nonuniform::{check_times, interpolate, interpolate_gaps, Nonu
 
 /// Minimum number of samples of a recording.
 const MIN_SAMPLES: usize = 3;
-/// Minimum peak of a nonzero signal. Squares of smaller signals underflow.
+/// Minimum peak magnitude of a nonzero signal. Squares of smaller values underflow.
 pub(crate) const MIN_SIGNAL_PEAK: f64 = 1e-140;
 
-/// Sampling of the runs: step, decimation and length.
+/// Sampling of runs: block pulses, decimation and length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Sampling {
-    /// Block pulses per sampling interval.
+    /// Number of block pulses per sampling interval after decimation.
     pub pulses_per_sample: usize,
-    /// Decimation factor of the samples.
+    /// Decimation factor: one of this many successive samples is used.
     pub decimation: usize,
-    /// Number of leading sampling intervals of each run to use; None for all.
+    /// Number of leading sampling intervals of each run that are used; None for all.
     pub leading_intervals: Option<usize>,
 }
 
 impl Sampling {
-    /// Check that the numbers of pulses and the decimation are positive and not too large.
+    /// Return an error for an invalid number of pulses or decimation factor.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a number that is zero or too large.
+    /// [`Error::OutOfRange`] for a value that is zero or too large.
     ///
     /// ```
     /// # use ftlm::recording::Sampling;
@@ -62,7 +63,7 @@ impl Default for Sampling {
     }
 }
 
-/// One run, with the roles, delays and limits that a structure gives its signals.
+/// One measured run. Its signals have the roles, delays, saturations and dead zones that a structure defines.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -83,45 +84,46 @@ pub struct Recording {
     times: Option<Vec<f64>>,
     channels: Vec<Channel>,
     outputs: Vec<usize>,
-    /// Sensor filter that some signals passed.
+    /// Sensor filter that some signals have passed; None without a filter.
     pub filter: Option<Filter>,
-    /// Number of unknown initial states of the sensor filter: 0 with zero initial conditions.
+    /// Number of unknown initial states of the sensor filter; 0 with zero initial conditions.
     pub filter_states: usize,
-    /// Whether all signals were zero before the first sample.
+    /// True if all signals were zero before the first sample.
     pub is_at_rest: bool,
     /// True if other outputs enter an equation as simulated, false if as measured.
     pub is_coupled: bool,
-    /// True if an equation has friction or non-linear terms, so that outputs are simulated before the filter.
+    /// True if an equation has friction or non-linear terms. Outputs are then simulated before the sensor filter.
     pub has_friction: bool,
-    /// Signal and law of each delay, saturation and dead zone that is to be estimated.
+    /// Signal index and kind of each delay, saturation and dead zone that is to be estimated.
     pub free_inputs: Vec<(usize, InputLaw)>,
 }
 
-/// Pulse means of a recording.
+/// Pulse means of the signals of a recording, with their filter, initial levels and jumps.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pulses {
     /// Pulse width \[s\].
     pub step: f64,
-    /// Means of each signal.
+    /// Pulse means of each signal.
     pub means: Vec<PulseMeans>,
-    /// Series of the sensor filter, if all signals have passed it.
+    /// Sensor filter as a power series in the one-step delay, if all signals have passed it.
     pub filter: Option<Vec<f64>>,
-    /// Signals that may contain an initial transient of their sensor filter.
+    /// For each signal, whether it may contain an initial transient of the sensor filter.
     pub has_transient: Vec<bool>,
-    /// Initial level of each signal, from which improper terms measure deviations; 0 with zero initial conditions.
+    /// Initial level of each signal; 0 with zero initial conditions. Improper terms act on the deviation from this
+    /// level.
     pub initial_levels: Vec<f64>,
-    /// Pulse means of the known responses of the filter to an impulse and its derivatives.
+    /// Pulse means of the responses of the sensor filter to an impulse and its derivatives, one row for each.
     pub impulse_responses: Vec<Vec<f64>>,
-    /// Jumps of each zero-order-hold signal within pulses. Empty without friction, and for pulses that are longer than a
+    /// Jumps of each zero-order-hold signal within pulses. Empty without friction, and if pulses are longer than a
     /// sampling interval.
     pub jumps: Vec<Vec<PulseJump>>,
 }
 
 impl Pulses {
-    /// Record without initial state.
+    /// Return the record without filter transients and initial levels.
     ///
     /// # Errors
-    /// [`crate::error::Error::NotFinite`] for a pulse mean that is not finite, and an invalid step ([`Record::new`]).
+    /// The errors of [`Record::new`], for a pulse mean that is not finite or an invalid step.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -141,10 +143,10 @@ impl Pulses {
         }
     }
 
-    /// Record with the filter transients and initial levels, if there are any.
+    /// Return the record with the filter transients and initial levels, if there are any.
     ///
     /// # Errors
-    /// [`crate::error::Error::NotFinite`] for a pulse mean that is not finite, and an invalid step ([`Record::new`]).
+    /// The errors of [`Record::new`], for a pulse mean that is not finite or an invalid step.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -170,12 +172,14 @@ impl Pulses {
 }
 
 impl Recording {
-    /// Recording of signals with a uniform sampling interval. With `times` \[s\], it also has nonuniform samples.
+    /// Recording of signals with the sampling interval `step` \[s\]. `times` \[s\] holds the nonuniform sample times,
+    /// if any.
     ///
-    /// `outputs` are the signals that equations simulate, in the sequence of the equations.
+    /// `outputs` holds the indices of the signals that equations simulate, in the sequence of the equations.
     ///
     /// # Errors
-    /// [`Error::Length`] for unequal or too few samples; as [`Channel::check`]; times that do not ascend from 0.
+    /// [`Error::Length`] for unequal or too few samples. [`Error::Structure`] for an output index out of range, or for
+    /// times that do not ascend from 0. The errors of [`Channel::check`] for an invalid channel.
     pub fn new(
         name: &str,
         step: f64,
@@ -217,10 +221,10 @@ impl Recording {
         })
     }
 
-    /// Recording of other signals with the same sample times, sensor filter and initial state.
+    /// Return a recording of other signals with the same sample times, sensor filter and initial conditions.
     ///
     /// # Errors
-    /// Samples of unequal length, or a channel that is invalid ([`Recording::new`]).
+    /// The errors of [`Recording::new`], for samples of unequal length or an invalid channel.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -244,16 +248,16 @@ impl Recording {
         })
     }
 
-    /// Name for messages.
+    /// Name of the run for messages.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Recording of uniform samples whose outputs are the channels of that role, in their sequence.
+    /// Recording of uniform samples. Its outputs are the channels with [`Role::Output`], in their sequence.
     ///
     /// # Errors
-    /// Samples of unequal length, or a channel that is invalid ([`Self::new`]).
+    /// The errors of [`Self::new`], for samples of unequal length or an invalid channel.
     pub fn from_channels(step: f64, channels: Vec<Channel>) -> Result<Self> {
         let outputs = (0..channels.len()).filter(|&signal| channels[signal].role == Role::Output).collect();
         Self::new("run", step, None, channels, outputs)
@@ -265,10 +269,10 @@ impl Recording {
         &self.channels
     }
 
-    /// Signal by its number.
+    /// Return a signal by its index.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a signal that the recording does not have.
+    /// [`Error::Structure`] for an index out of range.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -286,7 +290,7 @@ impl Recording {
         })
     }
 
-    /// Signals that equations simulate.
+    /// Indices of the signals that equations simulate.
     #[must_use]
     pub fn outputs(&self) -> &[usize] {
         &self.outputs
@@ -298,7 +302,7 @@ impl Recording {
         self.channels.first().map_or(0, |channel| channel.samples.len())
     }
 
-    /// Whether the recording has no samples; always false.
+    /// Always false: a recording has at least three samples.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -310,17 +314,17 @@ impl Recording {
         self.step
     }
 
-    /// Time from the first uniform sample to the last \[s\].
+    /// Time from the first to the last uniform sample \[s\].
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn duration(&self) -> f64 {
         (self.len() - 1) as f64 * self.step
     }
 
-    /// Recording with these values of the delays and limits that are to be estimated.
+    /// Return the recording with these values of the delays, saturations and dead zones in `free_inputs`.
     ///
     /// # Errors
-    /// [`Error::Length`]; as [`Channel::check`].
+    /// [`Error::Length`] for a wrong number of values. The errors of [`Channel::check`] for an invalid value.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -352,7 +356,7 @@ impl Recording {
         Ok(copy)
     }
 
-    /// Recording of the leading samples.
+    /// Return the recording of the first `rows` samples.
     ///
     /// # Errors
     /// [`Error::Recording`] for fewer than three samples.
@@ -375,7 +379,7 @@ impl Recording {
             let what = format!("window: {rows} rows remain, {MIN_SAMPLES} are needed");
             return Err(Error::Recording { what, remedy: "widen the limits".into() });
         }
-        // The next sample after the last uniform one belongs to the line between both.
+        // Interpolation up to the last uniform sample requires the nonuniform sample that follows it.
         let end = (rows - 1) as f64 * self.step + self.step;
         let nonuniform = self.times.as_ref().map_or(0, |times| times.partition_point(|time| *time <= end));
         let of = |channel: &Channel| channel.leading_part(rows, nonuniform);
@@ -390,26 +394,27 @@ impl Recording {
         }))
     }
 
-    /// True if a measured signal that passed the sensor filter enters the equations. They then relate filtered signals.
+    /// True if the equations relate filtered signals, because a measured signal that has passed the sensor filter
+    /// enters them.
     #[must_use]
     pub fn is_all_filtered(&self) -> bool {
         let simulated = |signal| (self.is_coupled || self.has_friction) && self.outputs.contains(&signal);
         self.channels.iter().enumerate().any(|(signal, channel)| channel.is_filtered && !simulated(signal))
     }
 
-    /// Whether the samples have nonuniform times.
+    /// True if the recording has nonuniform sample times.
     #[must_use]
     pub fn has_nonuniform_samples(&self) -> bool {
         self.times.is_some()
     }
 
-    /// Whether outputs are compared at nonuniform sample times.
+    /// True if simulations are compared with the measurement at nonuniform sample times.
     fn compares_nonuniform_samples(&self) -> bool {
         self.times.is_some() && self.free_inputs.is_empty() && !self.is_all_filtered()
     }
 
-    /// States of the sensor filter, if its transient is removed from a signal that enters equations as measured; else
-    /// None.
+    /// Return the states of the sensor filter if its initial transient is removed from a signal, otherwise None. The
+    /// transient is removed from filtered signals that enter other equations as measured.
     fn removed_transient(&self, signal: usize) -> Option<FilterStates> {
         let channel = &self.channels[signal];
         let simulated = self.is_coupled && self.outputs.contains(&signal);
@@ -421,7 +426,8 @@ impl Recording {
         FilterStates::of(self.filter.as_ref()?).filter(|states| states.lasts(self.step))
     }
 
-    /// Samples of a signal in the equations: after its limits, without the transient of its sensor filter.
+    /// Return the uniform samples of a signal as it enters the equations. Known saturations and dead zones are applied,
+    /// and the initial transient of the sensor filter is removed.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -444,7 +450,7 @@ impl Recording {
         }
     }
 
-    /// Nonuniform samples of a signal in the equations; the uniform samples if there are no others.
+    /// Return the nonuniform samples of a signal as it enters the equations; None if it has no nonuniform samples.
     fn acting_nonuniform_samples(&self, signal: usize) -> Option<Cow<'_, [f64]>> {
         let (channel, times) = (&self.channels[signal], self.times.as_ref()?);
         let limited = channel.behind_limits(channel.nonuniform.as_ref()?);
@@ -465,7 +471,8 @@ impl Recording {
         (0..self.len()).map(|row| row as f64 * self.step).collect()
     }
 
-    /// Value of a delayed signal before its first sample.
+    /// Return the value of a delayed signal before its first sample: 0 with zero initial conditions, otherwise that
+    /// sample.
     pub(crate) fn value_before(&self, samples: &[f64]) -> f64 {
         if self.is_at_rest {
             0.0
@@ -474,11 +481,11 @@ impl Recording {
         }
     }
 
-    /// Means over `m` pulses of a signal in the equations: exact integrals of the recorded signal after limits and
-    /// delay.
+    /// Return the means over `m` pulses of a signal as it enters the equations. They are exact integrals of the
+    /// recorded signal with known saturations, dead zones and delay applied.
     ///
     /// # Errors
-    /// No pulse or too many, a sample that is not finite.
+    /// [`Error::OutOfRange`] for no pulse or too many pulses, [`Error::NotFinite`] for a sample that is not finite.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -508,8 +515,8 @@ impl Recording {
         let mut samples = interpolate_gaps(&acting);
         if channel.lag() != 0.0 {
             let intervals = self.len() - 1;
-            // On a finer grid the delayed command switches within an interval, so it is held on that grid before the
-            // delay.
+            // On a finer grid a delayed command switches within a sampling interval. Its samples are therefore repeated
+            // on that grid before the delay is applied.
             let every = if intersample == Intersample::Hold && m.is_multiple_of(intervals) {
                 (m / intervals).max(1)
             } else {
@@ -523,14 +530,14 @@ impl Recording {
         pulse_means(&samples, m, intersample)
     }
 
-    /// Pulse means of every signal in the equations.
+    /// Return the pulse means of all signals as they enter the equations.
     ///
-    /// If `filtered`, signals that were not measured through the sensor filter are filtered.
-    ///
-    /// The equations then hold for filtered signals.
+    /// If `filtered`, signals that were not measured through the sensor filter are filtered. The equations then relate
+    /// filtered signals.
     ///
     /// # Errors
-    /// As [`Recording::pulse_means`] and [`Filter::series`]; [`Error::Recording`] for a signal whose squares underflow.
+    /// The errors of [`Recording::pulse_means`] and [`Filter::series`]. [`Error::Recording`] for a signal whose squares
+    /// underflow.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -586,7 +593,8 @@ impl Recording {
         })
     }
 
-    /// Initial level of a signal; 0 with zero initial conditions, for filtered inputs, and for a missing first sample.
+    /// Return the initial level of a signal. It is 0 with zero initial conditions, for derived signals, and if the
+    /// first sample is missing. It is also 0 for filtered signals if the equations relate filtered signals.
     fn initial_level(&self, signal: usize) -> f64 {
         let channel = &self.channels[signal];
         if self.is_at_rest || channel.role == Role::Derived || (channel.is_filtered && self.is_all_filtered()) {
@@ -600,13 +608,14 @@ impl Recording {
         }
     }
 
-    /// Experiment: the run on a grid, with the samples for comparison with a simulation.
+    /// Return the experiment on a grid: pulse means of the signals, and the samples to compare with a simulation.
     ///
-    /// Free delays and limits are left to the fit. Weights of outputs are 1; missing samples have weight 0.
+    /// Free delays, saturations and dead zones are not applied, because the fit determines them. Outputs have weight 1,
+    /// and missing samples weight 0.
     ///
     /// # Errors
-    /// An invalid number of pulses ([`Recording::pulses`]), fewer than three samples ([`Recording::leading_part`]), or
-    /// weights that do not match the outputs ([`Experiment::check`]).
+    /// The errors of [`Recording::pulses`] for an invalid number of pulses, of [`Recording::leading_part`] for fewer
+    /// than three samples, and of [`Experiment::check`].
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role, Sampling};
@@ -664,8 +673,8 @@ impl Recording {
         }
     }
 
-    /// Samples of each output as recorded, at the times at which simulations are compared with the measurement. Missing
-    /// samples are NaN.
+    /// Return the recorded samples of each output: the nonuniform samples if simulations are compared with these,
+    /// otherwise the uniform samples. Missing samples are NaN.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -686,7 +695,8 @@ impl Recording {
         outputs.map(|channel| channel.leading_part(0, count).nonuniform.unwrap_or_default()).collect()
     }
 
-    /// Memory of an experiment \[bytes\]: pulse means and values of the signals, samples and weights of the outputs.
+    /// Return the memory of an experiment \[bytes\]: pulse means and values of the signals, samples and weights of the
+    /// outputs.
     pub(super) fn bytes(&self, sampling: Sampling) -> usize {
         let rows = self.len().min(sampling.leading_intervals.unwrap_or(usize::MAX)) / sampling.decimation;
         let pulses = rows.saturating_mul(sampling.pulses_per_sample);
@@ -694,11 +704,11 @@ impl Recording {
         signals.saturating_add(2 * rows * self.outputs.len()).saturating_mul(size_of::<f64>())
     }
 
-    /// Samples of each output for the comparison with a simulation on a grid of `every` block pulses per sampling
-    /// interval. Missing samples are NaN.
+    /// Return the samples of each output to compare with a simulation on a grid of `every` block pulses per sampling
+    /// interval. They are filtered if the equations relate filtered signals. Missing samples are NaN.
     ///
     /// # Errors
-    /// An invalid number of pulses, or a sample that is not finite ([`Recording::pulses`]).
+    /// The errors of [`Recording::pulses`], for an invalid number of pulses or a sample that is not finite.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -719,7 +729,7 @@ impl Recording {
         Ok(self.outputs.iter().map(|&output| self.compared_samples(output, &pulses, every, 1)).collect())
     }
 
-    /// Recording of `rows` samples of zero, except for one unit sample (signal, row) if given.
+    /// Return a recording of `rows` samples that are zero. If `sample` is (signal, row), this one sample is 1.
     pub(crate) fn unit_recording(&self, rows: usize, sample: Option<(usize, usize)>) -> Self {
         let of = |(signal, channel): (usize, &Channel)| {
             let mut samples = vec![0.0; rows];
@@ -746,7 +756,8 @@ impl Recording {
         }
     }
 
-    /// Samples of an output for comparison; filtered if the equations hold for filtered signals.
+    /// Return the samples of an output to compare with a simulation. They are filtered if the equations relate filtered
+    /// signals.
     fn compared_samples(&self, output: usize, pulses: &Pulses, every: usize, decimation: usize) -> Vec<f64> {
         let channel = &self.channels[output];
         if pulses.filter.is_none() || channel.is_filtered {
@@ -755,10 +766,11 @@ impl Recording {
         point_samples(pulses.means[output].values()).into_iter().step_by(every).collect()
     }
 
-    /// Values of a signal at the samples, after any jump there.
+    /// Return the values of a signal at the sample times, after any jump at these times.
     ///
-    /// None for a filtered or derived signal, which has no jump or slope discontinuity at the samples, and for a signal
-    /// with missing samples.
+    /// The values are None for derived signals. They are None for signals to which the sensor filter is applied
+    /// numerically, because these have no jumps or slope discontinuities. They are also None for an output with missing
+    /// samples.
     fn point_values(&self, signal: usize, pulses: &Pulses, every: usize, decimation: usize) -> Result<PointValues> {
         let channel = &self.channels[signal];
         let smooth = pulses.filter.is_some() && !channel.is_filtered;
@@ -769,7 +781,7 @@ impl Recording {
         }
         let is_zero_order_hold = channel.is_held_input();
         if channel.lag() != 0.0 && is_zero_order_hold {
-            // A command switches between samples after a delay: what it is then is the pulse that follows.
+            // A delayed command switches between samples. Its value at a sample time is that of the pulse that follows.
             let mut values: Vec<f64> = pulses.means[signal].values().iter().copied().step_by(every).collect();
             values.extend(values.last().copied());
             return Ok(PointValues { values: Some(values), is_zero_order_hold });
@@ -781,8 +793,8 @@ impl Recording {
         Ok(PointValues { values: Some(samples.iter().copied().step_by(decimation).collect()), is_zero_order_hold })
     }
 
-    /// Experiment at nonuniform sample times, with the samples and point values. The first sample gives the initial
-    /// levels.
+    /// Return the experiment at nonuniform sample times, the weights of its samples, and the point values of each
+    /// signal. The weights are None if no sample is missing. Samples at t = 0 are not compared.
     #[allow(clippy::cast_precision_loss, clippy::type_complexity)]
     fn nonuniform_experiment(
         &self,
@@ -818,7 +830,8 @@ impl Recording {
         Ok((Experiment::with_nonuniform_samples(record, samples, weights, own)?, unread, point_values))
     }
 
-    /// Times \[s\] and sizes of the jumps of a zero-order-hold input after its delay; None for other signals.
+    /// Return the times \[s\] and sizes of the jumps of a zero-order-hold input with its delay applied; None for other
+    /// signals.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -837,7 +850,8 @@ impl Recording {
         self.with_signal(signal, |line| line.jumps()).flatten()
     }
 
-    /// Values of a signal just after given times \[s\]; None for a derived signal.
+    /// Return the values of a signal just after the given times \[s\], with delay and limits applied; None for a
+    /// derived signal.
     ///
     /// ```
     /// # use ftlm::recording::{Channel, Recording, Role};
@@ -853,7 +867,8 @@ impl Recording {
         self.with_signal(signal, |line| line.at(times))
     }
 
-    /// Evaluate a signal after limits and delay, at its own times; None for a derived signal.
+    /// Apply a function to a signal at its own sample times, with saturations, dead zones and delay applied. Return
+    /// None for a derived signal.
     fn with_signal<T>(&self, signal: usize, of: impl FnOnce(NonuniformSignal<'_>) -> T) -> Option<T> {
         let channel = &self.channels[signal];
         if channel.role == Role::Derived {
@@ -869,7 +884,8 @@ impl Recording {
     }
 }
 
-/// Samples with 0 in place of missing ones, and the weight of each sample; None if none is missing.
+/// Replace missing samples (NaN) by 0. Return the samples and their weights. A missing sample has weight 0, any other
+/// sample weight 1. The weights are None if no sample is missing.
 fn without_gaps(samples: Vec<Vec<f64>>) -> (Vec<Vec<f64>>, Option<Vec<Vec<f64>>>) {
     if !samples.iter().flatten().any(|v| v.is_nan()) {
         return (samples, None);

@@ -1,7 +1,7 @@
 //! States of a sensor filter without zeros: its initial transient in a signal, and its responses to impulses.
 //!
-//! A signal filtered from an unknown initial state contains a sum of the responses of the filter to an impulse and its
-//! derivatives. On a pulse grid an impulse would last for one pulse, and its derivative for two. The responses are
+//! A signal that was filtered from an unknown initial state contains responses of the filter to an impulse and its
+//! derivatives. On a grid of pulses, an impulse would last for one pulse, and its derivative for two. The responses are
 //! therefore computed from the states of the filter.
 
 use crate::equation::Filter;
@@ -11,28 +11,30 @@ use crate::linalg::orthogonal::norm;
 use crate::linalg::small::spectral_radius;
 use crate::state_space::exponential;
 
-/// Length of the fit of the transient, in time constants of the fastest pole. Over this time the input of the filter is
-/// nearly a straight line.
+/// Length of the record to which the transient is fitted, in time constants of the fastest pole. Over this time the
+/// input of the filter is nearly a straight line.
 const TRANSIENT_FIT_TIME_CONSTANTS: f64 = 1.0;
+/// Minimum number of samples per parameter in the fit of the transient.
 const SAMPLES_PER_PARAMETER: usize = 2;
-/// Product of fastest pole and sampling interval above which the transient has decayed before the second sample.
+/// Product of the fastest pole \[rad/s\] and the sampling interval \[s\] above which the transient has decayed before
+/// the second sample.
 const MAX_POLE_STEP_PRODUCT: f64 = 1e3;
 
-/// State-space form of a filter without zeros: a chain of integrators that starts at the output.
+/// State-space form of a filter without zeros: a chain of integrators whose first state is the output.
 pub(super) struct FilterStates {
     /// Number of states.
     size: usize,
-    /// Row-major system matrix.
+    /// System matrix, row-major.
     system: Vec<f64>,
-    /// Gain of the input of the filter on the last state.
+    /// Gain from the input of the filter to the last state.
     gain: f64,
     /// Magnitude of the fastest pole \[rad/s\].
     fastest: f64,
 }
 
 impl FilterStates {
-    /// States of a filter; None if it has zeros, fractional orders or order 0, because its transients are not impulse
-    /// responses then.
+    /// State-space form of a filter. None if the filter has zeros, fractional orders or order 0, because its transients
+    /// are then not impulse responses.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn of(filter: &Filter) -> Option<Self> {
         let whole = |order: f64| order.fract() == 0.0;
@@ -53,14 +55,14 @@ impl FilterStates {
         Some(Self { size, system, gain, fastest })
     }
 
-    /// True if a transient lasts beyond the first sample, for the sampling interval `step` \[s\].
+    /// True if a transient lasts beyond the first sample at the sampling interval `step` \[s\].
     pub(super) fn lasts(&self, step: f64) -> bool {
         self.fastest * step <= MAX_POLE_STEP_PRODUCT
     }
 
-    /// States after an impulse and its derivatives, as rows.
+    /// Return the states just after an impulse and after its first `count` − 1 derivatives, one row for each.
     fn impulse_states(&self, count: usize) -> Vec<Vec<f64>> {
-        // An impulse is caught by the last state; each derivative of one goes through the system once more.
+        // An impulse sets the last state. Each derivative multiplies by the system matrix once more.
         let mut state = vec![0.0; self.size];
         state[self.size - 1] = self.gain;
         let mut states = Vec::with_capacity(count);
@@ -75,8 +77,8 @@ impl FilterStates {
         self.system.chunks_exact(self.size).map(|row| row.iter().zip(state).map(|(a, x)| a * x).sum()).collect()
     }
 
-    /// System matrix extended by `more` states and multiplied by `step`. `links` are (row, column, value) of the
-    /// additional elements.
+    /// Return the system matrix with `more` additional states, multiplied by `step`. `links` holds (row, column, value)
+    /// of the additional elements.
     fn extended_system(&self, more: usize, links: &[(usize, usize, f64)], step: f64) -> Vec<f64> {
         let n = self.size + more;
         let mut whole = vec![0.0; n * n];
@@ -87,19 +89,18 @@ impl FilterStates {
         whole
     }
 
-    /// Initial transient of a filtered signal at its samples; None if it cannot be computed.
+    /// Return the initial transient of a filtered signal at its samples; None if it cannot be computed.
     ///
-    /// The first sample is entirely transient.
-    ///
-    /// Over the first samples the input of the filter is nearly a straight line. The response to it and `states`
-    /// responses to an impulse and its derivatives are fitted together.
+    /// The first sample is assumed to consist of the transient only. Over the first samples, the input of the filter is
+    /// nearly a straight line. The response to this line, and `states` responses to an impulse and its derivatives, are
+    /// fitted together.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn transient(&self, samples: &[f64], step: f64, states: usize) -> Option<Vec<f64>> {
         let row_count = TRANSIENT_FIT_TIME_CONSTANTS / (self.fastest * step);
         let row_count =
             if self.fastest > 0.0 { row_count.round_ties_even().min(samples.len() as f64) as usize } else { 0 };
         let count = row_count.max(SAMPLES_PER_PARAMETER * (states + 2)).min(samples.len());
-        // A level and a slope that come in are two states more, which nothing moves but the slope the level.
+        // Level and slope of the input are two additional states. The slope is constant, and the level is its integral.
         let n = self.size;
         let whole = self.extended_system(2, &[(n - 1, n, self.gain), (n, n + 1, 1.0)], step);
         let unit = |at: usize| (0..n + 2).map(|i| f64::from(u8::from(i == at))).collect::<Vec<f64>>();
@@ -127,17 +128,17 @@ impl FilterStates {
             .map(|mut rows| rows.remove(0))
     }
 
-    /// Means over `m` pulses of the responses to an impulse and its derivatives; empty if they are not finite or have
-    /// decayed within a pulse.
+    /// Return the means over `m` pulses of the responses to an impulse and its derivatives. Empty if the responses are
+    /// not finite or have decayed within a pulse.
     ///
     /// # Errors
-    /// Too many pulses.
+    /// [`Error::OutOfRange`](crate::error::Error::OutOfRange) for too many pulses.
     pub(super) fn impulse_responses(&self, states: usize, m: usize, step: f64) -> Result<Vec<Vec<f64>>> {
         check_points("m", m)?;
         if states == 0 || !self.lasts(step) {
             return Ok(Vec::new());
         }
-        // The integral of the response is one state more.
+        // The integral of the response is an additional state.
         let n = self.size;
         let starts: Vec<Vec<f64>> =
             self.impulse_states(states).iter().map(|state| [state.as_slice(), &[0.0]].concat()).collect();
@@ -147,10 +148,10 @@ impl FilterStates {
     }
 }
 
-/// Free response of one state at unit time steps, one row of `count` values for each initial state; None if it
-/// overflows.
+/// Return the free response of the state with index `state` at unit time steps, one row of `count` values for each
+/// initial state; None if it overflows.
 fn free_responses(system: &[f64], n: usize, starts: &[Vec<f64>], count: usize, state: usize) -> Option<Vec<Vec<f64>>> {
-    // Powers of the transition double the number of steps that are known: a row of each is read at those before.
+    // Multiplication by a power of the transition matrix doubles the number of known steps.
     let mut power = exponential(system, n)?;
     let rows = starts.len();
     let mut responses: Vec<f64> = starts.concat();

@@ -10,8 +10,8 @@
 //! four rates.
 //!
 //! Coulomb friction of a joint is a set-valued torque. It is expressed as a current that is subtracted from the motor
-//! current. At standstill it may have any value up to its limit. [`crate::friction::law`] gives it for one joint; an
-//! iteration couples the two joints.
+//! current. At standstill it may have any value up to its limit. [`crate::friction::law`] computes it for one joint,
+//! and an iteration couples the two joints.
 
 use crate::equation::{check_regular, tidy, Equation, ORDER_GRAIN};
 use crate::error::{check_length, check_step, Error, Result};
@@ -19,25 +19,27 @@ use crate::fractional::exponential_sum::{decay, Rates};
 use crate::friction::law::{pulse, Phase};
 use crate::linalg::small;
 
-/// Relative accuracy of the sums of exponentials, far below the error of the trapezoidal steps.
+/// Relative accuracy of the sums of exponentials that represent fractional kernels. It is far below the error of the
+/// trapezoidal steps.
 const MEMORY_TOLERANCE: f64 = 1e-10;
 /// Maximum number of iterations for the friction of both joints. Decoupled joints need one, coupled joints a few.
 const FRICTION_SWEEPS: usize = 60;
-/// Rounding error relative to the largest rate change by friction.
+/// Rounding error of a rate, relative to the largest change of the rate due to friction.
 const RATE_ROUNDING_RATIO: f64 = 1e-12;
 
 /// Maximum number of substeps per sample. A sample with more would take seconds.
 const MAX_SUBSTEPS: f64 = 1e6;
 
-/// Number of signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
+/// Number of signals of the arm's equations: angles θ₁₁, θ₁₂, θ₂₁, θ₂₂ and motor currents I₁, I₂.
 pub const SIGNAL_COUNT: usize = 6;
 
 /// Equations and friction of the arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// D^α θ = Σ c D^ν s of the four angles in order, over [`SIGNAL_COUNT`] signals with raw currents.
+    /// Equations D^α θ = Σ c D^ν s of the angles θ₁₁, θ₁₂, θ₂₁, θ₂₂, in this order. s is one of the [`SIGNAL_COUNT`]
+    /// signals. Friction is not subtracted from the motor currents.
     pub equations: Vec<Equation>,
-    /// Coulomb friction of each joint as a current \[A\].
+    /// Coulomb friction of each joint, expressed as a motor current \[A\].
     pub coulomb: [f64; 2],
 }
 
@@ -47,11 +49,11 @@ struct Operator {
     signal: usize,
     order: f64,
     into: [f64; 4],
-    /// Contributions to the momenta on the left side of the integrated equations.
+    /// Contributions to the momenta on the left-hand side of the integrated equations.
     momentum: [f64; 4],
-    /// Weights of the history states. Empty for orders 0 and 1.
+    /// Weights of the history states; empty for orders 0 and 1.
     weights: Vec<f64>,
-    /// Weight of the rate at the start of the substep.
+    /// Weight of the rate at the start of the substep. `now` is the weight of the rate at its end.
     before: f64,
     now: f64,
     /// Value of the derivative at the start of the substep.
@@ -67,7 +69,8 @@ pub struct Arm {
     /// Acceleration of each angle per ampere of each motor \[rad/(s² A)\].
     input: [[f64; 2]; 4],
     coulomb: [f64; 2],
-    /// Matrix (P − h/2·C)⁻¹, where P are the momenta and C the forces per unit rate at the end of the substep.
+    /// Matrix (P − h/2·C)⁻¹ for a substep h. P and C hold the momenta and the forces per unit of rate at the end of the
+    /// substep.
     solve: [[f64; 4]; 4],
     implicit: [[f64; 4]; 4],
     keep: Vec<f64>,
@@ -81,13 +84,14 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// Arm at rest, with samples of `step` s in substeps of at most `longest_substep` s, for at most `horizon` s.
+    /// Arm at rest. A sample lasts `step` \[s\], and is divided into substeps of at most `longest_substep` \[s\]. The
+    /// history is accurate up to the time `horizon` \[s\].
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for an order outside [0, 3), a highest order outside (1, 2], a negative friction, a step
-    /// that is not positive, a horizon that is NaN, more than a million substeps; [`Error::NotFinite`] for a
-    /// coefficient; [`Error::Structure`] for a singular leading matrix, a differentiated current, and friction of a
-    /// joint on which its motor does not act.
+    /// that is not positive, a horizon that is NaN, or more than a million substeps. [`Error::NotFinite`] for a
+    /// coefficient that is not finite. [`Error::Structure`] for a singular leading matrix, a differentiated current, or
+    /// friction of a joint on which its motor does not act.
     pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
         check_step(step)?;
         check_step(longest_substep)?;
@@ -165,7 +169,7 @@ impl Arm {
         Ok(arm)
     }
 
-    /// Angles θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\].
+    /// Hub angle and deflection of joint 1, then of joint 2: θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\].
     #[must_use]
     pub fn angles(&self) -> [f64; 4] {
         self.angle
@@ -177,13 +181,14 @@ impl Arm {
         self.rate
     }
 
-    /// Number of history states.
+    /// Total number of history states of all angles.
     #[must_use]
     pub fn memory(&self) -> usize {
         self.past.iter().map(Vec::len).sum()
     }
 
-    /// Advance by one sample with held motor currents \[A\]. Constant time.
+    /// Advance by one sample with constant motor currents \[A\]. The computing time does not grow with the elapsed
+    /// time.
     pub fn advance(&mut self, current: [f64; 2]) {
         for _ in 0..self.substeps {
             self.substep(current);
@@ -206,7 +211,7 @@ impl Arm {
             for (sum, c) in gained.iter_mut().zip(operator.momentum) {
                 *sum += c * (operator.value - value);
             }
-            // The contribution of the final rate follows below.
+            // The contribution of the rate at the end of the substep is added below.
             operator.value = value;
         }
         let mut right = [0.0; 4];
@@ -233,13 +238,14 @@ impl Arm {
         self.rate = rate;
     }
 
-    /// Rates at the end of a substep per ampere of each motor in it.
+    /// Return the change of the rates at the end of a substep per ampere of each motor: four rates for each motor.
     fn columns(&self) -> [[f64; 4]; 2] {
         let h = self.substep;
         std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])))
     }
 
-    /// Apply Coulomb friction: iterate over the friction laws of both joints until they converge.
+    /// Subtract Coulomb friction from the rates at the end of a substep. Iterate over the friction laws of both joints
+    /// until they converge.
     fn apply_friction(&mut self, rate: &mut [f64; 4]) {
         let columns = self.columns();
         let free = *rate;
@@ -266,7 +272,7 @@ impl Arm {
             rate[i] = free[i] - columns[0][i] * friction[0] - columns[1][i] * friction[1];
         }
         for k in 0..2 {
-            // A joint held by friction has a rate of exactly 0, so its encoder does not count.
+            // A joint at rest has a rate of exactly 0, so its encoder does not count.
             if rests[k] {
                 rate[2 * k] = 0.0;
             }
@@ -285,8 +291,8 @@ impl Operator {
         } else if self.order == 1.0 {
             (self.before, self.now) = (0.0, 1.0);
         } else if self.order < 1.0 {
-            // I^q of a rate that is linear over the last substep, exactly. The exponentials represent the history
-            // before.
+            // Exact integral I^q of a rate that is linear over the last substep. The exponentials represent the history
+            // before it.
             let q = 1.0 - self.order;
             let scale = libm::pow(h, q) / libm::tgamma(q + 2.0);
             (self.before, self.now) = (q * scale, scale);
@@ -303,7 +309,7 @@ impl Operator {
     }
 }
 
-/// Weights of the kernel at lags beyond a substep.
+/// Return the weights of the exponentials in the kernel at lags beyond one substep.
 fn past_weights(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
     rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
 }
@@ -315,7 +321,8 @@ fn singular() -> Error {
     }
 }
 
-/// Forces and momenta of the four equations as derivatives of the angles, and their motor currents.
+/// Return the forces and momenta of the four equations as derivatives of the angles, and the coefficients of both motor
+/// currents in each equation.
 fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4])> {
     check_length("equations of the arm", 4, parameters.equations.len())?;
     let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
@@ -341,7 +348,7 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
         if !(alpha > 1.0 && alpha <= 2.0) {
             return Err(outside("highest order of the arm", alpha, "(1, 2]"));
         }
-        // Terms on the left count with a negative sign on the right.
+        // Terms of the left-hand side have a negative sign on the right-hand side.
         let terms = structure.terms.iter().zip(&equation.coefficients).map(|(t, &c)| (t.signal, t.order, c));
         for (signal, order, c) in std::iter::once((row, alpha, -1.0)).chain(terms) {
             if signal >= SIGNAL_COUNT {
@@ -360,7 +367,8 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
                 input[row][signal - 4] += c;
                 continue;
             }
-            // Above 3 even the momentum would have a derivative above order 2, which trapezoidal steps do not support.
+            // From order 3 on, the momentum would have a derivative of order 2 or more, which trapezoidal steps do not
+            // support.
             if !(0.0..3.0).contains(&order) {
                 return Err(outside("order of the arm", order, "[0, 3)"));
             }

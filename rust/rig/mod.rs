@@ -1,4 +1,4 @@
-//! Rig: safety guard of real and virtual rigs, and the simulated two-link arm with real-time pacing.
+//! Rig: safety guard of real and virtual rigs, and the simulated two-link arm with real-time deadlines.
 
 pub mod arm_model;
 pub mod safety_guard;

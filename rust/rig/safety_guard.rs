@@ -1,4 +1,4 @@
-//! Safety guard of real and virtual rigs: limits of every motor command, and latched faults.
+//! Safety guard of real and virtual rigs. It limits every motor command and latches faults.
 
 use thiserror::Error;
 
@@ -10,11 +10,12 @@ use crate::rig::virtual_arm::Reading;
 pub struct GuardSettings {
     /// Sampling interval \[s\].
     pub step: f64,
-    /// Deflection per volt of strain gauge \[rad/V\]. The deflection is minus this scale times the volts above bias.
+    /// Deflection per volt of the strain gauge \[rad/V\]. The deflection is minus this scale times the voltage above
+    /// the bias.
     pub strain_scale: [f64; 2],
-    /// Current per volt of the sense input \[A/V\]. The current is minus this scale times the volts.
+    /// Current per volt of the current sensor \[A/V\]. The current is minus this scale times the voltage.
     pub sense_scale: f64,
-    /// Current per volt of the command \[A/V\]. The volts are minus the current divided by this scale.
+    /// Current per volt of the command \[A/V\]. The voltage is minus the current divided by this scale.
     pub command_scale: f64,
     /// Joint angle per encoder count \[rad\].
     pub encoder_scale: [f64; 2],
@@ -23,25 +24,27 @@ pub struct GuardSettings {
     /// Maximum permitted rate of change of a command \[A/s\].
     pub slew: [f64; 2],
     /// Maximum permitted continuous current of a motor \[A\]. The mean of the squared current over `thermal_time` stays
-    /// below its square.
+    /// below the square of this value.
     pub continuous: [f64; 2],
     /// Averaging time of the squared current \[s\].
     pub thermal_time: f64,
     /// Maximum permitted deflection \[rad\].
     pub deflection_limit: [f64; 2],
-    /// Voltage at which a strain gauge saturates \[V\].
+    /// Magnitude of the voltage from which on a strain gauge counts as saturated \[V\].
     pub saturation: f64,
-    /// Current above which a joint must move; otherwise its encoder is dead \[A\].
+    /// Current from which on a joint must move \[A\]. If it does not move, its encoder counts as dead.
     pub moving_current: f64,
-    /// Maximum permitted time at rest while the motor current exceeds `moving_current` \[s\].
+    /// Maximum duration for which a joint may stand still while its commanded current is at least `moving_current`
+    /// \[s\].
     pub standstill: f64,
-    /// Maximum plausible joint speed \[rad/s\]. A faster change of the encoder is a fault.
+    /// Maximum plausible joint speed \[rad/s\]. A faster change of an encoder is a fault.
     pub fastest: f64,
     /// Maximum permitted delay of a command \[s\].
     pub late_limit: f64,
     /// Maximum permitted number of consecutive missed deadlines.
     pub missed_limit: u32,
-    /// Sensor filter of both deflections: natural frequency \[rad/s\] and damping ratio.
+    /// Natural frequency \[rad/s\] and damping ratio of the low-pass filter for both deflections; None without a
+    /// filter.
     pub filter: Option<(f64, f64)>,
 }
 
@@ -92,33 +95,33 @@ impl GuardSettings {
     }
 }
 
-/// Reason for which the motors were stopped.
+/// Reason why the motors were stopped. Joints, links and motors are numbered from 1.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Fault {
     /// Command that is NaN or infinite.
     #[error("the command of motor {stage} is {value}, not a finite current; correct the input")]
     Command {
-        /// Number of the motor.
+        /// Number of the motor: 1 or 2.
         stage: usize,
-        /// Value of the command.
+        /// Value of the command \[A\].
         value: f64,
     },
     /// Encoder that does not count although its motor has current.
     #[error("encoder {stage} has not changed for {seconds:.2} s under {current:.2} A or more; the encoder is faulty or the hub is blocked; check its cable and the gear")]
     DeadEncoder {
-        /// Number of the joint.
+        /// Number of the joint: 1 or 2.
         stage: usize,
         /// Duration of the standstill \[s\].
         seconds: f64,
-        /// Current above which the joint must move \[A\].
+        /// Current from which on the joint must move \[A\].
         current: f64,
     },
-    /// Encoder jump beyond the highest joint speed.
+    /// Encoder jump that exceeds the highest plausible joint speed.
     #[error(
         "encoder {stage} jumped by {counts} counts in one sample; its counter wrapped or its cable is loose: check it"
     )]
     EncoderJump {
-        /// Number of the joint.
+        /// Number of the joint: 1 or 2.
         stage: usize,
         /// Size of the jump in counts.
         counts: i64,
@@ -126,39 +129,39 @@ pub enum Fault {
     /// Strain gauge in saturation.
     #[error("strain gauge {stage} is saturated at {volts:.2} V; check its amplifier and cable")]
     Saturated {
-        /// Number of the link.
+        /// Number of the link: 1 or 2.
         stage: usize,
-        /// Reading \[V\].
+        /// Voltage of the sensor \[V\].
         volts: f64,
     },
     /// Strain gauge that does not respond to its motor.
     #[error("strain gauge {stage} has not changed from {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is faulty and would not detect a bent link; check its amplifier and cable")]
     DeadGauge {
-        /// Number of the link.
+        /// Number of the link: 1 or 2.
         stage: usize,
-        /// Reading \[V\].
+        /// Voltage of the sensor \[V\].
         volts: f64,
         /// Duration without a response \[s\].
         seconds: f64,
-        /// Change of the current that must change the reading \[A\].
+        /// Change of the motor current from which on the reading must change \[A\].
         current: f64,
     },
-    /// Current sense that is not finite.
+    /// Current sensor whose voltage is not finite.
     #[error("the current sense of motor {stage} reads {volts} V; check the board's analog inputs")]
     Sense {
-        /// Number of the motor.
+        /// Number of the motor: 1 or 2.
         stage: usize,
-        /// Reading \[V\].
+        /// Voltage of the sensor \[V\].
         volts: f64,
     },
     /// Deflection above its limit.
     #[error("link {stage} is bent by {degrees:.2} degrees, more than the limit of {limit:.2}; use a smaller amplitude or avoid its resonance")]
     Deflection {
-        /// Number of the link.
+        /// Number of the link: 1 or 2.
         stage: usize,
         /// Deflection \[degrees\].
         degrees: f64,
-        /// Limit \[degrees\].
+        /// Limit of the deflection \[degrees\].
         limit: f64,
     },
     /// Limit switch that is tripped.
@@ -166,15 +169,15 @@ pub enum Fault {
         "limit switch {line} is tripped; move the arm off the switch by hand with the amplifier off, then start again"
     )]
     Switch {
-        /// Digital line.
+        /// Index of the digital line, from 0.
         line: usize,
     },
-    /// Single command that is far too late.
+    /// Command whose delay exceeds its limit.
     #[error("a command was {milliseconds:.1} ms late, more than the limit of {limit:.0} ms; lower the rate or the machine's load")]
     Late {
         /// Delay \[ms\].
         milliseconds: f64,
-        /// Limit \[ms\].
+        /// Limit of the delay \[ms\].
         limit: f64,
     },
     /// Too many consecutive missed deadlines.
@@ -183,12 +186,12 @@ pub enum Fault {
         /// Number of missed deadlines.
         count: u32,
     },
-    /// Fault reported by the rig.
+    /// Fault reported by the rig, with its message.
     #[error("{0}")]
     Rig(String),
 }
 
-/// Limits, conversions and faults of one run.
+/// Safety guard of one run. It converts readings, limits commands, and latches faults.
 #[derive(Debug, Clone)]
 pub struct Guard {
     settings: GuardSettings,
@@ -208,7 +211,7 @@ pub struct Guard {
 }
 
 impl Guard {
-    /// Guard before its run.
+    /// Guard at the start of a run, without readings and faults.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a setting that is not a positive, finite number.
@@ -261,7 +264,7 @@ impl Guard {
         })
     }
 
-    /// First fault. It is latched.
+    /// First fault of the run, which stays latched; None without a fault.
     #[must_use]
     pub fn fault(&self) -> Option<&Fault> {
         self.fault.as_ref()
@@ -272,13 +275,13 @@ impl Guard {
         self.fault.get_or_insert(fault);
     }
 
-    /// Currents of the last command \[A\].
+    /// Currents of the last command, after all limits \[A\].
     #[must_use]
     pub fn last_currents(&self) -> [f64; 2] {
         self.written
     }
 
-    /// Gauge voltages at rest \[V\].
+    /// Mean voltages of the strain gauges at rest \[V\].
     #[must_use]
     pub fn bias(&self) -> [f64; 2] {
         self.bias
@@ -290,7 +293,8 @@ impl Guard {
         self.missed_in_all
     }
 
-    /// Process a reading before the motors are enabled: gauge bias and encoder zero.
+    /// Process a reading before the motors are enabled. The gauge bias is the mean voltage of these readings, and the
+    /// encoder zero is the last count.
     pub fn rest(&mut self, reading: &Reading) {
         self.check(reading);
         self.rest += 1;
@@ -304,7 +308,9 @@ impl Guard {
         self.previous = Some(reading.counts);
     }
 
-    /// Convert a reading that is `late` s after its deadline: θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\] and both currents \[A\].
+    /// Check a reading and convert it to hub angle and deflection of joint 1, then of joint 2 (θ₁₁, θ₁₂, θ₂₁, θ₂₂
+    /// \[rad\]), and both motor currents \[A\]. `late` \[s\] is its delay after the deadline. A violated limit latches
+    /// a fault.
     pub fn read(&mut self, reading: &Reading, late: f64) -> [f64; 6] {
         self.check(reading);
         let mut hubs = [0.0; 2];
@@ -331,9 +337,10 @@ impl Guard {
         [hubs[0], bends[0], hubs[1], bends[1], -reading.analog[2] * scale, -reading.analog[3] * scale]
     }
 
-    /// Volts for both motors within all limits. Every command passes this function last.
+    /// Convert commanded currents \[A\] to voltages of both motors \[V\] within all limits. Every command passes this
+    /// function last.
     ///
-    /// Zero while a fault is latched. A command that is not finite latches a fault.
+    /// The voltages are zero while a fault is latched. A command that is not finite latches a fault.
     pub fn command(&mut self, current: [f64; 2]) -> [f64; 2] {
         for (j, value) in current.iter().enumerate() {
             if !value.is_finite() {
@@ -402,8 +409,8 @@ impl Guard {
         }
     }
 
-    /// Latch a fault if a gauge does not respond. Noise alone changes the reading of a working gauge; without noise, a
-    /// change of torque does.
+    /// Latch a fault if a strain gauge does not respond. Noise alone changes the reading of a working gauge. Without
+    /// noise, a change of the motor current changes it.
     fn check_gauge(&mut self, j: usize, volts: f64) {
         let (s, gauge) = (&self.settings, &mut self.gauges[j]);
         #[allow(clippy::float_cmp)]
@@ -434,8 +441,8 @@ impl Guard {
     }
 }
 
-/// Monitor of one strain gauge: last voltage, current at its start, and duration of this voltage under a changed
-/// current.
+/// Monitor of one strain gauge: its last voltage, and the motor current when this voltage was first read. `still` is
+/// the time \[s\] for which the voltage has not changed although the current has.
 #[derive(Debug, Clone, Copy, Default)]
 struct Gauge {
     volts: f64,

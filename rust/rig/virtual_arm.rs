@@ -1,82 +1,82 @@
-//! Virtual arm: sensors, converters, real-time pacing and fault injection of the simulated arm.
+//! Virtual arm: sensors, converters, real-time deadlines and fault injection of the simulated arm.
 
 use std::time::{Duration, Instant};
 
 use super::arm_model::Arm;
 use crate::error::{check_finite, check_step, Error, Result};
 
-/// Sensors and converters of the arm.
+/// Sensors, converters and amplifiers of the arm. Pairs are joint 1 and joint 2.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sensors {
-    /// Deflection per volt of strain gauge \[rad/V\].
+    /// Deflection per volt of the strain gauge \[rad/V\]. The gauge voltage falls with the deflection.
     pub strain_scale: [f64; 2],
-    /// Volts of the gauges at rest.
+    /// Voltage of the strain gauges without deflection \[V\].
     pub strain_bias: [f64; 2],
-    /// Standard deviation of the noise on strain 1, 2 and current sense 1, 2 \[V\].
+    /// Standard deviation of the noise on strain gauges 1, 2 and current sensors 1, 2 \[V\].
     pub noise: [f64; 4],
-    /// Offset of the current sense \[V\].
+    /// Voltage of the current sensors at zero current \[V\].
     pub sense_bias: [f64; 2],
-    /// Current per volt of the sense \[A/V\].
+    /// Current per volt of the current sensor \[A/V\]. The sensor voltage falls with the current.
     pub sense_scale: f64,
-    /// Current per volt of the command \[A/V\].
+    /// Current per volt of the command \[A/V\]. A positive voltage gives a negative current.
     pub command_scale: f64,
-    /// Hub angle per count \[rad\].
+    /// Hub angle per encoder count \[rad\].
     pub encoder_scale: [f64; 2],
-    /// Half of the voltage range of the converters \[V\].
+    /// Half of the voltage range of the converters, which is symmetric about 0 \[V\].
     pub range: f64,
     /// Resolution of the converters in bits. 0 disables quantization.
     pub bits: u32,
     /// Maximum current that each amplifier supplies \[A\].
     pub current_limit: [f64; 2],
-    /// Disturbance of each motor current while its amplifier is enabled \[A\].
+    /// Disturbance that is added to each motor current while its amplifier is enabled \[A\].
     pub offset: [f64; 2],
-    /// Hub angle at which a limit switch opens \[rad\].
+    /// Magnitude of the hub angle above which a limit switch opens \[rad\].
     pub travel: [f64; 2],
 }
 
-/// Fault injection from a sample on.
+/// Fault that is injected from a given sample on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Injection {
-    /// The encoder stops counting.
+    /// Encoder that stops counting.
     DeadEncoder {
-        /// Joint, from 0.
+        /// Index of the joint, from 0.
         stage: usize,
-        /// First sample.
+        /// Index of the first sample with the fault.
         from: u64,
     },
-    /// The amplifier of the gauge is saturated.
+    /// Strain gauge whose amplifier is saturated, so that its voltage stays at the limit of the converter.
     SaturatedGauge {
-        /// Joint, from 0.
+        /// Index of the joint, from 0.
         stage: usize,
-        /// First sample.
+        /// Index of the first sample with the fault.
         from: u64,
     },
-    /// A limit switch opens.
+    /// Limit switch that opens.
     LimitSwitch {
-        /// Line, from 0.
+        /// Index of the digital line, from 0.
         line: usize,
-        /// First sample.
+        /// Index of the first sample with the fault.
         from: u64,
     },
-    /// Deflection increased by this angle \[rad\].
+    /// Deflection increased by a constant angle.
     Deflection {
-        /// Joint, from 0.
+        /// Index of the joint, from 0.
         stage: usize,
-        /// First sample.
+        /// Index of the first sample with the fault.
         from: u64,
-        /// Angle \[rad\].
+        /// Angle that is added to the deflection \[rad\].
         angle: f64,
     },
     /// Delay of the control loop at one sample.
     Late {
-        /// Sample.
+        /// Index of the sample.
         at: u64,
         /// Delay \[s\].
         seconds: f64,
     },
-    /// No samples from the board.
+    /// Board that delivers no samples.
     LostSamples {
-        /// First sample.
+        /// Index of the first sample with the fault.
         from: u64,
     },
 }
@@ -84,15 +84,15 @@ pub enum Injection {
 /// Simultaneous reading of all channels.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Reading {
-    /// Strain 1, 2, current sense 1, 2 \[V\].
+    /// Voltages of strain gauges 1, 2 and of current sensors 1, 2 \[V\].
     pub analog: [f64; 4],
-    /// Encoder counts.
+    /// Counts of encoders 1 and 2.
     pub counts: [i32; 2],
-    /// Limit switches, 0 if tripped.
+    /// State of each limit switch: 0 if tripped, otherwise 1.
     pub switches: [i8; 4],
 }
 
-/// Arm with sensors and converters.
+/// Virtual arm: arm model with sensors, converters and injected faults.
 #[derive(Debug, Clone)]
 pub struct Plant {
     /// Arm model.
@@ -105,10 +105,10 @@ pub struct Plant {
 }
 
 impl Plant {
-    /// Arm at rest with zero current.
+    /// Virtual arm at rest with zero current.
     ///
     /// # Errors
-    /// A scale, limit, noise or resolution of the sensors out of range ([`Sensors::check`]).
+    /// The errors of [`Sensors::check`], for a value of the sensors out of range.
     pub fn new(arm: Arm, sensors: Sensors) -> Result<Self> {
         sensors.check()?;
         Ok(Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 })
@@ -117,7 +117,8 @@ impl Plant {
     /// Add a fault injection.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a joint or a line that does not exist, [`Error::NotFinite`] for its value.
+    /// [`Error::OutOfRange`] for the index of a joint or a line that does not exist. [`Error::NotFinite`] for an angle
+    /// or a delay that is not finite.
     pub fn inject(&mut self, injection: Injection) -> Result<()> {
         let place = |name: &str, index: usize, count: usize| {
             if index < count {
@@ -140,13 +141,14 @@ impl Plant {
         Ok(())
     }
 
-    /// Number of the sample that the next [`Self::read`] returns.
+    /// Index of the sample that the next [`Self::read`] returns.
     #[must_use]
     pub fn sample(&self) -> u64 {
         self.sample
     }
 
-    /// Read all channels. `noise` is standard normal, for strain 1, 2 and sense 1, 2.
+    /// Read all channels at the current sample. `noise` holds standard normal values for strain gauges 1, 2 and current
+    /// sensors 1, 2.
     pub fn read(&mut self, noise: [f64; 4]) -> Reading {
         let s = &self.sensors;
         let angles = self.arm.angles();
@@ -173,7 +175,7 @@ impl Plant {
                 }
             }
         }
-        // The arm rests in the middle of a count, so that quantization has no bias.
+        // The arm rests in the middle of an encoder count, so that quantization has no bias.
         #[allow(clippy::cast_possible_truncation)]
         let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j] + 0.5).floor() as i32);
         for injection in &self.injections {
@@ -186,13 +188,13 @@ impl Plant {
         Reading { analog, counts, switches }
     }
 
-    /// Whether the board delivers samples.
+    /// True if the board delivers samples.
     #[must_use]
     pub fn sampling(&self) -> bool {
         !self.injections.iter().any(|i| matches!(i, Injection::LostSamples { from } if self.sample >= *from))
     }
 
-    /// Delay injected at this sample \[s\].
+    /// Delay that is injected into the control loop at the current sample \[s\].
     #[must_use]
     pub fn delay(&self) -> f64 {
         let late = |i: &Injection| match *i {
@@ -202,7 +204,7 @@ impl Plant {
         self.injections.iter().map(late).sum()
     }
 
-    /// Advance by one sample with these volts at the amplifiers. Disabled amplifiers give no current.
+    /// Advance by one sample with these voltages at the amplifiers \[V\]. Disabled amplifiers supply no current.
     pub fn advance(&mut self, volts: [f64; 2], enabled: bool) {
         let s = &self.sensors;
         for ((current, volts), limit) in self.current.iter_mut().zip(volts).zip(s.current_limit) {
@@ -215,7 +217,7 @@ impl Plant {
     }
 }
 
-/// Error for a parameter of the virtual arm that is out of range.
+/// Return the error for a parameter of the virtual arm that is out of range.
 fn outside(name: &str, value: f64, range: &str) -> Error {
     Error::OutOfRange {
         name: name.into(),
@@ -225,16 +227,16 @@ fn outside(name: &str, value: f64, range: &str) -> Error {
     }
 }
 
-/// Maximum resolution of the converters in bits. With more bits the quantization step is below the rounding error of a
-/// voltage.
+/// Maximum resolution of the converters in bits. With more bits, the quantization step would be below the rounding
+/// error of a voltage.
 const MAX_BITS: u32 = 52;
 
 impl Sensors {
-    /// Return an error for scales, limits or ranges that are not positive, negative noise, offsets that are not finite,
-    /// or a resolution of more bits than a float has.
+    /// Return an error for invalid parameters.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a value out of its range; [`Error::NotFinite`] for an offset that is not finite.
+    /// [`Error::OutOfRange`] for a scale, limit or range that is not positive, for negative noise, or for more than 52
+    /// bits. [`Error::NotFinite`] for an offset that is not finite.
     pub fn check(&self) -> Result<()> {
         let pairs = [
             ("strain_scale", self.strain_scale),
@@ -260,7 +262,8 @@ impl Sensors {
         Ok(())
     }
 
-    /// Clip to the converter range and quantize. NaN becomes 0 V.
+    /// Clip a voltage to the converter range and quantize it. NaN and infinity become 0 V. Without quantization (0
+    /// bits), a finite voltage is not clipped.
     fn convert(&self, volts: f64) -> f64 {
         if !volts.is_finite() {
             return 0.0;
@@ -274,7 +277,7 @@ impl Sensors {
     }
 }
 
-/// Timer of a control loop with real-time deadlines.
+/// Timer for the real-time deadlines of a control loop.
 #[derive(Debug)]
 pub struct Pace {
     start: Instant,
@@ -282,17 +285,17 @@ pub struct Pace {
     samples: u64,
 }
 
-/// Time before a deadline of busy waiting, because a sleep ends late by some tens of microseconds.
+/// Duration of busy waiting before a deadline. A sleep may end late by some tens of microseconds.
 const SPIN_WAIT: Duration = Duration::from_micros(120);
 
 /// Maximum sampling interval in real time \[s\]: one day, so that times do not overflow.
 const LONGEST_STEP: f64 = 86_400.0;
 
 impl Pace {
-    /// Timer that starts now, with a deadline every `step` s.
+    /// Timer that starts now, with a deadline every `step` \[s\]. The first deadline is the start.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for a step that is not positive, or longer than a day.
+    /// [`Error::OutOfRange`] for a step that is not positive or longer than a day.
     pub fn new(step: f64) -> Result<Self> {
         check_step(step)?;
         if step > LONGEST_STEP {
@@ -301,7 +304,7 @@ impl Pace {
         Ok(Self { start: Instant::now(), step, samples: 0 })
     }
 
-    /// Wait for the next deadline and return the delay \[s\].
+    /// Wait for the next deadline. Return the time by which it was missed \[s\].
     pub fn wait(&mut self) -> f64 {
         #[allow(clippy::cast_precision_loss)]
         let due = Duration::try_from_secs_f64(self.step * self.samples as f64)

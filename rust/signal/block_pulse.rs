@@ -1,26 +1,27 @@
-//! Block-pulse coefficients: means of samples over pulses, delays, and interpolation back to nonuniform sample
-//! times.
+//! Block-pulse coefficients: means of samples over pulses, delays, and interpolation back to nonuniform sample times.
 //!
-//! Row j of a record is the sample at t = jh. An input command is held over [jh, (j+1)h). A measured signal is linear
-//! between its samples. Estimates from samples in place of means would be biased.
+//! Row j of a record is the sample at t = jh, where h is the sampling interval. An input command is held over [jh,
+//! (j+1)h). A measured signal is linear between its samples. Estimates from samples in place of pulse means would be
+//! biased.
 //!
-//! Four pulse means around a sample time determine a smooth signal to fourth order, by the slope of the quartic through
-//! its integral at the pulse edges. After a jump of a zero-order-hold input the signal is not smooth. I^η of a jump of
-//! size Δ at p is Δ (t − p)^η/Γ(η + 1), which has a slope discontinuity. Pulse means replace the jump by a ramp within
-//! its pulse. Both responses are known exactly, so samples near a jump are corrected by their difference.
+//! Four pulse means around a sample time determine a smooth signal to fourth order, as the slope of the quartic through
+//! its integral at the pulse edges. After a jump of a zero-order-hold input, the signal is not smooth. The fractional
+//! integral I^η of a jump of size Δ at time p is Δ (t − p)^η/Γ(η + 1), which has a slope discontinuity. Pulse means
+//! replace the jump by a ramp within its pulse. Both responses are known exactly, so samples near a jump are corrected
+//! by their difference.
 
 use crate::error::{check_finite, check_points, Error, Result};
 
 /// Inter-sample behavior of a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Intersample {
-    /// Zero-order hold, for commands: row j is held until row j+1.
+    /// Zero-order hold, for commands: row j is held until row j + 1.
     Hold,
     /// First-order hold, for measured signals: linear between rows.
     Linear,
 }
 
-/// Means of one signal over equal pulses. Conversion from or to samples is always explicit.
+/// Means of one signal over equal pulses. The type keeps them apart from samples, so that conversions are explicit.
 ///
 /// ```compile_fail,E0308
 /// use ftlm::regressors::Record;
@@ -37,7 +38,7 @@ pub enum Intersample {
 pub struct PulseMeans(Vec<f64>);
 
 impl PulseMeans {
-    /// Pulse means with these values, which are not checked. [`pulse_means`] computes them from samples.
+    /// Pulse means with these values, which are not checked. [`pulse_means`] computes pulse means from samples.
     ///
     /// ```
     /// use ftlm::signal::block_pulse::PulseMeans;
@@ -48,19 +49,19 @@ impl PulseMeans {
         Self(values)
     }
 
-    /// Pulse means of several signals.
+    /// Pulse means of several signals, from their values.
     #[must_use]
     pub fn from_signals(signals: Vec<Vec<f64>>) -> Vec<Self> {
         signals.into_iter().map(Self).collect()
     }
 
-    /// Mean of every pulse.
+    /// Values of the means, one per pulse.
     #[must_use]
     pub fn values(&self) -> &[f64] {
         &self.0
     }
 
-    /// Mean of every pulse, without a copy.
+    /// Convert to the values of the means, without a copy.
     #[must_use]
     pub fn into_vec(self) -> Vec<f64> {
         self.0
@@ -80,13 +81,15 @@ pub struct PulseJump {
     pub after: f64,
 }
 
-/// Means over `m` equal pulses of [0, (N−1)h] of a signal with N samples. O(N + m).
+/// Return the means of a signal over `m` equal pulses of [0, (N−1)h], where N is the number of samples and h their
+/// interval. O(N + m).
 ///
-/// `m` is arbitrary. m = N − 1 is the grid of the samples, and a multiple of it is a finer grid. A smaller `m` gives
+/// `m` is arbitrary. m = N − 1 is the grid of the samples, and a multiple of N − 1 is a finer grid. A smaller `m` gives
 /// exact means over several samples.
 ///
 /// # Errors
-/// Fewer than two samples, m = 0 or too large for the memory, a sample that is not finite.
+/// [`Error::Length`] for fewer than two samples. [`Error::OutOfRange`] for m = 0 or too many pulses.
+/// [`Error::NotFinite`] for a sample that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -138,7 +141,7 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Pu
     Ok(PulseMeans(means))
 }
 
-/// Return an error for no pulse or too many.
+/// Return an error if the number of pulses is zero or too large.
 pub(crate) fn check_pulses(m: usize) -> Result<()> {
     if m > 0 {
         return check_points("m", m);
@@ -151,7 +154,7 @@ pub(crate) fn check_pulses(m: usize) -> Result<()> {
     })
 }
 
-/// Integral over interval j from fraction a to b, without cancellation of two partial integrals.
+/// Return the integral over interval j from fraction a to b of it, without cancellation of two partial integrals.
 fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f64) -> f64 {
     match between {
         Intersample::Hold => samples[j] * (b - a),
@@ -161,13 +164,13 @@ fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f6
     }
 }
 
-/// Delay samples by `delay` steps, whole and fractional: u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
+/// Delay samples u_j by `delay` = d + φ steps, with an integer d and 0 ≤ φ < 1: u_j ← (1−φ)·u_{j−d} + φ·u_{j−d−1}.
 ///
-/// The result gives exact means of a held command after a delay of (d+φ)h. `before` is the value before the record.
-/// With a negative delay, the last sample is repeated at the end of the record.
+/// The result gives exact means of a held command after this delay. `before` is the value before the record. With a
+/// negative delay, the last sample is repeated at the end of the record.
 ///
 /// # Errors
-/// A delay or a sample that is not finite.
+/// [`Error::NotFinite`] for a delay, a sample or a value `before` that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -196,14 +199,14 @@ pub fn delay_samples(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64
         .collect())
 }
 
-/// Index of the row that row `j` shows after a delay by an integer number of rows, which may be negative; None before
-/// the record.
+/// Return the index of the sample that appears in row `j` after a delay by an integer number of rows. The delay may be
+/// negative. None before the record.
 pub(crate) fn delayed_row(j: usize, delay: isize) -> Option<usize> {
     j.checked_add_signed(delay.saturating_neg())
 }
 
-/// Point samples at 0, h, …, mh from m pulse means: the average of neighboring pulses, with second-order extrapolation
-/// at both ends.
+/// Return point samples at 0, h, …, mh from m pulse means. They are averages of neighboring pulses, with second-order
+/// extrapolation at both ends.
 #[must_use]
 pub fn point_samples(means: &[f64]) -> Vec<f64> {
     let m = means.len();
@@ -219,23 +222,23 @@ pub fn point_samples(means: &[f64]) -> Vec<f64> {
 
 /// Number of pulse means from which one sample is interpolated.
 const STENCIL_PULSES: usize = 4;
-/// Pulses after a jump within which samples are corrected. Later, the error decreases with the square of the step, like
-/// all other errors of the scheme.
+/// Number of pulses after a jump within which samples are corrected for the slope discontinuity. Later, the error
+/// decreases with the square of the step, like all other errors of the scheme.
 const KINK_RANGE_PULSES: f64 = 16.0;
 
-/// Jump of a held signal near a sample time. Lengths in pulses.
+/// Jump of a held signal near a sample time. All lengths are in pulses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct NearbyJump {
-    /// Time from the jump to the sample, negative for a later jump.
+    /// Time from the jump to the sample; negative for a jump after the sample.
     before: f64,
-    /// First pulse of the stencil, relative to the pulse of the jump.
+    /// Index of the first pulse of the interpolation, relative to the pulse of the jump.
     first: isize,
-    /// Fraction of the pulse of the jump that is before the jump.
+    /// Fraction of the pulse of the jump that precedes the jump.
     share: f64,
     size: f64,
 }
 
-/// Nonuniform sample times on a grid of pulses, with the interpolation weights.
+/// Nonuniform sample times on a grid of pulses, with the weights of the interpolation from pulse means.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SampleInterpolation {
     first: Vec<usize>,
@@ -251,10 +254,12 @@ pub struct Jumps {
 }
 
 impl SampleInterpolation {
-    /// Interpolation at these positions, in pulses from the start of the first one, among m pulses.
+    /// Interpolation at these positions among `m` pulses. A position is a time in pulses from the start of the first
+    /// pulse.
     ///
     /// # Errors
-    /// Fewer than four pulses, a position outside them.
+    /// [`Error::Length`] for fewer than four pulses. [`Error::OutOfRange`] or [`Error::NotFinite`] for a position
+    /// outside the pulses.
     ///
     /// ```
     /// # fn main() -> ftlm::error::Result<()> {
@@ -294,13 +299,13 @@ impl SampleInterpolation {
         self.first.len()
     }
 
-    /// Whether there are no sample times.
+    /// True if there are no sample times.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.first.is_empty()
     }
 
-    /// Samples of a smooth signal from its pulse means.
+    /// Return the samples of a smooth signal from its pulse means.
     #[must_use]
     pub fn interpolate(&self, means: &[f64]) -> Vec<f64> {
         let value = |(&first, weights): (&usize, &[f64; STENCIL_PULSES])| -> f64 {
@@ -309,7 +314,8 @@ impl SampleInterpolation {
         self.first.iter().zip(&self.weights).map(value).collect()
     }
 
-    /// Jumps of a held signal near each sample time, from their positions in pulses (ascending) and sizes.
+    /// Return the jumps of a held signal near each sample time. `at` holds the ascending positions of the jumps in
+    /// pulses, and `sizes` their sizes.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
     pub fn jumps(&self, at: &[f64], sizes: &[f64]) -> Jumps {
@@ -333,8 +339,9 @@ impl SampleInterpolation {
         out
     }
 
-    /// Corrections of the samples of I^η of a zero-order-hold signal: exact response to its jumps minus the response in
-    /// the pulse means.
+    /// Return the corrections of the samples of the fractional integral of order `eta` of a zero-order-hold signal.
+    /// Each is the exact response to its jumps minus the response that pulse means represent. `step` \[s\] is the pulse
+    /// length.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn kink_corrections(&self, jumps: &Jumps, eta: f64, step: f64) -> Vec<f64> {
@@ -361,8 +368,8 @@ impl SampleInterpolation {
     }
 }
 
-/// Weights of four pulse means for the value at x pulses from the start of the first one. They are slopes of the
-/// Lagrange polynomials through the integral at the five edges.
+/// Return the weights of four pulse means for the value at x pulses from the start of the first one. They are slopes of
+/// the Lagrange polynomials through the integral at the five pulse edges.
 #[allow(clippy::cast_precision_loss)]
 fn stencil(x: f64) -> [f64; STENCIL_PULSES] {
     let slope = |m: usize| -> f64 {

@@ -1,26 +1,29 @@
-//! Comparison of a response with a measurement: error (45), RMSE (46), NR (47), fit. Correlations for residual tests.
+//! Comparison of a response with a measurement, with the metrics of the paper: error (eq. 45), RMSE (eq. 46), NR (eq.
+//! 47), and the fit. Correlations for residual tests.
 
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::fft;
 
-/// Figures of merit of one output over the M pulses of a record.
+/// Metrics of one output over the M pulses of a record. y is the measurement, ŷ the response, and ȳ the mean of y.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub struct Metrics {
-    /// Sum of absolute errors Σ|y − ŷ| (paper (45)), in the unit of the output.
+    /// Sum of absolute errors Σ|y − ŷ|, eq. (45) of the paper, in the unit of the output.
     pub error: f64,
-    /// Root mean square error √(Σ(y − ŷ)²/M), equation (46) of the paper.
+    /// Root mean square error √(Σ(y − ŷ)²/M), eq. (46) of the paper, in the unit of the output.
     pub rmse: f64,
-    /// The normalized error NR = RMSE / σ(y), σ with divisor M (paper (47), as in its tables).
+    /// NR, the normalized error RMSE / σ(y), eq. (47) of the paper. The standard deviation σ has the divisor M, as in
+    /// its tables.
     pub nr: f64,
-    /// Fit 100·(1 − ‖y − ŷ‖/‖y − ȳ‖) in percent.
+    /// Fit 100·(1 − ‖y − ŷ‖/‖y − ȳ‖) \[%\].
     pub fit_percent: f64,
 }
 
-/// Compare a measurement with residuals e = y − ŷ of equal length. Not finite if the residuals are not.
+/// Return the metrics of residuals e = y − ŷ for a measurement y of equal length. The metrics are not finite if the
+/// residuals are not.
 ///
 /// # Errors
-/// [`Error::Length`] for empty or different lengths, [`Error::NotFinite`] for the measurement.
+/// [`Error::Length`] for empty or different lengths, [`Error::NotFinite`] for a measurement that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -40,7 +43,7 @@ pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
     let mean = measured.iter().sum::<f64>() / m;
     let deviation = measured.iter().map(|y| (y - mean) * (y - mean)).sum::<f64>();
     let error = residuals.iter().map(|e| e.abs()).sum::<f64>();
-    // A diverged response overflows when squared before it overflows itself.
+    // The squares of a diverging response overflow before the response itself.
     let largest = residuals.iter().fold(0.0_f64, |a, e| a.max(e.abs()));
     let squares = if largest > 1e150 { f64::INFINITY } else { residuals.iter().map(|e| e * e).sum::<f64>() };
     let error = if error.is_nan() { f64::INFINITY } else { error };
@@ -49,29 +52,29 @@ pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
     Ok(Metrics { error, rmse: (squares / m).sqrt(), nr, fit_percent: 100.0 * (1.0 - nr) })
 }
 
-/// Correlation of two signals, pooled over runs.
+/// Correlation of two signals x and y, pooled over runs.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Correlation {
-    /// Correlations r(k) = corr(x(t + k), y(t)) for k = −lags … lags; zero for a constant signal.
+    /// Correlations r(k) = corr(x(t + k), y(t)) for k = −lags … lags. They are zero if a signal is constant.
     pub values: Vec<f64>,
-    /// Variance of each value for independent x and y: Bartlett's Σ ρx(τ)ρy(τ)/N (doi:10.2307/2983611).
+    /// Variance of each correlation if x and y are independent: Bartlett's Σ ρx(τ)ρy(τ)/N (doi:10.2307/2983611).
     ///
-    /// The sum is truncated where the correlations of x have decayed. It is at least that of white noise.
+    /// The sum is truncated where the correlations of x have decayed. The variance is at least that of white noise.
     pub variance: f64,
-    /// Number of lags of the truncated sum on each side.
+    /// Number of lags on each side in the truncated sum of `variance`.
     pub window: usize,
 }
 
-/// Length of the truncated sum in correlation times (Sokal's windowing). A longer window adds only noise.
+/// Length of the truncated sum for the variance of a correlation, in correlation times (Sokal's windowing). A longer
+/// sum adds only noise.
 const WINDOW_CORRELATION_TIMES: f64 = 6.0;
 
-/// Correlations up to `lags` of x with y, each run about its own mean. O(N log N).
+/// Return the correlations of x with y at lags −`lags` … `lags`, each run about its own mean. O(N log N) for N samples.
 ///
 /// # Errors
-/// [`Error::Length`] where x and y differ in runs or samples, [`Error::OutOfRange`] where a run has no more samples
-/// than
-/// `lags`, [`Error::NotFinite`].
+/// [`Error::Length`] if x and y differ in runs or samples. [`Error::OutOfRange`] if a run has no more samples than
+/// `lags`. [`Error::NotFinite`] for a sample that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -98,7 +101,7 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
             remedy: "give longer runs or fewer lags".into(),
         });
     }
-    // Correlations beyond a quarter of a run are estimated from too few samples.
+    // Correlations at lags above a quarter of a run are estimated from too few samples.
     let reach = lags.max(shortest / 4);
     let (cross, own_x, own_y) =
         (pool_covariances(x, y, reach), pool_covariances(x, x, reach), pool_covariances(y, y, reach));
@@ -114,12 +117,12 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
         sum += 2.0 * rx * ry;
         time += 2.0 * rx * rx;
     }
-    // The sum over estimated correlations of signals with opposite oscillations may vanish or be negative. White noise
+    // For signals with opposite oscillations, the sum of estimated correlations may vanish or be negative. White noise
     // is the lower limit.
     Ok(Correlation { values, variance: sum.max(1.0) / count, window })
 }
 
-/// Covariances Σ x(t + k) y(t), k = −lags … lags, about the means, summed over runs.
+/// Return the covariances Σ x(t + k) y(t) for k = −lags … lags, about the mean of each run, summed over runs.
 fn pool_covariances(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Vec<f64> {
     let mut sums = vec![0.0; 2 * lags + 1];
     for (a, b) in x.iter().zip(y) {
@@ -135,7 +138,8 @@ fn subtract_mean(x: &[f64]) -> Vec<f64> {
     x.iter().map(|v| v - mean).collect()
 }
 
-/// Cross-covariances Σ x(t + k) y(t) for k = −lags … lags, by one product of spectra.
+/// Return the cross-covariances Σ x(t + k) y(t) for k = −lags … lags, computed by one product of spectra. Means are not
+/// subtracted.
 #[must_use]
 pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     let plan = fft::plan(fft::fast_length(x.len().max(y.len()) + lags + 1));
@@ -155,7 +159,7 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     behind.chain(&time[..=lags]).copied().collect()
 }
 
-/// Cross-covariances by definition, a reference for tests of [`covariances`]. O(N lags).
+/// Return the cross-covariances by their definition, as a reference for tests of [`covariances`]. O(N lags).
 #[cfg(feature = "oracles")]
 #[must_use]
 pub fn covariances_naive(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {

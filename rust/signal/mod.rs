@@ -1,4 +1,4 @@
-//! Signals: samples and block pulses, statistics, and metrics of errors.
+//! Signals: samples and block pulses, statistics, and error metrics.
 
 pub mod block_pulse;
 pub mod metrics;

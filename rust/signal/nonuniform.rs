@@ -1,19 +1,19 @@
-//! Signals at nonuniform sample times: values between the samples, jumps of a hold, exact block-pulse means.
+//! Signals at nonuniform sample times: values between samples, jumps of a zero-order hold, exact block-pulse means.
 //!
-//! A held signal keeps its value until the next sample, all others are linear between samples. Sample times ascend
-//! from 0.
+//! A held signal keeps its value until the next sample. All other signals are linear between samples. Sample times
+//! ascend from 0.
 
 use std::borrow::Cow;
 
 use super::block_pulse::{check_pulses, Intersample, PulseJump, PulseMeans};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 
-/// Tolerance in pulses: a sample time within this distance of a pulse edge counts as the edge.
+/// Distance in pulses within which a sample time counts as a pulse edge.
 const EDGE_TOLERANCE_PULSES: f64 = 1e-6;
-/// Tolerance for comparing times, as a fraction of the duration.
+/// Tolerance for the comparison of times, as a fraction of the duration.
 pub(crate) const TIME_TOLERANCE: f64 = 1e-12;
 
-/// Samples of one signal with their times \[s\].
+/// Samples of one signal with their times \[s\], and the behavior between samples.
 #[derive(Debug, Clone)]
 pub struct NonuniformSignal<'a> {
     times: Cow<'a, [f64]>,
@@ -22,23 +22,24 @@ pub struct NonuniformSignal<'a> {
 }
 
 impl<'a> NonuniformSignal<'a> {
-    /// Signal with one value per sample time, at least one. Missing values of a linear signal are NaN.
+    /// Signal with one value per sample time. Missing values of a linear signal are NaN.
     ///
     /// # Errors
-    /// [`Error::Length`]; [`Error::Structure`] for times that do not ascend from 0.
+    /// [`Error::Length`] without samples or for different numbers of times and values. [`Error::NotFinite`] or
+    /// [`Error::Structure`] for times that do not ascend from 0.
     pub fn new(times: &'a [f64], values: &'a [f64], intersample: Intersample) -> Result<Self> {
         check_times(times)?;
         check_length("values at the sample times", times.len(), values.len())?;
         Ok(Self::new_unchecked(times, values, intersample))
     }
 
-    /// Signal of checked times.
+    /// Signal whose sample times have been checked.
     pub(crate) fn new_unchecked(times: &'a [f64], values: &'a [f64], intersample: Intersample) -> Self {
         Self { times: Cow::Borrowed(times), values: Cow::Borrowed(values), intersample }
     }
 
-    /// Signal after a delay \[s\], with the value before its first sample; with a negative delay, the last value is
-    /// held.
+    /// Return the signal after a delay \[s\]. `before` is the value before its first sample. With a negative delay, the
+    /// last value is held at the end.
     #[must_use]
     pub fn with_delay(self, delay: f64, before: f64) -> Self {
         if delay == 0.0 {
@@ -58,10 +59,11 @@ impl<'a> NonuniformSignal<'a> {
         Self { times, values, ..self }
     }
 
-    /// Exact means over `m` pulses of this width \[s\]. O((N + m) log m).
+    /// Return exact means over `m` pulses of width `step` \[s\]. O((N + m) log m) for N samples.
     ///
     /// # Errors
-    /// No pulse or too many, a step that is not positive, a value that is not finite.
+    /// [`Error::OutOfRange`] for no pulse, too many pulses, or a step that is not positive. [`Error::NotFinite`] for a
+    /// value that is not finite.
     ///
     /// ```
     /// # use ftlm::signal::{block_pulse::Intersample, nonuniform::NonuniformSignal};
@@ -81,11 +83,11 @@ impl<'a> NonuniformSignal<'a> {
         }))
     }
 
-    /// Means of a zero-order-hold signal, without rounding error if the value is constant within a pulse.
+    /// Return the means of a zero-order-hold signal, without rounding error if the value is constant within a pulse.
     fn hold_means(&self, edges: &[f64], step: f64) -> Vec<f64> {
         let m = edges.len() - 1;
         let close = |edge: f64, time: f64| (edge - time).abs() <= EDGE_TOLERANCE_PULSES * step;
-        // A switch within rounding of an edge is at that edge.
+        // A switching time within rounding of a pulse edge counts as this edge.
         let switches: Vec<f64> = (self.times.iter())
             .map(|&time| {
                 let after = edges.partition_point(|edge| *edge < time).min(m);
@@ -138,21 +140,21 @@ impl<'a> NonuniformSignal<'a> {
         integrals.windows(2).map(|pair| (pair[1] - pair[0]) / step).collect()
     }
 
-    /// Values at given times \[s\]; at a jump of a zero-order-hold signal, the value after it.
+    /// Return the values at given times \[s\]. At a jump of a zero-order-hold signal, this is the value after the jump.
     #[must_use]
     pub fn at(&self, times: &[f64]) -> Vec<f64> {
         let (own, values) = (&self.times, &self.values);
         if self.intersample == Intersample::Linear {
             return times.iter().map(|&time| interpolate(time, own, values)).collect();
         }
-        // Times that differ from a switch by rounding only count as equal.
+        // Times that differ from a switching time by rounding only count as equal to it.
         let slack = TIME_TOLERANCE * own.last().copied().unwrap_or(0.0).max(1e-300);
         let value_before = |time: &f64| values[own.partition_point(|at| *at <= time + slack).saturating_sub(1)];
         times.iter().map(value_before).collect()
     }
 
-    /// Times \[s\] and sizes of the jumps of a zero-order-hold signal, including the initial jump from 0; None for a
-    /// linear signal.
+    /// Return the times \[s\] and sizes of the jumps of a zero-order-hold signal, including the initial jump from 0.
+    /// None for a linear signal.
     #[must_use]
     pub fn jumps(&self) -> Option<(Vec<f64>, Vec<f64>)> {
         let mut before = 0.0;
@@ -160,8 +162,8 @@ impl<'a> NonuniformSignal<'a> {
         (self.intersample == Intersample::Hold).then(|| (self.times.to_vec(), sizes))
     }
 
-    /// Jumps of a zero-order-hold signal within `m` pulses of width `step` \[s\], without jumps at pulse edges. A signal
-    /// that is linear between samples has none.
+    /// Return the jumps of a zero-order-hold signal within `m` pulses of width `step` \[s\], without jumps at pulse
+    /// edges. Empty for a linear signal.
     #[must_use]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::float_cmp)]
     pub fn pulse_jumps(&self, m: usize, step: f64) -> Vec<PulseJump> {
@@ -184,10 +186,11 @@ impl<'a> NonuniformSignal<'a> {
     }
 }
 
-/// Return an error for times that do not ascend from 0.
+/// Return an error for sample times that do not ascend from 0.
 ///
 /// # Errors
-/// [`Error::Length`] for no time, [`Error::NotFinite`], [`Error::Structure`].
+/// [`Error::Length`] without times, [`Error::NotFinite`] for a time that is not finite, [`Error::Structure`] for a
+/// negative or descending time.
 pub(crate) fn check_times(times: &[f64]) -> Result<()> {
     check_length("sample times", times.len().max(1), times.len())?;
     check_finite("sample times", times)?;
@@ -201,7 +204,7 @@ pub(crate) fn check_times(times: &[f64]) -> Result<()> {
     }
 }
 
-/// Linear interpolation of samples at ascending times; the first or last value outside them.
+/// Interpolate samples linearly at one time. `times` is ascending. Outside of it, the first or last value is returned.
 ///
 /// In an interval with a missing value (NaN) at one end, the result is NaN.
 #[must_use]
@@ -216,7 +219,8 @@ pub fn interpolate(time: f64, times: &[f64], values: &[f64]) -> f64 {
     slope * (time - times[row]) + values[row]
 }
 
-/// Uniform samples with missing ones (NaN) interpolated linearly; the nearest value at the ends.
+/// Interpolate missing uniform samples (NaN) linearly. At the ends, the nearest value is used. If all samples are
+/// missing, they stay NaN.
 ///
 /// ```
 /// # use ftlm::signal::nonuniform::interpolate_gaps;

@@ -1,21 +1,20 @@
-//! Statistics of series: robust noise scale, autocovariance, whiteness test, autoregressive noise models.
+//! Statistics of signals: robust noise level, autocovariances, whiteness test, autoregressive noise models.
 
 use crate::fft::{plan, Bin, Workspace};
 use crate::simd::{dispatch_simd, dot, SimdKernel};
 
 /// Median absolute deviation of a normal variable, in units of its standard deviation.
 pub const NORMAL_MAD_PER_SIGMA: f64 = 0.674_489_750_196_081_7;
-/// Huber's threshold in standard deviations. Under normal noise the efficiency is 95 % of the efficiency of least
-/// squares.
+/// Huber's threshold in standard deviations. Under normal noise, the efficiency is 95 % of that of least squares.
 pub const HUBER_THRESHOLD: f64 = 1.345;
-/// 99 % quantile of a normal variable. A test with this quantile rejects 1 % of true models.
+/// Quantile of the standard normal distribution at 99 %. A test with this quantile rejects 1 % of true models.
 const NORMAL_99: f64 = 2.326_347_874_040_840_8;
 /// Default number of lags of a whiteness test.
 pub const WHITENESS_LAGS: usize = 25;
-/// Maximum number of values that are summed one by one in pairwise summation.
+/// Maximum number of values that are added one by one in pairwise summation.
 const MAX_SERIAL_SUM_VALUES: usize = 128;
 
-/// SIMD task: inner product of two rows of equal length.
+/// SIMD kernel: dot product of two slices of equal length.
 struct Inner<'a>(&'a [f64], &'a [f64]);
 
 impl SimdKernel for Inner<'_> {
@@ -27,13 +26,13 @@ impl SimdKernel for Inner<'_> {
     }
 }
 
-/// Dot product Σ a·b of rows of equal length, vectorized.
+/// Return the dot product Σ a·b of slices of equal length, with the widest vector instructions of the processor.
 #[must_use]
 pub fn inner(a: &[f64], b: &[f64]) -> f64 {
     dispatch_simd(Inner(a, b))
 }
 
-/// Pairwise sum of values. Rounding errors grow with the logarithm of their number.
+/// Return the sum of values by pairwise summation. Its rounding error grows with the logarithm of their number.
 #[must_use]
 pub fn sum(values: &[f64]) -> f64 {
     if values.len() < 8 {
@@ -54,20 +53,21 @@ pub fn sum(values: &[f64]) -> f64 {
     rest.iter().fold(((a + b) + (c + d)) + ((e + f) + (g + h)), |total, value| total + value)
 }
 
-/// Mean of values, NaN if there are none.
+/// Return the mean of values; NaN without values.
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn mean(values: &[f64]) -> f64 {
     sum(values) / values.len() as f64
 }
 
-/// Root mean square. Infinite on overflow.
+/// Return the root mean square of values. Infinite on overflow, NaN without values.
 #[must_use]
 pub fn root_mean_square(values: &[f64]) -> f64 {
     mean(&values.iter().map(|v| v * v).collect::<Vec<_>>()).sqrt()
 }
 
-/// Robust standard deviation from the median of absolute values, insensitive to outliers. 0 without values.
+/// Return a robust standard deviation about 0, from the median of absolute values. It is insensitive to outliers. 0
+/// without values.
 ///
 /// ```
 /// let found = ftlm::signal::statistics::robust_deviation(&[1.0, -2.0, 3.0, -1000.0]);
@@ -81,7 +81,8 @@ pub fn robust_deviation(values: &[f64]) -> f64 {
     median(values.iter().map(|v| v.abs()).collect()) / NORMAL_MAD_PER_SIGMA
 }
 
-/// Standard deviation of white noise on a smooth signal, from the median of its second differences.
+/// Return the standard deviation of white noise on a smooth signal, from the median of second differences. NaN marks
+/// missing samples.
 #[must_use]
 pub fn white_noise_deviation(samples: &[f64]) -> f64 {
     let bends = |samples: &[f64]| -> Vec<f64> {
@@ -90,13 +91,13 @@ pub fn white_noise_deviation(samples: &[f64]) -> f64 {
     };
     let mut differences = bends(samples);
     if differences.is_empty() {
-        // No three neighboring samples are present: use the samples that are, in order.
+        // No three neighboring samples are present. The samples that are present then count as neighbors.
         differences = bends(&samples.iter().copied().filter(|v| !v.is_nan()).collect::<Vec<_>>());
     }
     robust_deviation(&differences) / 6.0_f64.sqrt()
 }
 
-/// Median of values, NaN if there are none.
+/// Return the median of values; NaN without values.
 ///
 /// ```
 /// assert_eq!(ftlm::signal::statistics::median(vec![3.0, 1.0, 8.0, 2.0]), 2.5);
@@ -114,7 +115,8 @@ pub fn median(mut values: Vec<f64>) -> f64 {
     }
 }
 
-/// Autocovariances of series at lags from 0 to `most`, and the number of pairs in each mean. O(most · N).
+/// Return the autocovariances of series at lags 0 to `most`, and the number of sample pairs at each lag. O(most · N)
+/// for N samples.
 ///
 /// NaN counts as a missing sample. Each series is centered on its own mean, and the results are pooled.
 #[must_use]
@@ -156,19 +158,19 @@ pub fn variance_inflation(series: &[f64]) -> f64 {
     1.0_f64.max(1.0 + 2.0 * weighted.sum::<f64>() / if power > 0.0 { power } else { 1.0 })
 }
 
-/// Series minus its mean; 0 at missing samples.
+/// Return a series minus its mean, with 0 at missing samples (NaN).
 fn subtract_mean(values: &[f64]) -> Vec<f64> {
     let finite: Vec<f64> = values.iter().copied().filter(|v| !v.is_nan()).collect();
     let center = if finite.is_empty() { 0.0 } else { mean(&finite) };
     values.iter().map(|v| if v.is_nan() { 0.0 } else { v - center }).collect()
 }
 
-/// Portmanteau statistic Σ_k (Σ eₜ eₜ₋ₖ)² / Σ (eₜ eₜ₋ₖ)² over `lags` lags k. For white noise it is chi-squared with
-/// `lags` degrees of freedom.
+/// Return the portmanteau statistic Σ_k (Σ_t e_t e_{t−k})² / Σ_t (e_t e_{t−k})² over `lags` lags k. If the series e is
+/// white noise, it is chi-squared with `lags` degrees of freedom.
 ///
-/// The variance of noise may change within the series: that of each lag is estimated from the products themselves
-/// (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). Each series is centered on its own mean, and the results
-/// are pooled. NaN counts as a missing sample.
+/// The variance of the noise may change within a series, because the variance at each lag is estimated from the
+/// products themselves (Lobato, Nankervis and Savin, doi:10.1111/1468-2354.00106). Each series is centered on its own
+/// mean, and the results are pooled. NaN counts as a missing sample.
 ///
 /// ```
 /// // Noise that changes its sign at random is white, however its size changes.
@@ -189,7 +191,7 @@ pub fn portmanteau(series: &[&[f64]], lags: usize) -> f64 {
     if largest == 0.0 {
         return 0.0;
     }
-    // Relative to the largest value, whose fourth power is in the range of numbers.
+    // Division by the largest magnitude keeps fourth powers in the range of floating-point numbers.
     let all: Vec<Vec<f64>> = all.iter().map(|x| x.iter().map(|v| v / largest).collect()).collect();
     let squares: Vec<Vec<f64>> = all.iter().map(|x| x.iter().map(|v| v * v).collect()).collect();
     let summed = |parts: &[Vec<f64>], lag: usize| -> f64 {
@@ -207,7 +209,8 @@ pub fn portmanteau(series: &[&[f64]], lags: usize) -> f64 {
     (1..=lags.min(longest)).map(of).sum()
 }
 
-/// Whether a series is consistent with white noise: [`portmanteau`] test at 1 %; true if it is too short for the lags.
+/// True if a series is consistent with white noise by the [`portmanteau`] test at 1 %. Series of at most `lags` + 1
+/// samples count as consistent.
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn is_white(series: &[f64], lags: usize) -> bool {
@@ -215,9 +218,10 @@ pub fn is_white(series: &[f64], lags: usize) -> bool {
     count <= lags + 1 || portmanteau(&[series], lags) <= chi_squared(lags as f64, NORMAL_99)
 }
 
-/// Quantile of chi-squared at the level of a normal `quantile`, by Wilson and Hilferty.
+/// Return the quantile of the chi-squared distribution by the approximation of Wilson and Hilferty. `quantile` is the
+/// standard normal quantile at the same probability, for example 2.326 for 99 %.
 ///
-/// Accurate to 0.3 % from five degrees of freedom, to 1 % from one.
+/// The error is at most 0.3 % from five degrees of freedom on, and at most 1 % from one degree on.
 #[must_use]
 pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
     let spread = 2.0 / (9.0 * degrees);
@@ -226,15 +230,15 @@ pub fn chi_squared(degrees: f64, quantile: f64) -> f64 {
 
 /// Minimum number of samples in the shortest run per coefficient of an autoregression.
 const SAMPLES_A_COEFFICIENT: usize = 10;
-/// Minimum length of the circulant matrix. Within it, a correlation of 0.99 per sample has decayed.
+/// Minimum length of the transform for autocovariances of an autoregression. Over this length, a correlation of 0.99
+/// per sample has decayed.
 const LEAST_CIRCLE: usize = 4096;
 
-/// Whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance.
+/// Return the whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance.
 ///
-/// The Yule–Walker equations are solved by the Levinson–Durbin recursion (doi:10.1093/biomet/47.3-4.233).
-///
-/// Covariances are pooled over the series, each about its own mean. The order, `most` at most, minimizes the Bayesian
-/// information criterion. NaN counts as a missing sample.
+/// The Yule–Walker equations are solved by the Levinson–Durbin recursion (doi:10.1093/biomet/47.3-4.233). Covariances
+/// are pooled over the series, each about its own mean. The order n, at most `most`, minimizes the Bayesian information
+/// criterion. NaN counts as a missing sample.
 ///
 /// ```
 /// // Every other value the opposite: x_k = −0.9 x_{k−1} + a bounded disturbance.
@@ -251,7 +255,7 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     let (mut covariance, pairs) = autocovariances(series, most);
     let (count, all) = (counts.iter().sum::<usize>() as f64, series.iter().map(|x| x.len()).sum::<usize>() as f64);
     for (lag, (value, &of)) in covariance.iter_mut().zip(&pairs).enumerate() {
-        // A lag with few pairs gets a small weight, so that all lags belong to one positive spectrum.
+        // A lag with few pairs gets a small weight, so that the covariances belong to a positive spectrum.
         let whole = series.iter().map(|x| x.len().saturating_sub(lag)).sum::<usize>() as f64;
         *value *= if of > 0.0 { (if whole > 0.0 { whole } else { 1.0 }) / all } else { 0.0 };
     }
@@ -281,11 +285,12 @@ pub fn whitening_filter(series: &[&[f64]], most: usize) -> (Vec<f64>, f64) {
     (best, remaining)
 }
 
-/// Autoregression 1, a₁, …, aₙ of a series and the innovation variance, by Burg's method.
+/// Return the autoregression 1, a₁, …, aₙ of a series, and the innovation variance, by Burg's method.
 ///
 /// The series is not centered. Yule–Walker estimates shift a root near 1, as of a random walk, inward, so they
-/// underestimate slow correlation. Burg's estimates do not (Kay, Modern Spectral Estimation, §7.6). The order, at most
-/// `most`, minimizes Schwarz's criterion. NaN marks a missing sample: pairs that begin or end at it are left out.
+/// underestimate slow correlation. Burg's estimates do not (Kay, Modern Spectral Estimation, §7.6). The order n, at
+/// most `most`, minimizes Schwarz's criterion. NaN marks a missing sample. Pairs of samples that begin or end at it are
+/// omitted.
 ///
 /// ```
 /// // The sum of ±1 is a random walk: each value predicts the next one.
@@ -335,31 +340,33 @@ pub fn burg_filter(series: &[f64], most: usize) -> (Vec<f64>, f64) {
     (best, remaining)
 }
 
-/// Minimum number of samples in all runs per input lag of an ARX model.
+/// Minimum number of samples in all runs together, per lag of each input of an ARX model.
 const SAMPLES_AN_INPUT_LAG: usize = 40;
-/// Relative residual of a regression column on the previous columns, below which the column is omitted.
+/// Residual sum of squares of a regression column on the previous columns, relative to its sum of squares. Below this
+/// value, the column is omitted.
 const COLUMN_TOLERANCE: f64 = 1e-8;
 
-/// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t), k ≥ 1, of series that may depend on inputs.
+/// ARX model e(t) = −Σ aₖ e(t − k) + Σ bₖ u(t − k) + w(t), k ≥ 1, of series e that may depend on inputs u. w are the
+/// innovations.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct ArxModel {
     /// Whitening filter 1, a₁, …, aₙ of the noise, without the response to the inputs.
     pub filter: Vec<f64>,
-    /// First row of the innovations in each series.
+    /// Index of the sample in each series at which the innovations start.
     pub start: usize,
-    /// Innovations w of each series from row `start` on, 0 where a sample is missing.
+    /// Innovations w of each series from sample `start` on; 0 where a sample is missing.
     pub innovations: Vec<Vec<f64>>,
     /// Number of estimated coefficients.
     pub parameters: usize,
 }
 
-/// ARX model with a noise spectrum that all series share, by least squares. O((lags · inputs)² · N).
+/// Fit an ARX model to series with a common noise spectrum, by least squares. O((lags · inputs)² · N) for N samples.
 ///
 /// An AR model without inputs would model the response to an input as noise. The order of the AR part, at most `most`,
-/// minimizes the Bayesian information criterion; inputs have lags 1 to `most`, fewer if samples are few. Lag 0 is left
-/// out: under feedback, the input at lag 0 contains the current noise. NaN is a missing sample of a series; `inputs`
-/// have one row for each series and no missing samples.
+/// minimizes the Bayesian information criterion. Inputs have lags 1 to `most`, or fewer if samples are few. Lag 0 is
+/// omitted, because under feedback the input at lag 0 contains the current noise. NaN marks a missing sample of a
+/// series. Each input has one row per series, without missing samples.
 ///
 /// ```
 /// // A sinusoid that follows an input, and noise that changes its sign at random: the filter is that of the noise.
@@ -383,7 +390,7 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
     let start = most.max(lags);
     let fixed = 1 + inputs.len() * lags;
     let size = fixed + most + 1;
-    // Numbers of any size and unit have squares in range.
+    // Series and inputs are scaled to one, so that the squares of values of any unit are in range.
     let (series, scale) = scale_to_one(series);
     let inputs: Vec<Vec<Vec<f64>>> = inputs.iter().map(|input| scale_to_one(input).0).collect();
     let fill = |run: usize, t: usize, row: &mut [f64]| {
@@ -391,7 +398,7 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
         for (input, columns) in inputs.iter().zip(row[1..fixed].chunks_exact_mut(lags.max(1))) {
             columns.iter_mut().enumerate().for_each(|(k, value)| *value = input[run][t - 1 - k]);
         }
-        // A missing sample counts as the mean, so that few gaps do not cost most rows.
+        // A missing sample is replaced by the mean. Otherwise a few gaps would exclude most rows.
         let value_or_zero = |value: f64| if value.is_nan() { 0.0 } else { value };
         row[fixed..size - 1]
             .iter_mut()
@@ -455,8 +462,8 @@ pub fn arx_model(series: &[&[f64]], inputs: &[Vec<&[f64]>], most: usize) -> ArxM
     ArxModel { filter, start, innovations, parameters: regression.used.len() }
 }
 
-/// Subtract its mean from each row and divide all rows by the largest magnitude; return the rows and that magnitude.
-/// NaN remains.
+/// Subtract the mean of each row, and divide all rows by the largest magnitude. Return the rows and this magnitude. NaN
+/// stays NaN.
 fn scale_to_one(rows: &[&[f64]]) -> (Vec<Vec<f64>>, f64) {
     let centered: Vec<Vec<f64>> = rows
         .iter()
@@ -483,7 +490,7 @@ impl Regression {
         Self { gram, diagonal, used: Vec::new() }
     }
 
-    /// Add a column, unless the columns before it nearly contain it.
+    /// Add a regression column, unless it is nearly a linear combination of the columns that are already used.
     fn add(&mut self, column: usize) {
         let pivot = self.gram[column][column];
         if pivot.is_nan() || pivot <= COLUMN_TOLERANCE * self.diagonal[column] {
@@ -500,12 +507,12 @@ impl Regression {
         self.used.push(column);
     }
 
-    /// Residual sum of squares of the last column.
+    /// Return the residual sum of squares of the last column.
     fn residual_power(&self) -> f64 {
         self.gram.last().and_then(|line| line.last()).copied().unwrap_or(0.0)
     }
 
-    /// Coefficient of each column except the last; 0 for columns that are not used.
+    /// Return the coefficient of each column except the last; 0 for columns that are not used.
     fn coefficients(&self) -> Vec<f64> {
         let last = self.gram.len() - 1;
         let mut values = vec![0.0; last];
@@ -514,7 +521,8 @@ impl Regression {
     }
 }
 
-/// Autocovariances at lags 0 to `count` − 1 of an autoregression with this filter and innovation variance.
+/// Return the autocovariances at lags 0 to `count` − 1 of an autoregression with this filter and innovation variance
+/// `power`.
 ///
 /// ```
 /// let found = ftlm::signal::statistics::filter_autocovariances(&[1.0, -0.9], 1.0, 30);
@@ -522,7 +530,7 @@ impl Regression {
 /// ```
 #[must_use]
 pub fn filter_autocovariances(filter: &[f64], power: f64, count: usize) -> Vec<f64> {
-    // The circle of frequencies is so fine that wrapped-around covariances have decayed.
+    // The transform is so long that wrapped-around covariances have decayed.
     let size = power_above(2 * count + 8 * filter.len()).max(LEAST_CIRCLE);
     let plan = plan(size);
     let mut time = filter.to_vec();
@@ -535,7 +543,8 @@ pub fn filter_autocovariances(filter: &[f64], power: f64, count: usize) -> Vec<f
     time
 }
 
-/// Products of rows with the symmetric Toeplitz matrix of these autocovariances. O(N log N) a row.
+/// Return the products of rows with the symmetric Toeplitz matrix of the autocovariances. O(N log N) per row of N
+/// values.
 ///
 /// The Toeplitz matrix is embedded in a circulant matrix.
 #[must_use]
@@ -564,7 +573,7 @@ pub fn multiply_toeplitz(rows: &[&[f64]], covariances: &[f64]) -> Vec<Vec<f64>> 
         .collect()
 }
 
-/// Smallest power of two above a number.
+/// Return the smallest power of two above a number.
 fn power_above(number: usize) -> usize {
     1 << (usize::BITS - number.leading_zeros())
 }

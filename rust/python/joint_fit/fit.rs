@@ -23,7 +23,7 @@ use crate::python::recording::{recordings, Recording};
 use crate::recording::Recordings;
 
 type Table<'py> = Bound<'py, PyArray2<f64>>;
-/// Resources as (number of threads, bytes of memory of one order grid).
+/// Resources of a fit: (number of threads, memory limit of one order grid \[bytes\]).
 type Means = (usize, u64);
 
 /// Candidates of a multistart, best first. Later fits of the same structure to the same runs can start from these
@@ -33,13 +33,14 @@ pub struct JointMultistart {
     inner: Arc<Vec<Candidate>>,
 }
 
-/// Runs as source of a fit.
+/// Return the runs as the data of a fit. Return an error if their signals or outputs are not those of the parameter
+/// set.
 pub(super) fn source(free: &ParameterSet, runs: &[Py<Recording>]) -> Result<Recordings> {
     let outputs: Vec<usize> = free.structure.equations.iter().map(|e| e.output).collect();
     recordings(runs, free.structure.recorded_count(), &outputs, free.structure.inputs.len())
 }
 
-/// Run the multistart of a problem on runs.
+/// Run the multistart of a joint fit and return its candidates. `progress` is called with (steps done, all steps).
 #[pyfunction]
 #[pyo3(signature = (problem, runs, means, progress=None, stop=None))]
 #[allow(clippy::needless_pass_by_value)]
@@ -62,10 +63,12 @@ pub fn joint_multistart(
     Ok(JointMultistart { inner: Arc::new(candidates) })
 }
 
-/// Warm start from an earlier fit: (values of the free parameters, noise of each output, pulses per sampling interval).
+/// Warm start from an earlier fit: (values of the free parameters, noise standard deviation of each output, pulses per
+/// sampling interval).
 type NearArg = (List<f64>, List<f64>, usize);
 
-/// Fit a structure to its runs; None if the simulation overflows for every initial guess.
+/// Fit a structure to its runs and return the result as a dictionary. None if the simulation overflows for every
+/// initial guess.
 #[pyfunction]
 #[pyo3(signature = (problem, runs, known, start, near, candidates, huber, refine, means, progress=None, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
@@ -108,7 +111,7 @@ pub fn joint_fit<'py>(
     fit.map(|fit| fit_to_dict(py, fit, size)).transpose()
 }
 
-/// Tables of all runs.
+/// Convert the rows of each run to a table.
 fn tables<'py>(py: Python<'py>, runs: &[Vec<Vec<f64>>]) -> PyResult<Vec<Table<'py>>> {
     runs.iter().map(|run| stack_rows(py, run)).collect()
 }

@@ -45,20 +45,21 @@ impl JointProblem {
         run_attached(|| Ok(self.inner.coefficients.clone()))
     }
 
-    /// Coefficients that a law determines: name, sign, factors.
+    /// Coefficients that a coefficient law determines: (name, sign, names of the factors).
     #[getter]
     fn products(&self) -> PyResult<Vec<(String, f64, Vec<String>)>> {
         let law_tuple = |law: &Law| (law.name.clone(), law.sign, law.factors.clone());
         run_attached(|| Ok(self.inner.products.iter().map(law_tuple).collect()))
     }
 
-    /// Bounds of all free parameters.
+    /// (lower, upper) bound of each free parameter.
     #[getter]
     fn bounds(&self) -> PyResult<Vec<(f64, f64)>> {
         run_attached(|| Ok(self.inner.problem.bounds()))
     }
 
-    /// Last point between a feasible point and another that satisfies bounds and constraints of the orders.
+    /// Return the last point on the line from the feasible point `at` to `towards` that satisfies the bounds and the
+    /// constraints of the orders.
     fn feasible<'py>(
         &self,
         py: Python<'py>,
@@ -70,10 +71,11 @@ impl JointProblem {
         Ok(PyArray1::from_vec(py, point))
     }
 
-    /// Minimize the output error on sampled runs by Levenberg–Marquardt.
+    /// Minimize the output error on sampled runs by the Levenberg–Marquardt method. Return the optimum as a dictionary.
     ///
-    /// `start` has the values of the free parameters and the states of runs with friction. Coordinates are logarithmic
-    /// where the start allows it, unless `plain`. `held` are the indices of fixed parameters.
+    /// `start` holds the values of the free parameters, and the initial states of runs with friction. Coordinates are
+    /// logarithmic where the initial guess allows it, unless `plain` is true. `held` holds the indices of fixed
+    /// parameters. With `steady`, no step leads from a stable model to an unstable one.
     #[pyo3(signature = (runs, start, plain, held, evaluations, tolerance, steady, stop=None))]
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn minimize<'py>(

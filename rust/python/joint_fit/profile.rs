@@ -17,12 +17,14 @@ use crate::python::convert::{matrix, rows, vector, List};
 use crate::python::order_search::watch::{run_with_progress, Stop};
 use crate::python::recording::Recording;
 
-/// Cost surface as (smallest sum of squares, values of both parameters, sums of squares).
+/// Cost surface: (smallest sum of squares, values of the first parameter, values of the second parameter, sums of
+/// squares).
 type SurfaceTuple<'py> = (f64, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>, Bound<'py, PyArray2<f64>>);
 
-/// State of a fit from a dictionary with these keys: estimate, values on its finest grid, weight of each output, robust
-/// weights of the samples by run, pulses per sampling interval, true if the step has converged, true if unstable models
-/// are excluded.
+/// State of a fit, from a dictionary with these fields as keys. `estimate` holds the parameters extrapolated to zero
+/// step, and `on_grid` the parameters on the finest grid. `weights` holds the weights of the outputs, and `shares` the
+/// robust weights of the samples by run. `every` is the number of pulses per sampling interval. `settled` is true if
+/// the step has converged. With `steady`, no step leads from a stable model to an unstable one.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct FitArg<'py> {
@@ -47,7 +49,7 @@ fn state(fit: FitArg<'_>) -> PyResult<FitState> {
     })
 }
 
-/// Return an error for an index without a parameter.
+/// Return an error if the index of a parameter is out of range.
 fn check_parameters(problem: &JointProblem, parameters: &[usize]) -> PyResult<()> {
     let size = problem.inner.problem.size();
     match parameters.iter().find(|&&i| i >= size) {
@@ -59,10 +61,12 @@ fn check_parameters(problem: &JointProblem, parameters: &[usize]) -> PyResult<()
     }
 }
 
-/// Profile-likelihood intervals of a fit around the optimum that `evaluations` lead to.
+/// Return profile-likelihood intervals of a fit as a dictionary. The item `intervals` holds (index of the parameter,
+/// lower bound, upper bound, points, evaluations) of each parameter.
 ///
-/// Without `parameters`, those with an inaccurate Wald interval are profiled. `budget` is the maximum number of
-/// simulations for all bounds, and the smallest initial budget of each bound.
+/// Without `parameters`, the parameters with an inaccurate Wald interval are profiled. `width` is the half-width in
+/// standard deviations. `budget` holds the maximum number of simulations for all bounds, and the smallest initial
+/// budget of each bound. At most `evaluations` evaluations locate the optimum before the profiles.
 #[pyfunction]
 #[pyo3(signature = (
     problem, runs, fit, parameters, width, *, budget=None, threads=1, evaluations=120, progress=None, stop=None,
@@ -99,7 +103,7 @@ pub fn profile_intervals<'py>(
     Ok(dict)
 }
 
-/// Maximum number of points on each axis of a cost surface. Each pair of values is a simulation.
+/// Maximum number of points on each axis of a cost surface. Each pair of values requires a simulation.
 const MAX_SURFACE_POINTS: usize = 64;
 
 #[allow(clippy::cast_precision_loss)]
@@ -112,9 +116,11 @@ fn check_surface_points(points: usize) -> Result<(), Error> {
     Err(Error::OutOfRange { name, value, range, remedy })
 }
 
-/// Sums of squares of a fit over two parameters: at the optimum, the values of both, and at each pair of values.
+/// Return the sums of squares of a fit over two parameters as (smallest sum, values of the first parameter, values of
+/// the second parameter, sums of squares).
 ///
-/// Rows are values of the second parameter. `halves` are the distances of the outermost values from the optimum.
+/// Each row of the sums of squares belongs to one value of the second parameter. `halves` holds the distances of the
+/// outermost values from the optimum. With `refit`, all other parameters follow by one linear step.
 #[pyfunction]
 #[pyo3(signature = (problem, runs, fit, pair, halves, points, *, refit=true, evaluations=20, stop=None))]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]

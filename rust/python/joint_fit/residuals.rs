@@ -17,7 +17,8 @@ fn copy_vectors(name: &str, arrays: &[PyReadonlyArray1<'_, f64>]) -> PyResult<Ve
     arrays.iter().map(|array| copy_vector(name, array)).collect()
 }
 
-/// Covariance from a Jacobian (one row per parameter), residuals by run and output, and their sum of squares.
+/// Return the covariance of parameters from a Jacobian with one row per parameter, the residuals of each run and
+/// output, and their sum of squares.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn covariance_of<'py>(
@@ -33,7 +34,8 @@ pub fn covariance_of<'py>(
     matrix(py, covariance, size)
 }
 
-/// Covariance of a fit, whose residuals may have robust weights.
+/// Return the covariance of the parameters of a fit from a Jacobian with one row per parameter, and the residuals of
+/// each run and output. `shares` holds the robust weights of the residuals; None without these.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn fit_covariance<'py>(
@@ -50,7 +52,7 @@ pub fn fit_covariance<'py>(
     matrix(py, covariance, size)
 }
 
-/// Long-run covariance of sums of scores, with Bartlett weights.
+/// Return the long-run covariance of the sums of scores (Jacobian times residual), with Bartlett weights.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn long_run_covariance<'py>(
@@ -64,8 +66,9 @@ pub fn long_run_covariance<'py>(
     matrix(py, covariance, size)
 }
 
-/// Likelihood ratio of two nested regressions under autoregressive noise. Columns are rows of the arrays; `blocks` are
-/// the (start, stop) indices of the samples by output and run.
+/// Return the likelihood ratio of two nested regressions of `residuals` under autoregressive noise of an order of at
+/// most `most`. Rows of `few` and `many` are the regressors of both. `blocks` holds the (start, stop) indices of the
+/// samples by output and run.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn prediction_ratio(
@@ -84,7 +87,8 @@ pub fn prediction_ratio(
     })
 }
 
-/// Whitening filter of series with a common spectrum, and the innovation variance.
+/// Return the whitening filter 1, a₁, …, aₙ of series with a common spectrum, and the innovation variance. n is at most
+/// `most`.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn whitening_filter<'py>(
@@ -100,8 +104,8 @@ pub fn whitening_filter<'py>(
     Ok((PyArray1::from_vec(py, filter), power))
 }
 
-/// ARX model of series that may depend on inputs: whitening filter of the noise, first row and values of the
-/// innovations, number of coefficients.
+/// Fit an ARX model to series that may depend on inputs. Return (whitening filter of the noise, index of the sample at
+/// which the innovations start, innovations of each series, number of coefficients).
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn arx_model<'py>(
@@ -130,7 +134,7 @@ pub fn arx_model<'py>(
     Ok((PyArray1::from_vec(py, model.filter), model.start, innovations, model.parameters))
 }
 
-/// Autocovariances of series at lags from 0, and the number of pairs in each mean.
+/// Return the autocovariances of series at lags 0 to `most`, and the number of sample pairs at each lag.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn autocovariances<'py>(
@@ -147,7 +151,8 @@ pub fn autocovariances<'py>(
     Ok((PyArray1::from_vec(py, sums), PyArray1::from_vec(py, pairs)))
 }
 
-/// Statistic of whiteness over all lags up to `lags`, chi-squared for white noise of any variance.
+/// Return the portmanteau statistic of series over `lags` lags. For white noise of any variance it is chi-squared with
+/// `lags` degrees of freedom.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn portmanteau(py: Python<'_>, series: List<PyReadonlyArray1<'_, f64>>, lags: usize) -> PyResult<f64> {
@@ -166,7 +171,7 @@ pub fn variance_inflation(py: Python<'_>, series: PyReadonlyArray1<'_, f64>) -> 
     run_interruptible(py, series.len(), None, move |_| Ok(statistics::variance_inflation(&series)))
 }
 
-/// Return true if the autocorrelations of a series are consistent with white noise.
+/// Return true if a series is consistent with white noise by the portmanteau test over `lags` lags at 1 %.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn is_white(py: Python<'_>, series: PyReadonlyArray1<'_, f64>, lags: usize) -> PyResult<bool> {
@@ -174,7 +179,8 @@ pub fn is_white(py: Python<'_>, series: PyReadonlyArray1<'_, f64>, lags: usize) 
     run_interruptible(py, series.len(), None, move |_| Ok(statistics::is_white(&series, lags)))
 }
 
-/// Quantile of chi-squared at the level of a normal quantile.
+/// Return the quantile of the chi-squared distribution. `quantile` is the standard normal quantile at the same
+/// probability.
 #[pyfunction]
 pub fn chi_squared(degrees: f64, quantile: f64) -> PyResult<f64> {
     run_attached(|| Ok(statistics::chi_squared(degrees, quantile)))

@@ -10,16 +10,17 @@ use crate::estimation::output_error::FreeInput;
 use crate::python::convert::{derived_signals, initial, DerivedArg, InitialArg, List};
 use crate::python::recording::input_law;
 
-/// Order: (constant, weight of each free order by name).
+/// Order law: (constant, [(name of the free order, weight), …]).
 type OrderArg = (f64, List<(String, f64)>);
 /// Coefficient with a factor: (factor, coefficient).
 type NumberArg = (f64, CoefficientArg);
 /// Term: (signal, order, coefficient, factor).
 type TermArg = (usize, OrderArg, CoefficientArg, f64);
-/// Equation: (output, order, terms, fc, fs and vs of friction).
+/// Equation: (output, order, terms, friction). The friction is None, or holds Coulomb friction, Stribeck friction and
+/// Stribeck velocity.
 type EquationArg = (usize, OrderArg, List<TermArg>, Option<[NumberArg; 3]>);
 
-/// Coefficient: a name if free, a number if fixed.
+/// Coefficient: a name if it is free, a number if it is fixed.
 #[derive(FromPyObject)]
 pub enum CoefficientArg {
     Free(String),
@@ -35,7 +36,7 @@ impl From<CoefficientArg> for Coefficient {
     }
 }
 
-/// Structure from a dictionary with these keys.
+/// Structure from a dictionary with these fields as keys.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct StructureArg {
@@ -52,7 +53,7 @@ pub struct StructureArg {
     hints: HintsArg,
 }
 
-/// Prior knowledge of orders and coefficients.
+/// Prior knowledge of orders and coefficients, from a dictionary with these fields as keys.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 pub struct HintsArg {
@@ -72,7 +73,7 @@ fn rubs([coulomb, stribeck, speed]: [NumberArg; 3]) -> FrictionParameters {
     FrictionParameters { coulomb: number(coulomb), stribeck: number(stribeck), speed: number(speed) }
 }
 
-/// Parse a structure. Return an error for a signal or coefficient that does not exist.
+/// Parse a structure. Return an error for a signal index out of range, an unknown input law, or an invalid expression.
 pub fn parse_structure(argument: StructureArg) -> PyResult<ParametricStructure> {
     let term = |(signal, at, coefficient, factor): TermArg| ParametricTerm {
         signal,

@@ -1,5 +1,4 @@
-//! Conversion of Python tuples to settings, order grids, partial results and outcomes of a search, and of results to
-//! tuples.
+//! Conversion of settings, order grids, partial results and outcomes of a search from and to Python tuples.
 
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -17,11 +16,11 @@ use crate::order_search::stage_join::Span;
 use crate::python::convert::{initial, prior, records, to_lists, to_vectors, InitialArg, List, RecordArg};
 use crate::regressors::Record;
 
-/// Convergence tolerance of the instrumental variables of a candidate, too small to affect the ranking.
+/// Convergence tolerance of the instrumental variables of a candidate. It is too small to affect the ranking.
 const IV_CONVERGENCE_TOLERANCE: f64 = 1e-4;
 
-/// Settings from a dictionary with these keys. `innovation_length` is 0 for least squares, `iterations` is 0 without
-/// instrumental variables, `prior_covariance` is None for a weak prior, `memory` is in bytes.
+/// Settings from a dictionary with these fields as keys. `innovation_length` is 0 for least squares. `iterations` is 0
+/// without instrumental variables. `prior_covariance` is None for a weak prior. `memory` is in bytes.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 struct SettingsDict {
@@ -89,14 +88,15 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
 }
 
 impl SettingsArg {
-    /// Options with the initial terms of the records.
+    /// Return the options of a search with these initial terms.
     pub fn options(self, terms: InitialArg) -> PyResult<Options> {
         let Self { criterion, norm, estimator, top, threads, pruning, memory } = self;
         Ok(Options { criterion, norm, estimator, initial: initial(terms)?, top, threads, pruning, memory })
     }
 }
 
-/// Data and options of a search without its order grid. `F` holds the fixed coefficients of one or several equations.
+/// Data and options of a search without its order grid. `F` is the type of the fixed coefficients, of one or several
+/// equations.
 pub struct SearchInputs<F> {
     records: Vec<Record>,
     pub inputs: Vec<bool>,
@@ -115,7 +115,8 @@ impl<F> SearchInputs<F> {
         Ok(Self { records: records(runs)?, inputs: inputs.into(), fixed, options: settings.options(terms)? })
     }
 
-    /// Records, with the noise-free substitutes that the estimator needs.
+    /// Return the records. For instrumental variables, they also contain noise-free projections of all signals except
+    /// the inputs.
     pub fn records(&mut self, control: &Control) -> Result<Vec<Record>, Error> {
         let records = std::mem::take(&mut self.records);
         if !matches!(self.options.estimator, Estimator::InstrumentalVariables(_)) {
@@ -126,10 +127,10 @@ impl<F> SearchInputs<F> {
     }
 }
 
-/// Order grid: (output, values of alpha, [(signal, values, interchangeable), …]).
+/// Order grid: (output, values of alpha, [(signal, values, true if interchangeable), …]).
 type OrdersTuple = (usize, List<f64>, List<(usize, List<f64>, bool)>);
 
-/// Axes of an order grid.
+/// Values of the orders on the axes of an order grid.
 pub struct OrdersArg {
     output: usize,
     alphas: Vec<f64>,
@@ -152,9 +153,9 @@ impl OrdersArg {
     }
 }
 
-/// Affine order: (constant, weight of each free order).
+/// Affine order law: (constant, weight of each free order).
 type AffineTuple = (f64, List<f64>);
-/// Order laws: (output, alpha, [(signal, order), …]).
+/// Order laws of an equation: (output, alpha, [(signal, order), …]).
 type LawTuple = (usize, AffineTuple, List<(usize, AffineTuple)>);
 
 /// Order laws of one equation.
@@ -171,7 +172,7 @@ impl<'py> FromPyObject<'_, 'py> for LawArg {
     }
 }
 
-/// Order grid of a coupled search from the values of its free orders.
+/// Build the order grid of a coupled search. `axes` holds the values of each free order.
 pub fn law_lattice(
     axes: &[Vec<f64>],
     laws: List<LawArg>,
@@ -182,7 +183,7 @@ pub fn law_lattice(
     Ok(OrderLawGrid::new(axes, &equations, inputs)?.with_fixed_coefficients(fixed))
 }
 
-/// Counts under their public names.
+/// Return the counts as a dictionary, with their names in the Python interface as keys.
 pub fn counts_to_dict<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("candidates", counts.candidates)?;
@@ -195,7 +196,7 @@ pub fn counts_to_dict<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'
     Ok(dict)
 }
 
-/// Name of a failure.
+/// Return the name of a failure in the Python interface.
 pub fn failure_name(failure: Failure) -> &'static str {
     match failure {
         Failure::Singular => "singular",
@@ -203,22 +204,23 @@ pub fn failure_name(failure: Failure) -> &'static str {
     }
 }
 
-/// Row of a result: (index, raw score, coefficients, initial terms by record).
+/// Row of a result: (index, raw sum Σ|e| or Σe² of the errors, coefficients, coefficients of the initial terms by
+/// record).
 type RowArg = (u64, f64, List<f64>, List<List<f64>>);
-/// Counts: candidates, table rows, beaten, excluded by bound, stopped, singular, diverged. Optional last: excluded by
-/// box.
+/// Numbers of candidates: (all, in the table, evaluated but not in the table, excluded by a bound, stopped early,
+/// singular, diverged). An optional last value counts candidates excluded together with their box.
 #[derive(FromPyObject, IntoPyObject)]
 pub enum CountsArg {
     Plain((u64, u64, u64, u64, u64, u64, u64)),
     Boxed((u64, u64, u64, u64, u64, u64, u64, u64)),
 }
-/// Part of a result: rows, counts, (index, true if diverged, false if singular) of failures.
+/// Partial result: (rows, counts, [(index, true if diverged, false if singular), …] of the failures).
 pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
-/// Checkpoint: position, true if the block was restarted, partial result. The position is the batch, the number of its
-/// evaluated candidates, the end, length and limit of the current chunk, and the digest of the evaluation order.
+/// Checkpoint: (position, true if it replaces earlier results, partial result). The position is (index of the batch,
+/// number of its evaluated candidates, end, length and limit of the current chunk, digest of the evaluation order).
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
-/// Result of batches as Python tuples.
+/// Convert a partial result to Python tuples.
 pub fn part_of(part: Part) -> PartArg {
     let c = part.counts;
     (
@@ -248,7 +250,7 @@ pub fn part_of(part: Part) -> PartArg {
     )
 }
 
-/// Result of batches from Python tuples.
+/// Convert a partial result from Python tuples.
 pub fn part((rows, counts, failures): PartArg) -> Part {
     let (candidates, retained, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
         CountsArg::Plain((a, b, c, d, e, f, g)) => (a, b, c, d, e, f, g, 0),
@@ -281,7 +283,7 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
     }
 }
 
-/// Checkpoint from Python tuples.
+/// Convert a checkpoint from Python tuples.
 pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): CheckpointArg) -> Checkpoint {
     Checkpoint {
         place: BatchPosition { batch: round, evaluated_count: followed, end, size, limit, order },
@@ -290,7 +292,7 @@ pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): Che
     }
 }
 
-/// Checkpoint as Python tuples.
+/// Convert a checkpoint to Python tuples.
 pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
     let p = checkpoint.place;
     (
@@ -300,15 +302,17 @@ pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
     )
 }
 
-/// Block of candidates: (equation, first, one past the last, limit).
+/// Contiguous block of candidates: (equation, index of the first candidate, index after the last one, limit of the raw
+/// sum Σ|e| or Σe²).
 pub type SpanArg = (usize, usize, usize, f64);
 
-/// Contiguous block of candidates.
+/// Convert a block of candidates from a Python tuple.
 pub fn span((equation, first, last, limit): SpanArg) -> Span {
     Span { equation, first, last, limit }
 }
 
-/// Serialize outcomes of candidates: raw sums as little-endian doubles, and kinds as one byte each.
+/// Serialize outcomes of candidates. Return the raw sums Σ|e| or Σe² as little-endian doubles, and the kinds of outcome
+/// as one byte each.
 pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     let pairs = verdicts.iter().map(|verdict| match *verdict {
         Verdict::Score(raw) => (raw, 0),
@@ -321,7 +325,8 @@ pub fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
     (values.concat(), kinds)
 }
 
-/// Deserialize the outcomes serialized by [`verdicts_of`].
+/// Deserialize outcomes from [`verdicts_of`]. Return an error for an unknown kind or for different numbers of values
+/// and kinds.
 pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
     let decoded = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
         let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));

@@ -53,7 +53,7 @@ pub fn search<'py>(
     result.dict(py)
 }
 
-/// Row of a result table. Initial terms are listed by record.
+/// Row of a result table. `initial` holds the coefficients of the initial terms by record.
 #[derive(IntoPyObject)]
 struct FoundRow {
     index: u64,
@@ -64,7 +64,7 @@ struct FoundRow {
     initial: Vec<Vec<f64>>,
 }
 
-/// Result table with counts and failures, and the orders of each index.
+/// Result table of a search, with counts, and (index, alpha, orders, reason) of each failure.
 struct OrderTable {
     rows: Vec<FoundRow>,
     counts: Counts,
@@ -103,7 +103,8 @@ impl OrderTable {
     }
 }
 
-/// Return the plan of a search: number of candidates, and index after the last batch of each generation.
+/// Return the plan of a search: (number of candidates, index after the last batch of each generation). A generation is
+/// a group of batches that start from the same results.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_plan(
@@ -120,8 +121,8 @@ pub fn search_plan(
     })
 }
 
-/// Join the partial results of all batches, and return the result of the search. `samples` is the total number of
-/// samples of the records.
+/// Join the partial results of all batches, and return the result of the search as a dictionary. Return an error unless
+/// they account for all candidates. `samples` is the total number of samples of the records.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_join<'py>(
@@ -163,7 +164,7 @@ pub fn search_join<'py>(
     result.dict(py)
 }
 
-/// Order search prepared for the evaluation of its batches, on one machine or several.
+/// Order search that is prepared for the evaluation of its batches, on one or several machines.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct OrderSearch {
     ready: batches::BatchEvaluator<'static>,
@@ -199,9 +200,9 @@ impl OrderSearch {
         Ok(Self { ready })
     }
 
-    /// Evaluate batches `first … last − 1` of candidates and return counts and best rows. All batches must belong to
-    /// one generation, a group of batches that start from the same results. `seed` holds index and raw score of the
-    /// rows found before the generation. `start` is a checkpoint to resume.
+    /// Evaluate the batches `first` to `last` − 1 and return their partial result. All batches must belong to one
+    /// generation, a group of batches that start from the same results. `seed` holds (index, raw sum Σ|e| or Σe²) of
+    /// the rows found before the generation. `start` is a checkpoint to resume from.
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn rounds(
         &self,
@@ -222,8 +223,9 @@ impl OrderSearch {
     }
 }
 
-/// Certify a lower bound of the equation error. `alpha` is the interval of the output's order, `terms` are (signal,
-/// lowest, highest order), `memory` is in bytes.
+/// Certify a lower bound of the equation error over a region of orders. Return the certificate as a dictionary. `alpha`
+/// is the interval of the order of the output, `terms` holds (signal, lowest order, highest order), and `memory` is in
+/// bytes.
 #[pyfunction]
 #[pyo3(signature = (
     runs, *, output, alpha, terms, min_separation, tolerance, max_term_ratio, max_cells, threads, memory, progress,
@@ -259,7 +261,7 @@ pub fn certify<'py>(
     Ok(dict)
 }
 
-/// Errors of candidates with given orders and coefficients.
+/// Evaluation of candidates with given orders and coefficients.
 #[pyclass(module = "ftlm._core")]
 pub struct Points {
     inner: PointsOf,
@@ -284,7 +286,8 @@ impl Points {
         Ok(Self { inner: run_detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
     }
 
-    /// Errors of candidates in rows (alpha, orders, coefficients). Infinite above the limit.
+    /// Return the error of each candidate. A row of `candidates` holds alpha, the orders and the coefficients. An error
+    /// above `limit` is returned as infinity.
     #[allow(clippy::needless_pass_by_value)]
     fn scores<'py>(
         &mut self,
@@ -310,7 +313,7 @@ impl Points {
     }
 }
 
-/// Test hook: panic in the call, in the search thread, or in a worker thread of the search.
+/// Test hook: panic in the calling thread, in the search thread, or in a worker thread of the search.
 #[pyfunction]
 #[allow(clippy::panic)]
 pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
@@ -322,7 +325,7 @@ pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
     }
 }
 
-/// Test hook: run all kernels with the instructions of the oldest supported processor.
+/// Test hook: run all kernels with the instruction set of the oldest supported processor if `on` is true.
 #[pyfunction]
 pub fn force_portable(on: bool) {
     crate::simd::force_portable(on);

@@ -43,10 +43,10 @@ pub fn search_stage<'py>(
     result.dict(py)
 }
 
-/// Result of one equation: (score, α, orders, coefficients, initial terms by record).
+/// Result of one equation: (score, α, orders, coefficients, coefficients of the initial terms by record).
 type FoundEquation = (f64, f64, Vec<f64>, Vec<f64>, Vec<Vec<f64>>);
 
-/// Result table with counts and failures, and the free orders of each index.
+/// Result table of a coupled search, with counts, and (index, free orders, reason) of each failure.
 struct StageTable {
     rows: Vec<(u64, f64, Vec<f64>, Vec<FoundEquation>)>,
     counts: Counts,
@@ -82,8 +82,8 @@ impl StageTable {
     }
 }
 
-/// Order search over coupled equations, prepared for evaluation on one machine or several. One instance has the search
-/// state and collects the results.
+/// Order search over coupled equations that is prepared for evaluation on one or several machines. One instance stores
+/// the search state and collects the results.
 #[pyclass(frozen, module = "ftlm._core")]
 pub struct StageSearch {
     stage: Stage<'static>,
@@ -91,7 +91,7 @@ pub struct StageSearch {
 }
 
 impl StageSearch {
-    /// Run `work` on the search state.
+    /// Apply `work` to the search state. Return an error if this instance stores no state.
     fn course<T>(&self, work: impl FnOnce(&mut SearchState) -> Result<T, Error>) -> Result<T, Error> {
         let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
         let state = course.as_mut().ok_or_else(|| Error::Structure {
@@ -129,19 +129,20 @@ impl StageSearch {
         Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
     }
 
-    /// Blocks of candidates to evaluate next; empty if the search is complete.
+    /// Return the blocks of candidates to evaluate next as (equation, first, end, limit). Empty if the search is
+    /// complete.
     fn pending_spans(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
         run_detached(py, || {
             self.course(|c| Ok(c.pending_spans().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
         })
     }
 
-    /// Total number of candidates to evaluate, as known up to now, and the best score up to now.
+    /// Return (number of candidates to evaluate as known so far, best score so far).
     fn state(&self, py: Python<'_>) -> PyResult<(u64, Option<f64>)> {
         run_detached(py, || self.course(|c| Ok((c.total(), c.best()))))
     }
 
-    /// Evaluate blocks of candidates; return their outcomes as bytes.
+    /// Evaluate blocks of candidates. Return (raw sums Σ|e| or Σe², kinds of outcome) of the candidates as bytes.
     #[allow(clippy::needless_pass_by_value)]
     fn follow<'py>(
         &self,
@@ -157,7 +158,7 @@ impl StageSearch {
         Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
     }
 
-    /// Add the results of the pending candidates, in their order.
+    /// Add the outcomes of the pending candidates to the search state, in the order of `pending_spans`.
     fn take(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
         run_watched(py, None, |control| {
             let decoded = verdicts(values, kinds)?;
@@ -165,7 +166,7 @@ impl StageSearch {
         })
     }
 
-    /// Result of the search, once no candidates are pending.
+    /// Return the result of the search as a dictionary, once no candidates are pending.
     fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let result = run_watched(py, None, |control| {
             let outcome = self.course(|course| self.stage.outcome(course, control))?;

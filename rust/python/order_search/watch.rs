@@ -12,10 +12,12 @@ use crate::order_search::control::Control;
 use crate::parallel;
 use crate::python::errors::{catch_panic, run_attached, run_detached};
 
-/// Polling interval of Python signals, well below the half second within which Ctrl-C must end a search.
+/// Interval between two polls of Python signals. It is well below the half second within which Ctrl-C must end a
+/// search.
 const SIGNAL_POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Run `work` on a separate thread. The calling thread polls Python signals and reports progress.
+/// Run `work` on a separate thread and return its result. Meanwhile the calling thread polls Python signals and calls
+/// `progress` with (candidates done, total, pruned).
 pub fn run_watched<T: Send>(
     py: Python<'_>,
     progress: Option<&Py<PyAny>>,
@@ -24,7 +26,8 @@ pub fn run_watched<T: Send>(
     run_checkpointed(py, progress, None, work)
 }
 
-/// As [`run_watched`], with calls of `save` with the latest checkpoint or None at every poll of the signals.
+/// Run `work` like [`run_watched`]. At every poll of the signals, call `save` with the latest checkpoint, or with None
+/// if there is no new one.
 pub fn run_checkpointed<T: Send>(
     py: Python<'_>,
     progress: Option<&Py<PyAny>>,
@@ -77,7 +80,7 @@ pub fn run_checkpointed<T: Send>(
 /// interval.
 const MAX_INLINE_POINTS: usize = 1 << 17;
 
-/// Cancellation flag for work on threads that Ctrl-C does not interrupt.
+/// Cancellation flag for computations on threads that Ctrl-C does not interrupt.
 #[pyclass(module = "ftlm._core", frozen)]
 #[derive(Clone, Default)]
 pub struct Stop(parallel::Stop);
@@ -89,7 +92,7 @@ impl Stop {
         run_attached(|| Ok(Self::default()))
     }
 
-    /// Cancel all current and later work with this flag.
+    /// Cancel all current and later computations that use this flag.
     fn set(&self) -> PyResult<()> {
         run_attached(|| {
             self.0.set();
@@ -97,14 +100,14 @@ impl Stop {
         })
     }
 
-    /// Whether the flag is set.
+    /// True if the flag is set.
     #[getter]
     fn is_set(&self) -> PyResult<bool> {
         run_attached(|| Ok(self.0.is_set()))
     }
 }
 
-/// Run `work` on `points` values such that Ctrl-C or a set flag returns at once.
+/// Run `work` on `points` values and return its result. Ctrl-C or a set flag makes the call return without delay.
 ///
 /// Transforms of millions of points cannot be stopped, so their thread is not joined. The thread ends at the next check
 /// for cancellation and does not access Python.
@@ -121,7 +124,7 @@ pub fn run_interruptible<T: Send + 'static>(
     py.detach(|| {
         let (send, receive) = channel();
         let stop_copy = stop.clone();
-        // An abandoned thread has no receiver.
+        // If the call has returned early, there is no receiver.
         std::thread::spawn(move || drop(send.send(catch_panic(|| work(&stop_copy)))));
         loop {
             match receive.recv_timeout(SIGNAL_POLL_INTERVAL) {
@@ -142,16 +145,16 @@ pub fn run_interruptible<T: Send + 'static>(
     })
 }
 
-/// Message of a computing thread: progress (steps done, all steps) or the result.
+/// Message of a computing thread: its progress (steps done, all steps), or its result.
 enum WorkerMessage<T> {
     Progresses(usize, usize),
     Ends(Result<T, Error>),
 }
 
-/// Progress callback of (steps done, all steps).
+/// Progress callback with the arguments (steps done, all steps).
 pub type Report<'a> = &'a dyn Fn(usize, usize) -> Result<(), Error>;
 
-/// As [`run_interruptible`], always on a separate thread, which reports its progress.
+/// Run `work` like [`run_interruptible`], but always on a separate thread, which reports its progress.
 ///
 /// `progress` is called on the calling thread, so the computing thread does not access Python. An exception of
 /// `progress` stops the computation.
@@ -165,7 +168,7 @@ pub fn run_with_progress<T: Send + 'static>(
     py.detach(|| {
         let (send, receive) = channel();
         let stop_copy = stop.clone();
-        // An abandoned thread has no receiver.
+        // If the call has returned early, there is no receiver.
         std::thread::spawn(move || {
             let report = |count, of| send.send(WorkerMessage::Progresses(count, of)).map_err(|_| Error::Interrupted);
             let ended = catch_panic(|| work(&stop_copy, &report));
@@ -192,7 +195,7 @@ pub fn run_with_progress<T: Send + 'static>(
     })
 }
 
-/// Progress: candidates done, total, and pruned.
+/// Return the progress of a search: (candidates done, total, pruned).
 fn state(control: &Control) -> (u64, u64, u64) {
     let read = |x: &AtomicU64| x.load(Ordering::Relaxed);
     (read(&control.finished_count), read(&control.total), read(&control.pruned))

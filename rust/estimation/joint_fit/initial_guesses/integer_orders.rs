@@ -474,9 +474,9 @@ impl<'a> Equation<'a> {
 
     /// Estimate the coefficients by least squares on samples that pass state-variable filters.
     ///
-    /// The regression is [s^n/F] y = Σ a_i [s^i/F] y + Σ b_j [s^j/F] u for output y and inputs u. The filter is F = (s
-    /// + λ)^n with λ = `corner` \[rad/s\]. Return None if a filtered signal is not finite or the coefficients are not
-    /// determined.
+    /// The regression is [s^n/F] y = Σ a_i [s^i/F] y + Σ b_j [s^j/F] u for output y and inputs u. The filter is
+    /// F = (s + λ)^n with λ = `corner` \[rad/s\]. Return None if a filtered signal is not finite or the coefficients
+    /// are not determined.
     #[allow(clippy::type_complexity)]
     fn filtered_least_squares(&self, start: &ParameterPoint, corner: f64) -> Result<Option<ParameterPoint>> {
         self.stop.check()?;
