@@ -1,1 +1,1 @@
-"""Physics of the flexible two-link arm: structures, models and energies."""
+"""Physics of the flexible two-link arm: structures of its equations, models and energies."""

@@ -1,4 +1,4 @@
-"""Energies, generalized forces and power balance of one joint of the arm: equations (7)-(11) of the paper."""
+"""Energies, generalized forces and power balance of one joint of the arm, by equations (7)-(15) of the paper."""
 
 from __future__ import annotations
 
@@ -16,31 +16,32 @@ from ftlm.fractional_calculus import fractional_derivative
 from ftlm.utils.arguments import check_arguments
 from ftlm.utils.validation import Floats
 
-#: Range of the relaxation rates whose sum gives a force of order nu: this factor times 1/T to this factor times 1/h.
-#: Slower relaxations equal a spring and faster ones a dashpot.
+#: Range of the relaxation rates [1/s] whose sum approximates a force of fractional order: from the first factor divided
+#: by the duration to the second factor divided by the sampling interval. Slower relaxations equal a spring, and faster
+#: ones a dashpot.
 MIN_RATE_TIMES_DURATION, MAX_RATE_TIMES_STEP = 1e-3, 1e3
-#: Difference in ln(rate) of neighboring relaxations. The sum then equals the integral to 1e-6.
+#: Difference in ln(rate) of neighboring relaxations, with which the sum equals the integral over all rates to 1e-6.
 RATE_LOG_SPACING = 0.5
-#: An angle counts as at rest if its first value is within this fraction of its largest one, and its first increment
-#: within a fraction of the largest increment or, in short runs, of the second one. From rest t^alpha has a ratio of
-#: first to second increment of 1/3 for alpha = 2 and of 0.55 for alpha = 1.5.
+#: Limits within which an angle starts at rest at 0: its first value relative to its largest one, its first increment
+#: relative to its largest one, and in short runs its first increment relative to the second one. A motion t^alpha from
+#: rest has a ratio of first to second increment of 1/3 for alpha = 2, and of 0.55 for alpha = 1.5.
 REST_ANGLE_FRACTION, REST_INCREMENT_FRACTION, REST_INCREMENT_RATIO = 0.01, 0.1, 2 / 3
-#: Minimum number of samples for differences of third order.
+#: Minimum number of samples of a run, which third-order differences require.
 MIN_SAMPLES = 4
 
 
 @dataclass(frozen=True)
 class Power:
-    """Power of a force c D^nu theta along its own angle theta, split into stored and dissipated parts.
+    """Power that a motion theta(t) supplies against a force c D^nu theta, and its stored and dissipated parts.
 
-    Every field has shape (N,).
+    D^nu is the fractional derivative of order nu. Every field has one value per sample, shape (N,).
 
     Parameters
     ----------
     supplied
         Supplied power [W]: c D^nu theta times the rate of theta.
     stored
-        Recoverable energy [J]: all supplied energy for a spring (nu = 0), 0 for a dashpot (nu = 1).
+        Stored (recoverable) energy [J]: all supplied energy for a spring (nu = 0), 0 for a dashpot (nu = 1).
     lost
         Dissipated power [W], never negative.
     """
@@ -52,26 +53,29 @@ class Power:
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies and generalized forces of one arm joint at the N samples of a run, by the paper's (7)-(11).
+    """Energies, generalized forces and powers of one joint of the arm at the samples of a run.
+
+    Equation numbers are those of the paper. Index 1 is the hub and index 2 the link: stiffness K_s, frictions B_1 and
+    B_2, orders gamma_1, beta_2 and mu_2. Arrays have shape (N,).
 
     Parameters
     ----------
     time
         Sample times [s].
     potential
-        Viscoelastic potential energy of the link by equation (7); in J if beta_2 = 0 and K_s is in N m/rad.
+        Viscoelastic potential energy of the link by equation (7). Its unit is J only for beta_2 = 0.
     hub_kinetic, link_kinetic
-        Kinetic energies by equation (8); in J if gamma_1 = mu_2 = 1.
+        Kinetic energies of hub and link by equation (8). Their unit is J only for gamma_1 = mu_2 = 1.
     hub_force, link_force
         Nonconservative generalized forces by equations (10) and (11) [N m].
     motor
         Power of the motor torque on the hub [W].
     inertia
         Power of the inertial terms of equations (14) and (15) [W]. For integer orders it is the time derivative of the
-        kinetic energy (9).
+        kinetic energy by equation (9).
     elastic, hub_friction, link_friction
-        Powers of the elasticity K_s D^beta_2 of the link, of the friction B_1 D^gamma_1 of the hub, and of the friction
-        B_2 D^mu_2 of the link.
+        Powers of the elasticity of the link (K_s, order beta_2), the friction of the hub (B_1, order gamma_1) and the
+        friction of the link (B_2, order mu_2).
     """
 
     time: Floats
@@ -88,7 +92,7 @@ class Energies:
 
     @property
     def kinetic(self) -> Floats:
-        """Total kinetic energy, equation (9) of the paper."""
+        """Total kinetic energy of hub and link, equation (9) of the paper."""
         return self.hub_kinetic + self.link_kinetic
 
     @property
@@ -101,25 +105,25 @@ class Energies:
 def energies(
     run: Run, *, stage: int = 1, parameters: LinkParameters | None = None, orders: Mapping[str, float] | None = None
 ) -> Energies:
-    """Return energies and generalized forces of one joint of the arm during a run, with their power balance.
+    """Return energies, generalized forces and power balance of one joint of the arm during a run.
 
-    Energies and forces are those of equations (7)-(11) of the paper. Equations (14) and (15), multiplied by the rates
-    of their angles, split the power of the motor into inertia, elasticity of the link, and both frictions. A force c
-    D^nu theta of fractional order stores a part of the power and dissipates the rest. Its diffusive representation is a
-    sum of springs in series with dampers, whose energies are added.
+    Energies and forces are those of equations (7)-(11) of the paper. Its equations (14) and (15), multiplied by the
+    rates of their angles, divide the power of the motor into inertia, elasticity of the link, and both frictions. A
+    force of fractional order stores a part of the supplied power and dissipates the rest. Its diffusive representation
+    is a sum of springs in series with dampers, whose energies are added.
 
     Parameters
     ----------
     run
-        Run with I1, theta11, theta12 or I2, theta21, theta22 in A and rad, from rest, with at least 4 rows. The angles
+        Run from rest with I1 [A], theta11, theta12 [rad], or I2, theta21, theta22, and at least 4 samples. The angles
         are differentiated, so use a simulated run without noise (:func:`ftlm.simulate`).
     stage
-        Joint, 1 or 2.
+        Number of the joint, 1 or 2.
     parameters
-        Parameters of the stage; by default the manufacturer's effective ones.
+        Parameters of the joint; by default the manufacturer's effective ones.
     orders
-        Orders by name: alpha, gamma of the hub and alpha, beta, mu of the link. Orders that are not given have the
-        integer values of the manufacturer's manual.
+        Orders by name: alpha and gamma of the hub (such as alpha1, gamma1), and alpha, beta and mu of the link (such as
+        alpha2). Orders that are not given have the integer values of the manufacturer's manual.
 
     Returns
     -------
@@ -131,7 +135,8 @@ def energies(
     ModelError
         If the stage or the name of an order is unknown, or the order of a force is outside [0, 1].
     DataError
-        If the run lacks one of the three signals or has fewer than 4 rows, or an angle does not start at rest at 0.
+        If the run lacks one of the three signals or has fewer than 4 samples, or if an angle does not start at rest at
+        0.
     """
     law = order_law(stage)
     h, d = 2 * stage - 1, 2 * stage
@@ -160,7 +165,7 @@ def energies(
     turning, bending = rate(hub, at[f"gamma{h}"]), rate(bend, at[f"mu{d}"])
     elastic = rate(bend, at[f"beta{d}"])
     j1, j2 = link.hub_inertia, link.link_inertia
-    # (14) and (15), with every order as the law has it.
+    # Inertial terms of equations (14) and (15), with orders by the order law.
     across = at[f"alpha{h}"] - at[f"gamma{h}"] + at[f"mu{d}"]
     inertia = hub_rate * ((j1 + j2) * rate(hub, at[f"alpha{h}"]) + j2 * rate(bend, across))
     inertia += bend_rate * j2 * (rate(hub, law[f"gamma{d}"].at(at)) + rate(bend, at[f"alpha{d}"]))
@@ -182,9 +187,9 @@ def energies(
 
 
 def _check_rest(run: str, name: str, angle: Floats) -> None:
-    """Raise DataError unless an angle starts at rest at 0.
+    """Raise DataError unless an angle [rad] starts at rest at 0; `run` and `name` identify it in the message.
 
-    Prior motion would act as an impulse at the first sample.
+    A motion before the first sample would act as an impulse at the first sample.
     """
     moves = np.diff(angle)
     way_out = (
@@ -197,12 +202,11 @@ def _check_rest(run: str, name: str, angle: Floats) -> None:
 
 
 def power(angle: Floats, coefficient: float, order: float, step: float) -> Power:
-    """Return the power of a force c D^nu theta along theta, split into stored energy and dissipated power.
+    """Return the power that a motion theta(t) from rest supplies against a force c D^nu theta, and its parts.
 
-    The motion starts from rest.
-
-    D^nu theta = sin(pi nu)/pi times the integral over w from 0 of w^(nu-1) z_w, where z_w' = -w z_w + theta'. Every z_w
-    is a spring in series with a dashpot: it stores z_w^2/2 and dissipates w z_w^2.
+    The fractional derivative D^nu theta is sin(pi nu)/pi times the integral of w^(nu-1) z_w over w from 0 to infinity,
+    where z_w' = -w z_w + theta'. Every z_w is the deflection of a spring in series with a dashpot. It stores the energy
+    z_w^2/2 and dissipates the power w z_w^2.
 
     Parameters
     ----------
@@ -218,7 +222,7 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
     Returns
     -------
     Power
-        Powers and energy at the N samples.
+        Supplied power, stored energy and dissipated power at the N samples.
     """
     start = np.concatenate([[0.0], np.diff(angle)])
     rate = np.gradient(angle, step)
@@ -231,7 +235,7 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
     low, high = math.log(MIN_RATE_TIMES_DURATION / duration), math.log(MAX_RATE_TIMES_STEP / step)
     count = max(2, round((high - low) / RATE_LOG_SPACING))
     share = math.sin(math.pi * order) / math.pi
-    # Ends of the range lie between two rates, where those of the sum's weight end.
+    # Each rate is at the middle of its interval in ln(w), so the intervals cover exactly the range from low to high.
     width = (high - low) / count
     rates = np.exp(low + width * (np.arange(count) + 0.5))
     spring, dashpot = share * math.exp(low * order) / order, share * math.exp(high * (order - 1.0)) / (1.0 - order)
@@ -239,7 +243,7 @@ def power(angle: Floats, coefficient: float, order: float, step: float) -> Power
     stored, lost = 0.5 * spring * angle**2, dashpot * rate**2
     k = np.arange(angle.size)
     for w, weight in zip(rates.tolist(), (share * width * rates**order).tolist(), strict=True):
-        # Of an angle that is straight between two samples z is exact.
+        # z is exact for an angle that is linear between samples.
         decay = np.exp(-w * step * k) * (-math.expm1(-w * step) / (w * step))
         z = _core.series_multiply(decay, start, angle.size)
         force += weight * z

@@ -1,4 +1,8 @@
-"""Structures and models of the flexible two-link arm, and its physical parameters."""
+"""Structures and models of the flexible two-link arm, and its physical parameters.
+
+Equation numbers are those of the paper (Wang et al., Symmetry 2025, 17, 1072). A joint is also called a stage. Its hub
+has an odd index (1 or 3), and its link has an even index (2 or 4).
+"""
 
 from __future__ import annotations
 
@@ -22,16 +26,16 @@ from ftlm.utils.validation import check_choice, short_repr
 @check_arguments
 @dataclass(frozen=True)
 class LinkParameters:
-    """Physical parameters of one joint of the arm.
+    """Physical parameters of one joint of the arm. Units are those for integer orders.
 
     Parameters
     ----------
     stiffness
-        Viscoelastic coefficient of the link, K_s [N m/rad] (for integer orders).
+        Stiffness K_s of the link [N m/rad].
     hub_inertia, link_inertia
-        Inertias J_j1 and J_j2 of joint j [kg m^2].
+        Inertias J_1 of the hub and J_2 of the link [kg m^2].
     hub_friction, link_friction
-        Viscous frictions B_j1 and B_j2 of joint j [N m s/rad].
+        Viscous friction coefficients B_1 of the hub and B_2 of the link [N m s/rad].
     torque_constant
         Torque at the hub per ampere of motor current [N m/A].
     """
@@ -45,13 +49,16 @@ class LinkParameters:
 
     @property
     def inertia_ratio(self) -> float:
-        """Inertia ratio r = (J_1 + J_2) / J_2: deflection coefficients are r times the hub coefficients."""
+        """Inertia ratio r = (J_1 + J_2)/J_2 of hub J_1 and link J_2.
+
+        In the published form, coefficients a and d of the deflection are -r times those of the hub.
+        """
         return (self.hub_inertia + self.link_inertia) / self.link_inertia
 
     def coefficients(self, stage: int) -> dict[str, float]:
-        """Return the coefficients a, b, d, g of both equations of a stage in the published form, by name.
+        """Return the coefficients a, b, d and g of both equations of joint 1 or 2 in the published form, by name.
 
-        The paper defines them after equation (21).
+        The published form is equations (22)-(25) of the paper, which defines the coefficients after its equation (21).
         """
         hub, deflection = 2 * stage - 1, 2 * stage
         a, b = self.stiffness / self.hub_inertia, -self.hub_friction / self.hub_inertia
@@ -69,9 +76,9 @@ class LinkParameters:
         }
 
     def lagrange_coefficients(self, stage: int) -> dict[str, float]:
-        """Return the coefficients of both equations of a stage in the Lagrange form, by name.
+        """Return the coefficients of both equations of joint 1 or 2 in the Lagrange form, by name.
 
-        They are a, b, d, g of the hub's equation and a, b, d of the deflection's equation (15).
+        They are a, b, d and g of the hub equation, and a, b and d of the deflection equation, eq. (15) of the paper.
         """
         hub, deflection = 2 * stage - 1, 2 * stage
         own = {n: v for n, v in self.coefficients(stage).items() if n.endswith(str(hub))}
@@ -79,9 +86,10 @@ class LinkParameters:
         return own | {f"a{deflection}": -stiffness, f"b{deflection}": -1.0, f"d{deflection}": 0.0 - friction}
 
 
-#: Named parameter sets, by stage. "effective" reproduces the integer-order rows of the paper's Tables 4 and 5: the
-#: torque per ampere holds gear efficiency, gear ratio and torque constant. "table-3" is the paper's Table 3 as printed,
-#: whose stiffnesses are about 14.8 times smaller and whose torque constants lack gear and efficiency.
+#: Named parameter sets, by joint number. "effective" reproduces the integer-order rows of the paper's Tables 4 and 5.
+#: Its torque per ampere is the product of gear efficiency, gear ratio and torque constant. "table-3" is the paper's
+#: Table 3 as printed. Its stiffnesses are about 14.8 times smaller, and its torque constants are without gear and
+#: efficiency.
 PARAMETER_SETS: dict[str, dict[int, LinkParameters]] = {
     "effective": {
         1: LinkParameters(39.9572, 0.0635362, 0.170434, 4.0, 0.0, 0.75 * 100 * 0.119),
@@ -92,36 +100,37 @@ PARAMETER_SETS: dict[str, dict[int, LinkParameters]] = {
         2: LinkParameters(0.463, 0.003, 0.0064, 1.5, 0.856, 0.0234),
     },
 }
-#: The manual's integer orders: alpha = 2, stiffness on the angle, damping and friction on its rate.
+#: Integer orders of the manufacturer's manual: hub friction and link damping act on rates, link stiffness on the angle.
+#: alpha is 2.
 INTEGER_ORDERS = {"gamma": 1.0, "beta": 0.0, "mu": 1.0}
 
 
 def integer_order(name: str) -> float:
-    """Return the integer order of the manual for an order name such as gamma1."""
+    """Return the integer order in the manufacturer's manual for the name of an order, such as gamma1."""
     return INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0)
 
 
-#: Orders of the cross-stage terms: torques of the other stage act through its angles and its current as they are.
+#: Order of the terms by which the torques of the other joint act: they contain its angles and current undifferentiated.
 CROSS_ORDER = 0.0
-#: Range of the highest order of an equation: a link is of second order or slightly below.
+#: Range of the highest order alpha of an equation: that of a link is 2 or slightly less.
 HIGHEST_ORDER_RANGE = (1.2, 2.0)
-#: Typical orders near the integer ones: damping on the rate or slightly below, stiffness on the angle.
+#: Typical orders for initial guesses, at or near the integer orders.
 TYPICAL_ORDERS = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
-#: Ranges (low, high, increment) of the elasticity and damping orders if no other equation identifies them.
+#: Grids (low, high, increment) of the elasticity and damping orders of a link if its equation is identified alone.
 DEFLECTION_ORDER_RANGES = {"beta": (0.0, 0.5, 0.05), "mu": (0.5, 1.95, 0.05)}
-#: Orders by the letter of the coefficient whose term they differentiate, as in (22)-(25).
+#: Name of the order of the term with each coefficient, as in equations (22)-(25) of the paper.
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 Form: TypeAlias = Literal["lagrange", "published"]
 InputOrder: TypeAlias = Literal["published", "derived"]
 CrossStage: TypeAlias = Literal["torques", "inertial"] | bool
 FrictionLaw: TypeAlias = Literal["coulomb", "stribeck"] | bool
 Law: TypeAlias = Literal["orders", "coefficients", "velocities"]
-#: Names of the physical laws that can be imposed.
+#: Names of the physical laws that can be imposed on orders and coefficients; see :func:`flexible_link`.
 LAW_NAMES = ("orders", "coefficients", "velocities")
 
 
 def _hints(form: Form) -> Hints:
-    """Return hints for initial guesses: ranges and names of the orders, and lower bounds of the inertia ratios."""
+    """Return hints for the initial guesses of a fit, such as typical orders and lower bounds of inertia ratios."""
     return Hints(
         HIGHEST_ORDER_RANGE,
         {f"{order}{n}": values for order, values in TYPICAL_ORDERS.items() for n in range(1, 5)},
@@ -133,7 +142,10 @@ def _hints(form: Form) -> Hints:
 
 
 def _resolve_form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, InputOrder]:
-    """Return the form and the input order; an input order selects the published form by default."""
+    """Return the form and the input order with defaults resolved; an input order selects the published form.
+
+    Raise ModelError if one is unknown, or an input order is given for the Lagrange form.
+    """
     if form is None:
         form = "lagrange" if input_order is None else "published"
     check_choice("form", form, ("lagrange", "published"))
@@ -153,27 +165,29 @@ def order_law(
 ) -> dict[str, Order]:
     """Return the order law of one joint: every order of its two equations as a function of five free orders.
 
+    Equation numbers are those of the paper. Indices are those of joint 1: 1 for the hub, 2 for the deflection.
+
     Parameters
     ----------
     stage
-        1 or 2.
+        Number of the joint, 1 or 2.
     input_order
-        ``"published"`` or ``"derived"``, only for the published form.
+        ``"published"`` or ``"derived"``, only for the published form; see the returned ``input``.
     form
         ``"lagrange"`` or ``"published"``; see :func:`flexible_link`. The default is ``"lagrange"``, or ``"published"``
         if an input order is given.
     velocities
-        Whether gamma_1 = mu_2, so that D^gamma_1 theta_11 and D^mu_2 theta_12, which equation (8) adds, have the same
-        order. The order of the hub angle in the deflection's equation (15) is then alpha_2.
+        Whether gamma_1 = mu_2. The terms D^gamma_1 theta_11 and D^mu_2 theta_12, which equation (8) adds, then have the
+        same order. The order of the hub angle in the deflection equation (15) is then alpha_2.
 
     Returns
     -------
     dict
         Orders by name: alpha, beta, gamma, mu of the hub (index 2*stage - 1) and of the deflection (index 2*stage). The
-        order of the hub angle in the deflection's equation is gamma_2 = alpha_2 - mu_2 + gamma_1 by (15), which exceeds
-        alpha_2 if gamma_1 exceeds mu_2. In the published form it is 2 gamma_1 - alpha_1 + alpha_2 - mu_2. That form
-        also has ``input``, the order of the current in the deflection's equation: 0 as published in (23), or alpha_2 -
-        mu_2 + gamma_1 - alpha_1 as derived.
+        order of the hub angle in the deflection equation is gamma_2 = alpha_2 - mu_2 + gamma_1 by (15), which exceeds
+        alpha_2 if gamma_1 exceeds mu_2. In the published form it is 2 gamma_1 - alpha_1 + alpha_2 - mu_2. The published
+        form also has ``input``, the order of the current in the deflection equation. It is 0 with the input order
+        ``"published"``, as in (23), and alpha_2 - mu_2 + gamma_1 - alpha_1 with ``"derived"``.
 
     Raises
     ------
@@ -202,7 +216,7 @@ def order_law(
     return {name: Order.parse(text) for name, text in law.items()}
 
 
-#: First word of the names of these structures.
+#: Beginning of the names of these structures.
 FLEXIBLE_LINK = "flexible link"
 
 
@@ -225,6 +239,9 @@ def flexible_link(
 ) -> Structure:
     """Return the structure of a flexible joint: an equation of its hub angle and one of its link's deflection.
 
+    Equation numbers are those of the paper. Indices are those of joint 1: 1 for the hub, 2 for the link. K_s is the
+    stiffness, B a viscous friction coefficient, and J an inertia.
+
     Parameters
     ----------
     stage
@@ -234,60 +251,62 @@ def flexible_link(
         the deflection is D^alpha_2 theta_12 = a_2 D^beta_2 theta_12 - D^(alpha_2 - mu_2 + gamma_1) theta_11 + d_2
         D^mu_2 theta_12 with a_2 = -K_s/J_2 and d_2 = -B_2/J_2. Its only input is the hub angle, whose order exceeds
         alpha_2 if gamma_1 exceeds mu_2. The equation of the hub is (17). ``"published"``: equations (22)-(25) as
-        printed, for comparison with the paper. They eliminate the hub's acceleration from the deflection's equation and
-        drop a derivative of the current. With fractional orders, the simulated deflection then has the wrong sign.
+        printed, for comparison with the paper. They eliminate the acceleration of the hub from the equation of the
+        deflection, and drop a derivative of the current. With fractional orders, the simulated deflection then has the
+        wrong sign.
     input_order
-        Order of the current in the deflection's equation of the published form; see :func:`order_law`. ``"derived"``
-        eliminates the hub's acceleration without dropping a term, which gives the same simulations as the Lagrange
-        form, but the deflection is then driven by a small difference of large terms. Giving this argument selects the
-        published form.
+        Order of the current in the deflection equation of the published form; see :func:`order_law`. ``"derived"``
+        eliminates the acceleration of the hub without dropping a term, which gives the same simulations as the Lagrange
+        form. The deflection then depends on a small difference of large terms. This argument selects the published
+        form.
     coupling
-        ``"measured"`` (default of the Lagrange form): the other measured angle is an input of each equation.
-        ``"simulated"`` (default of the published form): both angles are simulated from the currents, so noise on the
-        measured hub angle has no effect.
+        ``"measured"`` (default of the Lagrange form): the other angle of the joint is a measured input of each
+        equation. ``"simulated"`` (default of the published form): both angles are simulated from the currents, so noise
+        on the measured hub angle has no effect.
     cross_stage
         ``"torques"`` (or True) adds angles and current of the other joint to every equation, with order 0.
         ``"inertial"``, for the Lagrange form, adds the linearized inertial coupling of the planar arm, in which hub 2
-        is mounted on the tip of link 1. Accelerations of joint 2 act on link 1 (p_2 D^2 theta_21 + q_2 D^2 theta_22),
-        and those of joint 1 act on hub 2 and link 2 (p_3, p_4 of theta_11 and q_3, q_4 of theta_12). Joint 2 acts on
-        hub 1 only through link 1. With ``stage="both"`` the other joint is modeled too, and orders follow from the sum
-        of velocities in (8): theta_21 has the order alpha_2 - mu_2 + gamma_3 in the equation of theta_12, and so on.
-        For a single joint, these terms have the order of their equation, alpha_2, alpha_3 or alpha_4.
+        is mounted on the tip of link 1. Accelerations of joint 2 act on link 1 (p_2 D^2 theta_21 + q_2 D^2 theta_22).
+        Those of joint 1 act on hub 2 and link 2, with coefficients p_3 and p_4 of theta_11, and q_3 and q_4 of
+        theta_12. Joint 2 acts on hub 1 only through link 1. With ``stage="both"`` the other joint is modeled too, and
+        orders follow from the sum of velocities in (8). For example, theta_21 has the order alpha_2 - mu_2 + gamma_3 in
+        the equation of theta_12. For a single joint, these terms have the order alpha of their equation.
     friction
-        ``"coulomb"`` (or True) adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the
-        Lagrange form, it is - fc_j * sign(D theta_j1) of the simulated velocity, set-valued at rest
-        (:class:`Friction`), and is estimated by output error. With measured coupling, in the published form, it is a
-        linear term c * coulomb_theta_j1 in the sign of the measured velocity, in both equations. ``"stribeck"``, with
-        simulated coupling, adds the larger friction fs_j below the speed vs_j (:class:`Stribeck`).
+        ``"coulomb"`` (or True) adds Coulomb friction of hub j to its equation. With ``coupling="simulated"`` (Lagrange
+        form only), it is -fc_j sign(D theta_j1) of the simulated velocity, set-valued at rest (:class:`Friction`), and
+        is estimated by output error. With measured coupling, it is a linear term c coulomb_theta_j1 in the sign of the
+        measured velocity; in the published form, both equations have it. ``"stribeck"``, with simulated coupling, adds
+        a larger friction fs_j at speeds below vs_j (:class:`Stribeck`).
     cross_sensitivity
-        Whether hub angles are added to the deflection's equation with order 0, because strain gauges and cables make a
-        measured deflection depend on the hub angle. The terms are e_2 theta_11 in the equation of theta_12 and, with
+        Whether hub angles are added to the deflection equation with order 0, because strain gauges and cables make a
+        measured deflection depend on the hub angle. The terms in the equation of theta_12 are e_2 theta_11 and, with
         ``cross_stage="inertial"``, f_2 theta_21.
     cross_damping
-        Whether the rate of the other link's deflection is added, w_2 D theta_22 in the equation of theta_12, with
-        ``cross_stage="inertial"`` and measured coupling. The term is not a physical dissipation. Like the gain of an
-        observer, it makes the simulation less sensitive to errors of the measured inputs; docs/arm.md shows its effect.
+        Whether the rate of the deflection of the other link is added to the deflection equation, as w_2 D theta_22 in
+        the equation of theta_12. It requires ``cross_stage="inertial"`` and measured coupling. The term is not a
+        physical dissipation. Like the gain of an observer, it makes the simulation less sensitive to errors of the
+        measured inputs; docs/arm.md shows its effect.
     hub
-        Whether the hub's equation is included. Without it, the deflection has the measured hub angle as input, and the
-        friction of the hub need not be known. Without the hub's equation there is no coefficient law, and the data
-        hardly distinguish the link's spring from its damper. beta is therefore searched up to 1/2, and mu from 1/2.
+        Whether the equation of the hub is included. Without it, the deflection has the measured hub angle as input, and
+        the friction of the hub need not be known. There is then no coefficient law, and the data hardly distinguish the
+        spring of the link from its damper. The order beta is therefore searched up to 1/2, and mu from 1/2.
     laws
         ``"orders"``: orders obey :func:`order_law`, with five free orders. Without it, each equation has four free
         orders. In the Lagrange form and with ``"derived"``, alpha_2 (alpha_4) is fixed at 2, because only the viscous
-        friction of the link depends on it. ``"coefficients"``: the structure has the coefficient law, with the ratio r
-        = (J_1 + J_2)/J_2 in the published form, or j = J_1/J_2 in the Lagrange form. The coefficient of the hub's
-        motion in the Lagrange form is then -1, otherwise the free coefficient b_2. With inertial coupling, the law also
-        has q_3 = p_3 and q_4 = p_4. Equation-error methods estimate all coefficients freely, and report their deviation
-        from the law. ``"velocities"``: gamma_1 = mu_2 (gamma_3 = mu_4), for the Lagrange form together with
-        ``"orders"``; see :func:`order_law`.
+        friction of the link depends on it. ``"coefficients"``: coefficients obey the coefficient law. In the Lagrange
+        form, it is a_2 = -j a_1 and d_2 = -j d_1 with the ratio j = J_1/J_2, and the coefficient of the hub motion is
+        -1 instead of the free b_2. In the published form, it is a_2 = -r a_1, b_2 = -b_1, d_2 = -r d_1 and g_2 = -g_1
+        with r = (J_1 + J_2)/J_2. With inertial coupling, the law also has q_3 = p_3 and q_4 = p_4. Equation-error
+        methods estimate all coefficients freely, and report their deviation from the law. ``"velocities"``: gamma_1 =
+        mu_2 (gamma_3 = mu_4), for the Lagrange form together with ``"orders"``; see :func:`order_law`.
     parameters
         Named set of nominal values, which are printed next to the estimates.
     sensor_filter
-        Filter that the deflections passed when they were measured. ``"stock"`` is the 2 Hz low-pass of the arm's
-        original real-time model on both deflections.
+        Filter that the deflections have passed in the measurement. ``"stock"`` is the 2 Hz low-pass of the arm's stock
+        real-time model on both deflections.
     offset
-        ``"constant"`` or ``"ramp"``: an unknown constant (and a linear drift) in each equation and run, such as a
-        current at which the arm rests; see :func:`ftlm.equation`.
+        ``"constant"`` or ``"ramp"``: an unknown constant, or a constant and a linear drift, in each equation and run,
+        such as from a current offset; see :func:`ftlm.equation`.
 
     Returns
     -------
@@ -297,13 +316,13 @@ def flexible_link(
     Raises
     ------
     ModelError
-        If an argument is unknown, or the form does not use it.
+        If an argument is unknown, or cannot be combined with the form or with another argument.
 
     Notes
     -----
-    Time must be in seconds. If gamma_1 may differ from mu_2, the coefficient law relates coefficients whose dimensions
-    differ by time to the power of gamma_1 - mu_2, including the fixed -1, so it depends on the unit of time. With
-    ``"velocities"`` it does not.
+    Time must be in seconds. If gamma_1 may differ from mu_2, the coefficient law (including the fixed -1) relates
+    coefficients whose dimensions differ by time to the power gamma_1 - mu_2. The law then depends on the unit of time.
+    With ``"velocities"`` it does not.
     """
     if stage not in (1, 2, "both"):
         raise ModelError(f"{setting('stage')} {stage!r} is not known; use 1, 2 or 'both'")
@@ -385,7 +404,7 @@ def flexible_link(
             tied = (("a", (ratio,)), ("b", ()), ("d", (ratio,)), ("g", ()))
         coefficient_law += [(f"{c}{d}", -1.0, (f"{c}{h}", *factors)) for c, factors in tied]
         if cross_stage == "inertial" and j == 2:
-            # Both angles of stage 1 rotate stage 2, which is mounted on its tip.
+            # Both angles of joint 1 rotate joint 2, which is mounted on the tip of link 1.
             coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
         link = PARAMETER_SETS[parameters][j]
         values = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
@@ -408,7 +427,7 @@ def flexible_link(
     if form == "lagrange" or input_order == "derived":
         structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})
     if not hub:
-        # Only their order ranges distinguish the link's two terms: exchanged, they give the same equation.
+        # Only the ranges of their orders distinguish elasticity and damping, whose exchange gives the same equation.
         structure = structure.with_orders(
             {f"{n}{2 * j}": DEFLECTION_ORDER_RANGES[n] for j in stages for n in DEFLECTION_ORDER_RANGES}
         )
@@ -418,7 +437,11 @@ def flexible_link(
 def _joint_equations(
     stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], friction: bool
 ) -> tuple[Equation, Equation]:
-    """Return the hub equation and the deflection equation of one joint."""
+    """Return (hub equation, deflection equation) of one joint.
+
+    `law` are the orders by the order law. They are used if `laws` contains "orders"; otherwise each order is a
+    separate free order. `friction` adds the linear Coulomb term.
+    """
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
     tied = "orders" in laws
@@ -437,7 +460,7 @@ def _joint_equations(
             Term(deflection, order(f"mu{n}"), f"d{n}"),
         ]
         if drive is None and "coefficients" in laws:
-            # The motion of the hub enters with the coefficient -1, whatever the parameters of the link.
+            # The motion of the hub has the coefficient -1 for any parameters of the link.
             terms[1] = Term(hub, order(f"gamma{n}"), -1.0, name=f"b{n}")
         if drive is not None:
             terms.append(Term(current, drive, f"g{n}"))
@@ -448,13 +471,13 @@ def _joint_equations(
 
 
 def _append_terms(item: Equation, terms: Sequence[Term]) -> Equation:
-    """Return an equation with further terms, inserted before its friction terms."""
+    """Return an equation with additional terms, which are inserted before its terms of Coulomb friction."""
     rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
     return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
 
 
 def _add_cross_torques(pair: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
-    """Return the equations of a joint with order-0 terms in the other joint's angles and current."""
+    """Return both equations of a joint with added terms of order 0 in the angles and the current of the other joint."""
     other, first = 3 - stage, 2 * stage - 1
     signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
     hub, deflection = (
@@ -467,14 +490,13 @@ def _add_cross_torques(pair: tuple[Equation, Equation], stage: int) -> tuple[Equ
 def _add_cross_inertia(
     pair: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool
 ) -> tuple[Equation, Equation]:
-    """Return the equations of a joint with the inertial terms of the other joint.
+    """Return (hub equation, deflection equation) of a joint with added accelerations of the other joint.
 
-    They follow from the kinetic energy of the planar arm with the absolute rates of (8).
-
+    The terms follow from the kinetic energy T of the planar arm, with the absolute rates in eq. (8) of the paper:
     T = (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12,
-    w_3 = w_2 + D theta_21, w_4 = w_3 + D theta_22. J_12 includes all masses beyond link 1, at its tip, and H is the
-    length of link 1 times the first moment of mass of link 2. The difference of the equations of hub 1 and link 1 has
-    no term of joint 2.
+    w_3 = w_2 + D theta_21 and w_4 = w_3 + D theta_22. J_12 includes all masses beyond link 1, at its tip. H is the
+    length of link 1 times the first moment of mass of link 2. The equation of hub 1 gets no terms, because its
+    difference from that of link 1 has none of joint 2. `both` states whether the other joint is modeled too.
     """
     h, d, other = 2 * stage - 1, 2 * stage, 3 - stage
     oh, od = 2 * other - 1, 2 * other
@@ -492,17 +514,22 @@ def _add_cross_inertia(
 
 
 def _add_cross_sensitivity(item: Equation, stage: int, *, other: bool) -> Equation:
-    """Return the equation of a measured deflection with terms of order 0 in the hub angles."""
+    """Return a deflection equation with an added term of order 0 in its hub angle.
+
+    With `other`, a term in the other hub angle is added too.
+    """
     signals = (f"theta{stage}1", f"theta{3 - stage}1")[: 1 + other]
     return _append_terms(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
 
 
 def link_structure(stage: Literal[1, 2, "both"], *, both: bool, filtered: bool = True, rate: bool = True) -> Structure:
-    """Return the structure of a deflection by equation (15) of the paper, with the measured hub angle as input.
+    """Return the structure of a deflection by eq. (15) of the paper, with the measured hub angle as input.
 
-    Elasticity and damping have any order, and the strain gauge and its cable are included. With the angles of the
-    other joint it includes their accelerations, by the energies of the planar arm, and the rate of the other
-    deflection with the gain ``rate``. Initial terms are Caputo's. A history would give fractional orders more
+    Elasticity and damping have free orders, and effects of hub angle and offset on the strain gauge are included. If
+    both joints are measured (`both`), so are the accelerations of the other joint, and with `rate` the rate of its
+    deflection. `filtered` states whether deflections passed the stock 2 Hz low-pass.
+
+    Initial conditions are those of Caputo derivatives. A history before the run would give fractional orders more
     parameters on the validation run than integer orders.
     """
     structure = flexible_link(
@@ -531,21 +558,21 @@ def link_model(
 ) -> Model:
     """Return a model of the arm with known parameters, by default the integer-order model of the manufacturer's manual.
 
-    With integer orders both forms are the same model. With fractional orders the deflection of the published form has
-    the wrong sign.
+    With integer orders, the Lagrange form and the published form are the same model. With fractional orders, the
+    deflection of the published form has the wrong sign.
 
     Parameters
     ----------
     stage
         Joint: 1, 2 or ``"both"``.
     parameters
-        Named set, or physical parameters by joint.
+        Named parameter set, or physical parameters by joint number.
     orders
-        Values of the free orders of the order law by name; by default the integer ones of the manual.
+        Values of the free orders of the order law by name; by default the integer orders of the manual.
     coefficients
         Coefficients by name, which replace those that follow from the parameters.
     form, input_order, coupling
-        See :func:`flexible_link`. By default, both angles are simulated from the current.
+        As for :func:`flexible_link`, except that both angles are simulated from the current by default.
 
     Returns
     -------

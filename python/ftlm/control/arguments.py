@@ -1,4 +1,4 @@
-"""Checks of arguments that several control designs share."""
+"""Validation of arguments that several control designs have in common."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ftlm.errors import ModelError
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Floats, check_integer, check_seed, nearest, real_number, short_repr
 
-#: Sampling rates [Hz] at which margins can be computed in floating point.
+#: Range of sampling rates [Hz] for which stability margins can be computed in floating point.
 RATE_RANGE_HZ = (1e-9, 1e9)
-#: Range of standard deviations and times.
+#: Permitted range of positive arguments, such as standard deviations and times.
 POSITIVE_RANGE = (1e-100, 1e100)
 
 
 def checked_rate(rate: object) -> float:
-    """Return a sampling rate [Hz]; raise ModelError if it is out of range."""
+    """Return a sampling rate [Hz] as a float; raise ModelError if it is out of range."""
     value = real_number("rate", rate)
     if not RATE_RANGE_HZ[0] <= value <= RATE_RANGE_HZ[1]:
         raise ModelError(
@@ -29,12 +29,15 @@ def checked_rate(rate: object) -> float:
 
 
 def same_rate(first: float, second: float) -> bool:
-    """Whether two sampling rates are equal, up to rounding."""
+    """Whether two sampling rates are equal up to a relative difference of 1e-9."""
     return abs(first - second) <= 1e-9 * second
 
 
 def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the chosen outputs, or all outputs if the choice is None; raise ModelError for an unknown one."""
+    """Return the names of chosen outputs; all outputs if the choice is None.
+
+    Raise ModelError if a name is unknown or repeated, or the choice is empty. `what` is the argument in the message.
+    """
     if choice is None:
         return outputs
     names = [] if isinstance(choice, str) or not isinstance(choice, Sequence) else [*choice[: len(outputs) + 1]]
@@ -53,7 +56,7 @@ def select_outputs(what: str, choice: Sequence[str] | None, outputs: tuple[str, 
 
 
 def positive(name: str, value: object) -> float:
-    """Return a number; raise ModelError if it is not finite and positive."""
+    """Return the argument `name` as a float; raise ModelError if it is not positive and finite, or out of range."""
     number = real_number(name, value)
     if not (math.isfinite(number) and number > 0):
         raise ModelError(f"{name} = {short_repr(value)} is not positive and finite; give a number above 0")
@@ -66,7 +69,7 @@ def positive(name: str, value: object) -> float:
 
 
 def check_limit(limit: object) -> float:
-    """Return the limit of a command, which may be infinite; raise ModelError if it is not positive."""
+    """Return the maximum magnitude of a command, which may be infinite; raise ModelError if it is not positive."""
     most = real_number("limit", limit)
     if not most > 0:
         raise ModelError(f"{setting('limit')} {short_repr(limit)} is not positive; give a number above 0, or inf")
@@ -74,12 +77,18 @@ def check_limit(limit: object) -> float:
 
 
 def check_samples(samples: object, seed: object) -> tuple[int, int]:
-    """Return the number of parameter samples and their seed; raise ModelError if one is invalid."""
+    """Return (number of parameter samples, seed); raise ModelError if one is invalid.
+
+    The number is 0 to 10000.
+    """
     return check_integer("samples", samples, 0, 10_000), check_seed(seed)
 
 
 def sum_row(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
-    """Return the coefficient of each output in a sum such as "theta11 + theta12"; raise ModelError if it is invalid."""
+    """Return the coefficient of each output in a sum such as "theta11 + theta12", shape (outputs,).
+
+    Raise ModelError if a term is not an output. `what` is the argument in the message.
+    """
     row = np.zeros(len(outputs))
     for part in text.split("+") if isinstance(text, str) else [""]:
         name = part.strip()

@@ -1,4 +1,4 @@
-"""Files that store discrete-time controllers, and the pair of controllers for the two joints of the rig."""
+"""JSON files of discrete-time controllers, and the pair of controllers for the two joints of the rig."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ftlm.utils.files import JsonFormat, write_atomically
 from ftlm.utils.validation import Floats, as_floats, error_text
 
 CONTROLLER_SCHEMA = 1
-#: Algorithm of each kind of controller, as text for implementations without ftlm.
+#: Algorithm of each kind of controller as text in the file, for implementations without ftlm.
 ALGORITHM_TEXTS = {
     "pid": "each sample, with e = reference - measured: every lag becomes x = keep x + now e + before e_last, and the "
     "output is (kp + direct) e + the sum of weight x, cut at the limit; lags of the derivative begin with "
@@ -33,7 +33,11 @@ Matrix: TypeAlias = list[list[float]]
 
 
 class Lag(msgspec.Struct, forbid_unknown_fields=True):
-    """First-order lag of a discrete-time controller, in a file."""
+    """First-order lag of a fractional PID controller, as stored in a controller file.
+
+    The state for the control error e is x_k = keep x_{k-1} + now e_k + before e_{k-1}. ``weight`` is its factor in the
+    output, and ``of`` the part of the controller to which the lag belongs.
+    """
 
     of: Literal["integral", "derivative"]
     keep: float
@@ -43,7 +47,7 @@ class Lag(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
-    """File form of a fractional PID controller: gains, orders and discrete-time coefficients."""
+    """Fractional PID controller as stored in a controller file: gains, orders and discrete-time coefficients."""
 
     kp: float
     ki: float
@@ -58,14 +62,14 @@ class PidFile(msgspec.Struct, forbid_unknown_fields=True, tag="pid"):
     lags: list[Lag]
 
     def controller(self) -> DiscretePid:
-        """Return the controller from its file form."""
+        """Return the controller with these settings; raise ModelError if they are invalid."""
         pid = FractionalPid(self.kp, self.ki, self.kd, self.lam, self.mu)
         limit = math.inf if self.limit is None else self.limit
         return DiscretePid(pid, self.rate, limit=limit, band=self.band, order=self.order)
 
 
 class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
-    """File form of an LQG controller: observer and state feedback in discrete time."""
+    """LQG controller as stored in a controller file: discrete-time observer and state feedback."""
 
     rate: float
     limit: float | None
@@ -88,7 +92,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
     deviations: list[float]
 
     def controller(self) -> Lqg:
-        """Return the controller from its file form."""
+        """Return the controller with these matrices; raise ModelError if shapes, numbers or names are invalid."""
         size, count = len(self.a), len(self.measured)
         shapes = {"a": (size, size), "b": (size, 1), "c": (len(self.outputs), size)}
         shapes |= {"correction": (size + 1, count), "feedback": (1, size)}
@@ -130,7 +134,7 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
 
 
 class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a controller file: one controller of one of two kinds."""
+    """Content of a controller file: one fractional PID or LQG controller, and information on the file."""
 
     format: Literal["ftlm-controller"]
     schema: int
@@ -140,7 +144,7 @@ class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
     controller: PidFile | LqgFile
 
 
-#: A controller of thirty states has a few tens of kilobytes; the default size limit suffices.
+#: Format of controller files. With thirty states, a file has a few tens of kilobytes, below the default size limit.
 CONTROLLER_FORMAT = JsonFormat("controller", "a file that ftlm control wrote", ControllerFile, CONTROLLER_SCHEMA)
 
 
@@ -157,9 +161,9 @@ def save_controller(
     path
         File to write.
     model
-        Description of the model for which the controller was designed.
+        Text that describes the model for which the controller was designed.
     force
-        Overwrite an existing file.
+        Whether to overwrite an existing file.
 
     Raises
     ------
@@ -183,7 +187,7 @@ def save_controller(
 
 @check_arguments
 def load_controller(path: str | os.PathLike[str]) -> DiscretePid | Lqg:
-    """Read a controller written by :func:`save_controller` or ``ftlm control``.
+    """Return the controller in a file that :func:`save_controller` or ``ftlm control`` wrote.
 
     Raises
     ------
@@ -239,22 +243,23 @@ def _lqg(controller: Lqg) -> LqgFile:
     )
 
 
-#: Angles that the rig measures, and currents of its motors, in the order of the rig.
+#: Names of the angles that the rig measures, and of the motor currents, in the order of the rig.
 ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 MOTOR_INPUTS = ("I1", "I2")
 
 
 @check_arguments
 class JointControllers:
-    """Pair of controllers for both joints of the rig, which computes motor currents from angles and references.
+    """Pair of controllers for both joints of the rig, as a function of angles and references that returns currents.
 
     :func:`ftlm.rig.control` calls it once per sample.
 
     Parameters
     ----------
     first, second
-        Controllers of joint 1 and joint 2. The input of a :class:`DiscretePid` is the reference minus the hub angle
-        [rad], and the inputs of an :class:`Lqg` are its measured angles. None means zero current.
+        Controllers of joint 1 and joint 2. The control error of a :class:`DiscretePid` is the reference minus the hub
+        angle of the joint [rad]. An :class:`Lqg` gets the angles that its observer measures. With None, the current of
+        the joint is zero.
 
     Raises
     ------
@@ -297,11 +302,15 @@ class JointControllers:
                 loop.reset()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return both controllers as a dictionary for JSON."""
+        """Return both controllers as a dictionary for JSON, with the keys ``hub1`` and ``hub2``."""
         return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
 
     def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
-        """Return the currents (joint 1, joint 2) [A] for measured angles and references [rad] at a time [s]."""
+        """Return the motor currents (joint 1, joint 2) [A] for one sample.
+
+        `angles` are theta11, theta12, theta21, theta22 [rad], and `reference` are the reference angles of both joints
+        [rad]. `time` is not used. Raise DataError for other shapes.
+        """
         angles, reference = as_floats("angles", angles), as_floats("reference", reference)
         if angles.shape != (4,) or reference.shape != (2,):
             raise DataError(

@@ -36,11 +36,11 @@ from ftlm.utils.validation import (
     short_repr,
 )
 
-#: Poles extend this factor beyond the band on both sides.
+#: Factor by which the frequencies of the poles extend beyond the band at both ends.
 POLE_RANGE_FACTOR = 30.0
-#: Maximum ratio of the band's ends.
+#: Maximum ratio of the upper to the lower frequency of the band.
 MAX_BAND_RATIO = 1e9
-#: Number of frequencies at which the approximation error is measured.
+#: Number of frequencies at which the approximation error is evaluated.
 ERROR_FREQUENCIES = 200
 
 
@@ -78,7 +78,7 @@ class FractionalPid:
             object.__setattr__(self, name, value)
 
     def response(self, w: Floats | Complex) -> Complex:
-        """Return the exact complex frequency response at positive frequencies [rad/s]."""
+        """Return the exact complex frequency response at frequencies w > 0 [rad/s], of the same shape as w."""
         s = 1j * as_complex("w", w)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
@@ -93,7 +93,11 @@ class FractionalPid:
 
 @dataclass(frozen=True)
 class _Bank:
-    """Sum of first-order lags 1/(s + p) with gains, discretized exactly for signals that are linear between samples."""
+    """Sum of first-order lags 1/(s + p) and a direct gain, discretized exactly for inputs linear between samples.
+
+    A lag has the state x_k = keep x_{k-1} + now e_k + before e_{k-1} for the input e. The output is direct e_k plus the
+    sum of weight x_k over all lags.
+    """
 
     direct: float
     weights: Floats
@@ -102,7 +106,7 @@ class _Bank:
     before: Floats
 
     def response(self, z: Complex) -> Complex:
-        """Return the frequency response at points z of the unit circle."""
+        """Return the frequency response at points z on the unit circle, shape (W,)."""
         inverse = 1.0 / z[:, None]
         lags = (self.now + self.before * inverse) / (1.0 - self.keeps * inverse)
         return np.asarray(self.direct + lags @ self.weights)
@@ -112,8 +116,9 @@ class _Bank:
 class DiscretePid:
     """Discrete-time fractional PID controller: Oustaloup's approximation as a sum of first-order lags.
 
-    The first error is assumed to have been constant in the past, so the controller starts without a derivative kick.
-    While the output is saturated, the integral does not change in the direction of the saturation (anti-windup).
+    Call it once per sample with the control error; it returns the controller output. The error before the first sample
+    is assumed to be constant, so the controller starts without a derivative kick. While the output is saturated, the
+    integral is not increased in the direction of the saturation (anti-windup).
 
     Parameters
     ----------
@@ -124,9 +129,10 @@ class DiscretePid:
     limit
         Magnitude at which the output saturates.
     band
-        Frequency band of the approximation [rad/s]; by default from a thousandth to an eighth of the Nyquist frequency.
+        Frequency band (low, high) of the approximation [rad/s]; by default from a thousandth to an eighth of the
+        Nyquist frequency.
     order
-        Order of Oustaloup's filter, which has 2 order + 1 poles for the integral and as many for the derivative.
+        Order N of Oustaloup's filter, which has 2 N + 1 poles for the integral and as many for the derivative.
 
     Raises
     ------
@@ -170,7 +176,7 @@ class DiscretePid:
         reach = (low / POLE_RANGE_FACTOR, high * POLE_RANGE_FACTOR)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
         self._derivative = _bank(pid.kd, *_power(pid.mu, reach, count), 1.0 / value)
-        #: Maximum errors over the band against the exact controller [dB], [degrees].
+        #: Maximum gain error [dB] and phase error [degrees] over the band, relative to the exact controller.
         self.gain_error, self.phase_error = self._errors()
         if not math.isfinite(self.gain_error + self.phase_error):
             raise ModelError(f"{pid} has no finite response in its band; give finite gains, at least one of them not 0")
@@ -178,16 +184,16 @@ class DiscretePid:
 
     @property
     def memory(self) -> int:
-        """Number of states of the controller."""
+        """Number of states of the controller, including the last error."""
         return len(self._integral.weights) + len(self._derivative.weights) + 1
 
     @property
     def direct(self) -> float:
-        """Direct feedthrough of the integral and derivative parts, without kp."""
+        """Sum of the direct gains of the integral part and of the derivative part, without kp."""
         return self._integral.direct + self._derivative.direct
 
     def lags(self) -> list[tuple[Literal["integral", "derivative"], tuple[float, float, float, float]]]:
-        """Return the coefficients (keep, now, before, weight) of each first-order lag, as in the controller file.
+        """Return ("integral" or "derivative", (keep, now, before, weight)) of each first-order lag.
 
         The state of a lag at sample k is x_k = keep x_{k-1} + now e_k + before e_{k-1}, where e is the error. The
         output is the sum of weight x_k over all lags.
@@ -203,12 +209,12 @@ class DiscretePid:
         ]
 
     def response(self, w: Floats | Complex) -> Complex:
-        """Return the frequency response of the discrete-time controller at w [rad/s], without saturation."""
+        """Return the frequency response of the discrete-time controller at w [rad/s], shape (W,); no saturation."""
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
 
     def reset(self) -> None:
-        """Reset all states."""
+        """Reset all states, so that the next sample is the first one."""
         self._sums = np.zeros(len(self._integral.weights))
         self._lags: Floats | None = None
         self._error = 0.0
@@ -217,7 +223,7 @@ class DiscretePid:
         """Return the controller output for the control error of the next sample."""
         error = float(error)
         if self._lags is None:
-            # The derivative starts in the steady state of a constant error, where it is zero.
+            # The lags of the derivative start in the steady state of a constant error, in which its output is zero.
             bank = self._derivative
             self._lags = error * (bank.now + bank.before) / (1.0 - bank.keeps)
             self._error, sums = error, self._sums
@@ -243,7 +249,7 @@ class DiscretePid:
         return gain, float(np.degrees(np.max(np.abs(np.angle(quotient)))))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return design data and approximation errors as a dictionary for JSON."""
+        """Return gains, orders, rate, band and approximation errors as a dictionary for JSON."""
         return {
             "pid": self.pid.to_dict(),
             "rate": self.rate,
@@ -261,19 +267,23 @@ class DiscretePid:
 
 
 def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
-    """Return poles, residues and direct gain of Oustaloup's filter for s^power, 0 < power <= 1."""
+    """Return (poles, residues, direct gain) of Oustaloup's filter for s^power, 0 < power <= 1.
+
+    `reach` is the frequency range of the poles [rad/s], and `order` the order of the filter. The steady-state gain is
+    zero. The filter is the direct gain plus the sum of residue/(s + pole). For power 1 it is a filtered derivative.
+    """
     if power < 1.0:
         poles, residues, _ = oustaloup(power, reach, order)
-        # The gain that makes the response to a constant zero; Oustaloup's gain is that at the band's lower end.
+        # This direct gain makes the steady-state gain zero. Oustaloup's own gives the gain at the band's lower end.
         return poles, residues, -float(np.sum(residues / poles))
     high = reach[1]
     return np.array([high]), np.array([-high * high]), high
 
 
 def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
-    """Return poles, residues and direct gain of an approximation of s^-power without steady-state error.
+    """Return (poles, residues, direct gain) of an approximation of s^-power, 0 < power <= 1, with a pole at s = 0.
 
-    It is an integrator in series with Oustaloup's filter for s^(1 - power).
+    It is an integrator in series with Oustaloup's filter for s^(1 - power), so a loop has no steady-state error.
     """
     if power >= 1.0:
         return np.zeros(1), np.ones(1), 0.0
@@ -285,11 +295,11 @@ def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Flo
 def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: float) -> _Bank:
     """Return a sum of first-order lags, discretized exactly for signals that are linear between samples.
 
-    `step` is the sampling interval [s], and `factor` multiplies all residues and the direct gain.
+    `step` is the sampling interval [s], and `factor` a gain of the whole sum.
     """
     x = poles * step
     keeps = np.exp(-x)
-    # (1 - e^-x)/x and what follows from it, whose limits at 0 are 1, 1/2 and 1/2.
+    # Near x = 0, (1 - e^-x)/x and both coefficients are replaced by their limits 1, 1/2 and 1/2.
     small = x < 1e-6
     safe = np.where(small, 1.0, x)
     mean = np.where(small, 1.0 - x / 2.0, -np.expm1(-safe) / safe)
@@ -299,24 +309,26 @@ def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: f
         return _Bank(factor * direct, factor * residues, keeps, now, coefficients_before)
 
 
-#: Range of the orders of integral and derivative, and values per order and round.
+#: Range of the orders of integral and derivative, and number of values per order in each step of the grid refinement.
 MIN_ORDER, MAX_ORDER, ORDERS_PER_ROUND = 0.5, 1.0, 15
+#: Number of grid refinements.
 REFINEMENT_ROUNDS = 3
-#: Number of frequencies at which orders are compared.
+#: Number of frequencies at which the sensitivity is evaluated to compare orders.
 COMPARISON_FREQUENCIES = 300
-#: Target of the largest sensitivity over all samples; if it is not reached, the tolerance above the smallest one.
+#: Maximum sensitivity over all parameter samples that orders may have. If no orders reach it, they may exceed the
+#: smallest value by the factor SENSITIVITY_TOLERANCE.
 TARGET_SENSITIVITY, SENSITIVITY_TOLERANCE = 1.5, 1.05
-#: Frequency of the low-frequency gain, as a share of the crossover; that gain rejects friction and offsets.
+#: Frequency, as a fraction of the crossover, at which the loop gain is maximized to reject friction and offsets.
 LOW_FREQUENCY_SHARE = 0.1
-#: Maximum share of parameter samples for which the loop may be unstable or lack phase margin.
+#: Maximum fraction of parameter samples for which the loop may be unstable or have too small a phase margin.
 MAX_FAILED_SAMPLE_SHARE = 0.05
-#: Minimum phase margin of a sample as a share of the requested one.
+#: Minimum phase margin for a parameter sample, as a fraction of the requested one.
 MIN_PHASE_MARGIN_SHARE = 0.5
-#: Lowest crossover as a share of the rate; below, margins are not computable in floating point.
+#: Minimum crossover [rad/s] divided by the sampling rate [Hz]. Below it, margins are not computable in floating point.
 MIN_CROSSOVER_SHARE = 1e-6
-#: Factor above the requested crossover from which the loop gain must be below 1.
+#: Frequency, relative to the requested crossover, above which the loop gain must be below 1.
 LAST_CROSSOVER_TOLERANCE = 1.01
-#: Relative plant gains at which the phase margin is evaluated.
+#: Factors of the plant gain at which the phase margin is evaluated, besides 1.
 GAIN_VARIATIONS = (0.7, 1.4)
 
 
@@ -332,13 +344,13 @@ class PidDesign(LoopDesign):
     rate
          Sampling rate [Hz].
     nominal
-        Margins at the nominal parameters.
+        Stability margins of the loop at the nominal parameters of the model.
     samples
-        Margins at parameters drawn from the covariance; empty without a covariance.
+        Stability margins at parameters drawn from their covariance; empty if the model has no covariance.
     flat
         Phase margins [degrees] at 0.7, 1 and 1.4 times the plant gain.
     plants
-        Plants from the input to all outputs that depend on it, the controlled output first.
+        Plants from the manipulated input to all outputs that depend on it, the controlled output first.
     """
 
     pid: FractionalPid
@@ -349,12 +361,16 @@ class PidDesign(LoopDesign):
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return measured outputs, and responses of the command to them and to the reference at w [rad/s]."""
+        """Return the frequency responses of the controller at w [rad/s] that a loop analysis requires.
+
+        They are the names of the measured outputs, the responses of the command to minus each measured output, shape
+        (outputs, W), and the response of the command to the reference, shape (W,).
+        """
         response = DiscretePid(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response
 
     def to_dict(self) -> dict[str, Any]:
-        """Return design and margins as a dictionary for JSON."""
+        """Return gains, orders and margins as a dictionary for JSON."""
         return {
             "design": "pid",
             "rate": self.rate,
@@ -387,9 +403,10 @@ def fractional_pid(
     coupling: Literal["simulated", "measured"] = "simulated",
     sensor: bool = False,
 ) -> PidDesign:
-    """Design a fractional PID controller for a crossover frequency, a phase margin and a flat phase.
+    """Design a fractional PID controller for a crossover frequency, a phase margin and a flat phase at the crossover.
 
-    The design is robust to the uncertainty of the model.
+    With a flat phase the phase margin depends little on the plant gain. The loop is also tested for parameters drawn
+    from the covariance of the model.
 
     Parameters
     ----------
@@ -398,19 +415,19 @@ def fractional_pid(
     output, input : str, optional
         Controlled output and manipulated input; may be omitted for a model with one of them.
     crossover
-        Gain crossover frequency [rad/s], the highest one of the loop.
+        Gain crossover frequency [rad/s]. The loop must have no higher one.
     phase_margin
         Phase margin at the crossover [degrees], 10 to 80.
     rate
         Sampling rate [Hz]. The loop includes one sample of delay and the zero-order hold.
     samples
-        Number of parameter samples from the covariance, 0 to 10000.
+        Number of parameter vectors drawn from the covariance of the model, 0 to 10000.
     seed
-        Seed of the samples.
+        Seed of these random parameter vectors.
     coupling
-        ``"simulated"``: plant of all coupled equations. ``"measured"``: plant of the output's equation alone.
+        ``"simulated"``: the plant has all coupled equations. ``"measured"``: it has only the equation of the output.
     sensor
-        Whether the loop measures the output after the model's sensor filter; by default before it.
+        Whether the measured output has passed the sensor filter of the model; by default it has not.
 
     Returns
     -------
@@ -420,17 +437,17 @@ def fractional_pid(
     Raises
     ------
     ModelError
-        If the model is unstable (an integrator is allowed), has friction, or is too uncertain: with more than 5 % of
-        the samples the loop is unstable or has half the phase margin. Also if no nonnegative gains meet the
-        requirements, or only with another crossover above the requested one.
+        If the model is unstable (an integrator is permitted), has friction, or is too uncertain. It is too uncertain if
+        for more than 5 % of the parameter samples the loop is unstable or has less than half the phase margin. Also if
+        no nonnegative gains meet the requirements, or only with another crossover above the requested one.
 
     Notes
     -----
     At given orders, three conditions at the crossover (gain 1, phase, zero slope of the phase) are linear in the three
-    gains and are met exactly. Among all orders whose maximum sensitivity over all samples is at most 1.5 (or within 5 %
-    of the smallest), those with the largest loop gain at a tenth of the crossover are selected. If their loop has
-    another crossover at a higher frequency, only orders without one are compared. Source: Monje, Vinagre, Feliu and
-    Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
+    gains and are met exactly. Orders are admissible if their maximum sensitivity over the parameter samples is at most
+    1.5, or if no orders achieve this, within 5 % of the smallest. Among them, those with the largest loop gain at a
+    tenth of the crossover are selected. If their loop has another crossover at a higher frequency, only orders without
+    one are compared. Source: Monje, Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
@@ -464,7 +481,7 @@ def fractional_pid(
     high = plant.response(fine[above])
 
     def is_last(pid: FractionalPid) -> bool:
-        """Whether the loop gain stays below 1 above the crossover."""
+        """Whether the loop gain is below 1 at all frequencies above the requested crossover."""
         return bool(np.all(np.abs(pid.response(fine[above]) * high) < 1.0))
 
     choice = best if is_last(best) else _best(target, slope, wc, w, curves, is_last)
@@ -506,7 +523,11 @@ def fractional_pid(
 def plant_of(
     model: Model, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
 ) -> Plant:
-    """Return the plant from an input to an output; raise ModelError if they are unknown or ambiguous."""
+    """Return the plant of a sampled loop from the input `driver` to an output of a model.
+
+    With None, the only input or output is used. Raise ModelError if a name is unknown or missing, or the model is not
+    linear.
+    """
     check_model(model)
     if not isinstance(sensor, bool):
         raise ModelError(f"sensor = {short_repr(sensor)} is neither True nor False; give one of them")
@@ -537,7 +558,12 @@ def _best(
     curves: Complex,
     is_allowed: Callable[[FractionalPid], bool] = lambda _: True,
 ) -> FractionalPid | None:
-    """Return the controller with the largest low-frequency gain that meets all conditions with low sensitivity."""
+    """Return the controller with the largest low-frequency gain among those that meet all conditions; None without one.
+
+    The controller has the value `target` at the frequency `wc` [rad/s], and there the phase slope `slope` of the plant
+    is compensated. `curves` are the plant responses at the frequencies `w`, one row per parameter sample, with which
+    the sensitivity is evaluated.
+    """
     candidates: list[tuple[float, float, FractionalPid]] = []
     centre, reach = ((MIN_ORDER + MAX_ORDER) / 2,) * 2, (MAX_ORDER - MIN_ORDER) / 2
     for _ in range(REFINEMENT_ROUNDS):
@@ -558,7 +584,10 @@ def _best(
 
 
 def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
-    """Return the controller with given orders, C(j wc) = target and d arg C/dw = -slope; None if a gain is negative."""
+    """Return the controller C with orders lam and mu, C(j wc) = target and d arg C/dw = -slope at wc [rad/s].
+
+    None if a gain is negative or not finite, or if the equations are singular.
+    """
     powers = np.array([0.0, -lam, mu])
     parts = (1j * wc) ** powers
     turning = powers * parts / (wc * target)
@@ -575,7 +604,7 @@ def _solve_gains(target: complex, slope: float, wc: float, lam: float, mu: float
 
 
 def least_certain_parameter(model: Model) -> str:
-    """Return the name of the coefficient or order with the largest relative uncertainty."""
+    """Return text that names the coefficient or order with the largest relative standard error, and this error."""
     covariance = covariance_of(model)
     if covariance is None:
         return "none is known"

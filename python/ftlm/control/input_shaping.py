@@ -1,4 +1,4 @@
-"""ZV and ZVD input shapers for the oscillatory modes of a model."""
+"""Zero-vibration (ZV) and ZV-derivative (ZVD) input shapers for the oscillatory modes of a model."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, as_array, as_floats, check_choice, check_integer, short_repr
 
-#: Convolution power of the zero-vibration shaper: the multiplicity of its zero at the pole.
+#: Number of times that the ZV shaper is convolved for each kind, which is the multiplicity of its zero at the pole.
 SHAPER_REPETITIONS = {"zv": 1, "zvd": 2}
-#: Maximum residual vibration over the confidence intervals of the poles.
+#: Maximum permitted residual vibration over the confidence intervals of the poles, relative to an unshaped step.
 MAX_RESIDUAL_VIBRATION = 0.2
-#: Longest shaper [samples], and range of its poles [rad/s].
+#: Maximum length of a shaper [samples], and permitted range of the magnitude of poles [rad/s].
 MAX_SHAPER_SAMPLES = 1 << 22
 POLE_RANGE_RAD_S = (1e-12, 1e12)
-#: Grid points per interval of frequency and of damping.
+#: Number of grid points over the confidence interval of the frequency, and over that of the damping.
 INTERVAL_GRID_POINTS = 9
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Shaper:
-    """Input shaper: a sequence of impulses with sum 1 that causes no residual vibration of given modes.
+    """Input shaper: a sequence of impulses with sum 1 that excites no residual vibration of given modes.
 
     Parameters
     ----------
@@ -42,11 +42,12 @@ class Shaper:
         ``"zv"``: zero vibration. ``"zvd"``: in addition, zero derivative of the vibration with respect to the pole,
         with twice the delay.
     modes
-        Modes that are shaped.
+        Modes that the shaper does not excite.
     times, amplitudes
         Times [s] and amplitudes of the impulses in continuous time.
     worst
-        Maximum residual vibration within the 95 % intervals of the modes; None without intervals.
+        Maximum residual vibration for frequencies and dampings within the 95 % intervals of the modes, relative to an
+        unshaped step. None if the modes have no intervals.
     """
 
     kind: str
@@ -57,31 +58,34 @@ class Shaper:
 
     @property
     def delay(self) -> float:
-        """Delay by which the shaper extends a reference [s]."""
+        """Time of the last impulse [s], by which the shaper delays the end of a reference."""
         return self.times[-1]
 
     def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-        """Return the residual vibration of a mode after a shaped step, relative to that after an unshaped step.
+        """Return the amplitude of the vibration of a mode after a shaped step, relative to that after an unshaped step.
+
+        The arguments are broadcast.
 
         Parameters
         ----------
         frequency
-            Undamped natural frequency of the mode [rad/s].
+            Undamped natural frequencies of the mode [rad/s].
         damping
-            Damping ratio.
+            Damping ratios of the mode.
         """
         return residual_vibration(np.array(self.times), np.array(self.amplitudes), frequency, damping)
 
     def impulses(self, rate: float) -> Floats:
-        """Return the impulses at a sampling rate [Hz], shape (N,), with sum 1 and exact zeros at the poles.
+        """Return the shaper at a sampling rate [Hz] as the amplitude at each sample, shape (N,), with sum 1.
 
-        An impulse between two samples is divided between them in such a way that its effect at the pole does not
-        change. Linear interpolation would change it.
+        The sampled shaper has exact zeros at the poles of the modes. For this, an impulse between two samples is
+        divided between them such that the excited vibration does not change. Linear interpolation would change it.
 
         Raises
         ------
         ModelError
-            If the rate is invalid, gives fewer than four samples per period of a mode, or gives millions of samples.
+            If the rate is invalid, has fewer than four samples per period of a mode, or makes the shaper longer than 4
+            million samples.
         """
         rate = checked_rate(rate)
         if self.delay * rate > MAX_SHAPER_SAMPLES:
@@ -102,24 +106,24 @@ class Shaper:
         return taps
 
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
-        """Return a reference filtered by the shaper at a sampling rate [Hz]; its length does not change.
+        """Return a reference filtered by the shaper, with the same shape.
 
-        The reference is assumed to equal its first row in the past. The result is delayed by `delay`, so the reference
-        should end at rest.
+        Before its first row, the reference is assumed to be constant. The filtered reference reaches its final value
+        later by `delay`, so the reference should end with a constant part of at least this duration.
 
         Parameters
         ----------
         reference
-            Reference with one row per sample.
+            Reference with one row per sample, shape (rows,) or (rows, columns).
         rate
             Sampling rate [Hz].
 
         Raises
         ------
         DataError
-            If a row is not finite.
+            If the reference has another shape or a value that is not finite.
         ModelError
-            In the cases of :meth:`impulses`.
+            If the rate is invalid; see :meth:`impulses`.
         """
         values = as_array("reference", reference)
         if values.dtype.kind not in "fiu" or values.ndim not in (1, 2) or values.size == 0:
@@ -136,7 +140,7 @@ class Shaper:
         return np.asarray(shaped.reshape(values.shape), dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return impulses and modes as a dictionary for JSON."""
+        """Return kind, impulses, modes and residual vibration as a dictionary for JSON."""
         modes = [[m.frequency, m.damping] for m in self.modes]
         return attributes(self, ("kind", "times", "amplitudes")) | {"modes": modes, "worst": self.worst}
 
@@ -160,19 +164,20 @@ def input_shaper(
     Parameters
     ----------
     model
-        Identified model, whose least damped modes are shaped; or a pole [rad/s] such as ``-2 + 17j``.
+        Model whose least damped modes are shaped, or a single pole [rad/s] such as ``-2 + 17j``.
     kind
-        ``"zv"`` (Smith's posicast, with a delay of half a period) or ``"zvd"`` (with a delay of a full period; errors
-        of the pole have only a second-order effect).
+        ``"zv"``: zero-vibration shaper (Smith's posicast), with a delay of half a period. ``"zvd"``: shaper with a
+        delay of a full period, on which errors of the pole have only a second-order effect.
     modes
         Number of modes that are shaped, the least damped first. Their delays are added.
     coupling
-        ``"simulated"``: poles of the coupled equations. ``"measured"``: poles of each equation alone, as for a flexible
-        link on a hub that a stiff position loop moves.
+        ``"simulated"``: the modes are poles of the coupled equations. ``"measured"``: they are poles of each equation
+        alone, as for a flexible link on a hub that follows a stiff position loop.
 
     Returns
     -------
     Shaper
+        Impulses and their residual vibration.
 
     Raises
     ------
@@ -226,7 +231,11 @@ def input_shaper(
 
 
 def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-    """Return the vibration amplitude after the last impulse, divided by the amplitude after one unit impulse."""
+    """Return the amplitude of vibration after the last of several impulses, relative to one unit impulse at that time.
+
+    `times` [s] and `amplitudes` define the impulses. `frequency` [rad/s] and `damping` of the mode are broadcast. Raise
+    DataError if one is out of range.
+    """
     w, z = np.broadcast_arrays(as_floats("frequency", frequency), as_floats("damping", damping))
     if not (np.all(np.abs(w) < POLE_RANGE_RAD_S[1]) and np.all(np.abs(z) <= 1.0)):
         raise DataError("frequency or damping is out of range; give rad/s, finite, and damping ratios from -1 to 1")
@@ -236,7 +245,7 @@ def residual_vibration(times: Floats, amplitudes: Floats, frequency: ArrayLike, 
 
 
 def _convolve(x: Floats, taps: Floats) -> Floats:
-    """Return the causal convolution of a signal with a few impulses, truncated to the length of the signal."""
+    """Return the convolution of a signal x with a filter of few nonzero taps, truncated to the length of x."""
     out = np.zeros(len(x))
     for at in np.flatnonzero(taps[: len(x)]):
         out[at:] += taps[at] * x[: len(x) - at]
@@ -257,17 +266,20 @@ def _mode_of(value: complex | np.number[Any]) -> Mode:
 
 
 def _half(mode: Mode) -> tuple[float, float]:
-    """Return half the damped period of a mode [s], and the decay of its amplitude over this time."""
+    """Return half the damped period of a mode [s], and the factor by which its amplitude decays in this time."""
     half = math.pi / mode.pole.imag
     return half, math.exp(mode.pole.real * half)
 
 
 def _zv_samples(mode: Mode, step: float) -> Floats:
-    """Return the sampled zero-vibration shaper of a mode, which is zero exactly at the pole of the mode."""
+    """Return the zero-vibration shaper of a mode as amplitudes at samples, with sum 1 and a zero at the mode's pole.
+
+    `step` is the sampling interval [s].
+    """
     half, decay_ratio = _half(mode)
     whole = math.floor(half / step)
     rest = half - whole * step
-    # a + b e^(-s step) = e^(-s rest) at the pole; both are positive below half the sampling rate.
+    # sooner + later e^(-s step) = e^(-s rest) at the pole s. Both are positive if the pole is below half the rate.
     decay, turn = mode.pole.real, mode.pole.imag
     later = math.exp(decay * (step - rest)) * math.sin(turn * rest) / math.sin(turn * step)
     sooner = math.exp(-decay * rest) * math.sin(turn * (step - rest)) / math.sin(turn * step)
@@ -279,7 +291,10 @@ def _zv_samples(mode: Mode, step: float) -> Floats:
 
 
 def _worst_residual(times: Floats, amplitudes: Floats, modes: tuple[Mode, ...]) -> float | None:
-    """Return the largest residual vibration over the confidence intervals of the modes; None without intervals."""
+    """Return the largest residual vibration over the 95 % intervals of frequency and damping of the modes.
+
+    None if no mode has intervals.
+    """
     worst: float | None = None
     for mode in modes:
         if mode.frequency_error is None or mode.damping_error is None:

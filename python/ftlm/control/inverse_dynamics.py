@@ -1,4 +1,4 @@
-"""Inverse dynamics: a reference that moves an output along a path, by inversion of the exact frequency response."""
+"""Inverse dynamics: the reference that moves an output along a path, from the inverse of the frequency response."""
 
 from __future__ import annotations
 
@@ -18,21 +18,23 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import Complex, Floats, as_array, real_number, short_repr
 
-#: Length of the transform relative to the path, and exponent of its weight exp(-t): the weight suppresses the periodic
-#: continuation, which the fading memory of a fractional model would never forget.
+#: Minimum length of the Fourier transform relative to the path, and exponent to which the weight exp(-a t) decays over
+#: the transform. The weight suppresses the effect of the periodic continuation, which a fractional model would never
+#: forget.
 TRANSFORM_LENGTH_FACTOR, WEIGHT_DECAY = 8, 28.0
-#: Maximum excursion of the reference relative to the move. A larger one shows that the inverse is unstable.
+#: Maximum deviation of the reference from its start, relative to the move. A larger one shows an unstable inverse.
 MAX_REFERENCE_RATIO = 20.0
-#: Longest path [samples].
+#: Maximum length of a path [samples].
 MAX_PATH_ROWS = 100_000
-#: Maximum initial offset of a reference relative to the move; above, the path needs a longer dwell before the move.
+#: Maximum deviation of the first sample of a reference from the path, relative to the move. Above it, the path needs a
+#: longer dwell before the move.
 MAX_INITIAL_OFFSET_SHARE = 1e-3
-#: Maximum residual vibration relative to that of the path as reference; above, the uncertainty is too large.
+#: Maximum residual vibration, relative to that with the path itself as reference. Above it, the model is too uncertain.
 MAX_RESIDUAL_SHARE = 0.5
 
 
 class Loop(Protocol):
-    """Protocol of a loop design with the frequency responses that inverse dynamics requires."""
+    """Protocol of a loop design, with the frequency responses that :func:`inverse_dynamics` requires."""
 
     @property
     def rate(self) -> float:
@@ -40,31 +42,38 @@ class Loop(Protocol):
 
     @property
     def plants(self) -> tuple[Plant, ...]:
-        """Plants of the loop, one per output."""
+        """Plants from the manipulated input of the loop, one per output."""
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return measured outputs, and responses of the command to each, (outputs, W), and to the reference, (W,)."""
+        """Return the frequency responses of the controller at w [rad/s].
+
+        They are the names of the measured outputs, the responses of the command to minus each measured output, shape
+        (outputs, W), and the response of the command to the reference, shape (W,).
+        """
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """Result of :func:`inverse_dynamics`: the reference for a move along a path, and its predicted effect.
 
+    Arrays have shape (N,), with one value per sample.
+
     Parameters
     ----------
     reference
-        Reference for the loop, one row per sample.
+        Reference for the loop.
     path
-        Desired path.
+        Desired path of the output.
     command
-        Command of the loop that its linear model predicts, one row per sample.
+        Command of the controller, as predicted by the linear model of the loop.
     outputs
-        Outputs that the model predicts, one row per sample.
+        Outputs by name, as predicted by the model.
     residual_vibration
-        RMS deviation from the path after its end that at most 2.5 % of the parameter samples exceed; None without a
-        covariance.
+        RMS deviation of the output from the path after the move, as the 97.5 % quantile over the parameter samples.
+        None if the model has no covariance.
     plain
-        RMS deviation after the end of the path if the path itself is the reference, at the nominal parameters.
+        RMS deviation of the output from the path after the move if the path itself is the reference, at the nominal
+        parameters.
     """
 
     reference: Floats
@@ -75,7 +84,7 @@ class Trajectory:
     plain: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a summary as a dictionary for JSON, without the samples."""
+        """Return length, largest command and residual vibrations as a dictionary for JSON, without the samples."""
         return {
             "rows": len(self.path),
             "largest_command": float(np.max(np.abs(self.command))),
@@ -100,14 +109,14 @@ class Trajectory:
 def point_to_point(
     distance: float, duration: float, rate: float = 500.0, *, dwell_before: float = 0.3, dwell_after: float = 1.2
 ) -> Floats:
-    """Return a point-to-point path: a polynomial of degree 7 in time.
+    """Return a path from 0 to `distance` with one value per sample, shape (N,): a polynomial of degree 7 in time.
 
-    Velocity, acceleration and jerk are zero at both ends. The path has shape (N,).
+    Velocity, acceleration and jerk are zero at both ends of the move.
 
     Parameters
     ----------
     distance
-        Distance, in the unit of the output.
+        Distance of the move, in the unit of the output.
     duration
         Duration of the move [s].
     rate
@@ -118,7 +127,7 @@ def point_to_point(
     Raises
     ------
     ModelError
-        If a number is invalid, or the move has fewer than ten samples.
+        If an argument is out of range, the move has fewer than ten samples, or the path has more than 100 000.
     """
     reach = real_number("distance", distance)
     if not math.isfinite(reach):
@@ -160,28 +169,29 @@ def inverse_dynamics(
         Loop design. The inverted response includes the exact fractional model, delay, hold and the discrete-time
         controller.
     path : array_like
-        Desired path, one row per sample at the rate of the loop. It must be at rest at both ends. The dwell before the
-        move must be at least as long as the time by which the reference starts earlier.
+        Desired path, one row per sample at the rate of the loop. It must be at rest at both ends. The reference may
+        have to start before the move, so the path must begin with a sufficiently long dwell.
     output : str, optional
-        Output of the model or a sum such as ``"theta11 + theta12"``, as measured by the loop; may be omitted for a
-        model with one output.
+        Output of the model, or a sum of outputs such as ``"theta11 + theta12"``; may be omitted for a model with one
+        output.
     limit
-        Maximum magnitude of the command.
+        Maximum permitted magnitude of the command.
     samples, seed
-        Number of parameter samples from the covariance, 0 to 10000, and their seed.
+        Number of parameter vectors drawn from the covariance of the model, 0 to 10000, and seed of the drawing.
 
     Returns
     -------
     Trajectory
+        Reference, predicted command and outputs, and residual vibration.
 
     Raises
     ------
     DataError
         If the path is invalid.
     ModelError
-        If the command exceeds the limit, the reference would start before the first row of the path, or the model is
-        too uncertain. It is too uncertain if the residual vibration may exceed half of the vibration with the path
-        itself as reference.
+        If the command exceeds the limit, the reference would have to start before the first row of the path or
+        diverges, or the model is too uncertain. It is too uncertain if the residual vibration may exceed half of that
+        with the path itself as reference.
 
     Notes
     -----
@@ -196,7 +206,8 @@ def inverse_dynamics(
     names = tuple(p.output for p in design.plants)
     row = sum_row("output", names[0] if output is None and len(names) == 1 else output, names)
     size = 1 << math.ceil(math.log2(TRANSFORM_LENGTH_FACTOR * len(rows)))
-    # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
+    # Frequencies on a line s = jw with a constant positive real part, right of all poles, and left of the zeros in the
+    # right half-plane that the response of a tip has.
     fall = WEIGHT_DECAY * design.rate / size
     w: Complex = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate) - 1j * fall, dtype=np.complex128)
     inside = w.real < 0.999 * math.pi * design.rate
@@ -204,7 +215,7 @@ def inverse_dynamics(
     heard, acts, asks = design.controller_response(w[inside])
 
     def closed_loop_response(model: Model) -> tuple[Complex, Complex]:
-        """Return the responses of command and outputs to the reference in closed loop."""
+        """Return the closed-loop responses of the command, (W,), and of the outputs, (outputs, W), to the reference."""
         responses = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
         loop = np.sum([a * responses[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
         command = asks / (1.0 + loop)
@@ -259,7 +270,11 @@ def inverse_dynamics(
 
 
 def _path(path: ArrayLike) -> Floats:
-    """Return a path as an array of shape (rows,); raise DataError if it is invalid."""
+    """Return a path as an array of shape (rows,).
+
+    Raise DataError if it has another shape, a length outside 16 to 100 000, no move, a value that is not finite or too
+    large, or no rest at an end.
+    """
     raw = as_array("path", path)
     if raw.dtype.kind not in "fiu" or raw.ndim != 1 or not 16 <= raw.size <= MAX_PATH_ROWS:
         raise DataError(f"path has shape {raw.shape}; give 16 to {MAX_PATH_ROWS} numbers, one per sample")
@@ -281,5 +296,5 @@ def _path(path: ArrayLike) -> Floats:
 
 
 def _residual_rms(output: Floats, rows: Floats, ends: int) -> float:
-    """Return the RMS deviation of an output from a path after row `ends`."""
+    """Return the RMS deviation of an output from a path `rows` from the row with index `ends` on."""
     return float(np.sqrt(np.mean(np.square((output - rows)[min(ends, len(rows) - 1) :]))))

@@ -22,19 +22,19 @@ from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import python_control
 from ftlm.utils.validation import Complex, Floats, as_complex, as_floats, check_vector, nearest, short_repr
 
-#: Name of the input disturbance in the estimates.
+#: Name of the estimated input disturbance among the estimates of an observer.
 UNKNOWN_INPUT = "unknown input"
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Observer:
-    """Kalman filter of a discrete-time model with an unknown input disturbance.
+    """Steady-state Kalman filter of a discrete-time model with an unknown input disturbance.
 
     Parameters
     ----------
     realization
-        Realization of the model for all outputs, with its approximation error.
+        State-space realization of the model with all outputs, and its approximation error.
     measured
         Names of the measured outputs.
     noise
@@ -42,9 +42,10 @@ class Observer:
     process_noise
         Process noise intensity: standard deviation of the change of the disturbance within one second.
     gain
-        Kalman gain of the correction, shape (states + 1, measured); the last row belongs to the disturbance.
+        Kalman gain of the measurement update, shape (states + 1, measured outputs). The last row is for the
+        disturbance.
     deviations
-        Steady-state standard deviation of the estimate of every output, by the model and its noise.
+        Standard deviation of the estimation error of each output in steady state, as predicted by the model.
     """
 
     realization: Realization
@@ -56,12 +57,12 @@ class Observer:
 
     @property
     def rows(self) -> Floats:
-        """Output matrix of the measured outputs."""
+        """Output matrix of the measured outputs, shape (measured outputs, states)."""
         return self.realization.c[[self.realization.outputs.index(o) for o in self.measured]]
 
     @property
     def matrices(self) -> tuple[Floats, Floats, Floats]:
-        """Matrices a, b, c of the discrete-time system, in which the input disturbance is the last state."""
+        """Matrices a, b, c of the discrete-time system with the input disturbance as the last state."""
         a, b = self.realization.a, self.realization.b
         size = len(a)
         whole = np.eye(size + 1)
@@ -69,10 +70,10 @@ class Observer:
         return whole, np.vstack([b, [[0.0]]]), np.column_stack([self.rows, np.zeros(len(self.rows))])
 
     def over(self, run: Run) -> dict[str, Floats]:
-        """Return estimates of every output and of the input disturbance for a run, from past and present samples.
+        """Return estimates of each output and of the input disturbance over a run, one array per name.
 
-        The filter starts at rest. If the first measured output has an integrator, it starts at the first sample of this
-        output.
+        The estimate at a sample uses this and earlier samples. The filter starts at rest. If the model has an
+        integrator, it starts in the equilibrium in which a measured output has its first measured value.
 
         Raises
         ------
@@ -92,7 +93,7 @@ class Observer:
         y = np.array([run[n] for n in self.measured])
         projection = np.eye(len(a)) - self.gain @ c
         start = np.append(self.rest(y[:, 0]), 0.0)
-        # From one corrected state to the next: x' = kept (a x + b u) + gain y'.
+        # Corrected state at the next sample: x' = projection (a x + b u) + gain y'.
         library = python_control()
         system = library.ss(
             projection @ a,
@@ -108,7 +109,10 @@ class Observer:
         return dict(zip(self.realization.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: states[-1]}
 
     def rest(self, measured: Floats) -> Floats:
-        """Return the equilibrium state at measured values, if the first output has an integrator; otherwise 0."""
+        """Return the equilibrium state, shape (states,), for the measured values of one sample.
+
+        It is zero unless the model has an integrator that acts on a measured output.
+        """
         states = np.zeros(self.realization.states)
         column = self.rows[:, 0]
         if self.realization.poles[0] == 0 and np.any(column):
@@ -124,7 +128,10 @@ class Observer:
 
 
 def _measured_values(observer: Observer, measured: Sequence[float] | Floats) -> Floats:
-    """Return the measured values of one sample; raise DataError unless there is one for each measured output."""
+    """Return the measured values of one sample as an array (measured outputs,).
+
+    Raise DataError unless there is one value for each measured output of the observer.
+    """
     values = as_floats("measured", measured)
     if values.shape != (len(observer.measured),):
         raise DataError(f"measured has shape {values.shape}; give one value each of {', '.join(observer.measured)}")
@@ -152,30 +159,31 @@ def observer(
     model
         Linear model that is stable except for an integrator.
     input : str, optional
-        Input; may be omitted for a model with one input.
+        Name of the input; may be omitted for a model with one input.
     measured : sequence of str, optional
         Names of the measured outputs; by default all.
     noise : mapping, optional
-        Standard deviation of the noise of each measured output; by default the standard deviation of the fit's
-        residuals.
+        Standard deviation of the noise of each measured output; by default that of the residuals of the fit.
     process_noise
         Process noise intensity: standard deviation of the change of an input disturbance within one second, in the unit
         of the input. The disturbance represents friction, offsets and other unmodeled effects.
     rate, band, poles
-        Options of the realization; see :class:`Realization`. The default band is from 1/5000 to 1/8 of the Nyquist
-        frequency. By default, as many poles are used as errors below 0.1 dB and 1 degree require.
+        Sampling rate [Hz], frequency band (low, high) [rad/s] and number of poles of the integer-order realization. The
+        default band is from 1/5000 to 1/8 of the Nyquist frequency. By default, there are as many poles as errors below
+        0.1 dB and 1 degree require.
     coupling, sensor
-        See :func:`ftlm.analysis.frequency_response`; by default the measurements are not filtered.
+        As for :func:`ftlm.analysis.frequency_response`. By default, measured outputs have not passed the sensor filter.
 
     Returns
     -------
     Observer
+        Steady-state Kalman filter.
 
     Raises
     ------
     ModelError
-        If the model is unstable or has no accurate low-order realization, an output or input is unknown, the noise is
-        unknown, or python-control is not installed.
+        If the model is unstable or has no accurate low-order realization, or if python-control is not installed. Also
+        if a name or the noise of an output is unknown, or states are not observable.
     """
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
     names = select_outputs("measured", measured, tuple(p.output for p in plants))
@@ -188,7 +196,10 @@ def observer(
 
 
 def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
-    """Return plants from one input to all outputs of a model; raise ModelError if the model is unstable."""
+    """Return the plants from one input of a model to each output that depends on the input.
+
+    Raise ModelError if the model is unstable, or if no output depends on the input.
+    """
     check_model(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
     plants[0].check_stable()
@@ -201,11 +212,14 @@ def plants_of(model: Model, driver: str | None, rate: float, coupling: str, *, s
 def kalman_filter(
     realization: Realization, measured: tuple[str, ...], noise: tuple[float, ...], process_noise: float
 ) -> Observer:
-    """Return the Kalman filter of a realization."""
+    """Return the steady-state Kalman filter of a realization.
+
+    Raise ModelError if the measured outputs do not make all states observable, so that the filter is unstable.
+    """
     bare = Observer(realization, measured, noise, process_noise, np.zeros((0, 0)), {})
     a, b, c = bare.matrices
     step = 1.0 / realization.rate
-    # Process noise of the input itself: the same deviation per sample as its random walk has in a second.
+    # The input also has white process noise, whose standard deviation is that of its random walk after one second.
     inside = np.zeros_like(a)
     inside[:-1, :-1] = b[:-1] @ b[:-1].T * process_noise**2
     inside[-1, -1] = process_noise**2 * step
@@ -227,7 +241,10 @@ def kalman_filter(
 
 
 def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str, float] | None) -> tuple[float, ...]:
-    """Return the noise standard deviation of each measured output; raise ModelError if one is unknown."""
+    """Return the noise standard deviation of each measured output: the given one, or that of the fit.
+
+    Raise ModelError if one is unknown or invalid.
+    """
     if noise is not None and not isinstance(noise, Mapping):
         raise ModelError(f"{setting('noise')} {short_repr(noise)} is not a mapping; give standard deviations by output")
     for name in noise or {}:
@@ -252,32 +269,33 @@ def noise_deviations(model: Model, measured: tuple[str, ...], noise: Mapping[str
     return tuple(out)
 
 
-#: Maximum peak of the sensitivity function of an acceptable design. It gives a phase margin of at least 19 degrees and
-#: gain margins of at least 1.5.
+#: Maximum sensitivity of an acceptable design. It implies a phase margin of at least 19 degrees and a gain margin of at
+#: least 1.5.
 MAX_SENSITIVITY = 3.0
-#: Number of frequencies of a Nyquist curve, and its start relative to the band.
+#: Number of frequencies of a Nyquist curve, and its lowest frequency relative to the lower end of the band.
 CURVE_POINTS, BAND_EXTENSION = 2500, 1e-2
-#: Distance from 1 below which a pole of the controller is its integrator.
+#: Distance from z = 1 below which a pole of the controller counts as its integrator.
 INTEGRATOR_TOLERANCE = 1e-7
 
 
 @check_arguments
 class Lqg:
-    """Discrete-time LQG controller: an observer and a state feedback.
+    """Discrete-time LQG controller: an observer with state feedback.
 
-    The observer starts at rest at the measured output, so the first command has no step. The observer uses the
-    saturated commands, which avoids windup.
+    Call it once per sample with the measured outputs and the reference; it returns the command. The observer starts in
+    the equilibrium that corresponds to the first measured outputs. The observer uses the saturated commands, which
+    avoids windup.
 
     Parameters
     ----------
     observer
-        Observer of the states.
+        Observer of the states and of the input disturbance.
     feedback
         State feedback gain, shape (1, states).
     tracked
         Name of the output that follows the reference.
     limit
-        Maximum magnitude of the command.
+        Magnitude at which the command saturates.
 
     Raises
     ------
@@ -299,29 +317,32 @@ class Lqg:
         self._a, self._b, self._c = observer.matrices
         self._gains = np.append(gains, [[1.0]], axis=1)
         rest = _equilibrium(realization, tracked)
-        #: Of the reference, so that in the end the output is where it is asked for.
+        #: Gain of the reference in the command, with which the output equals the reference in steady state.
         self.ahead = float(gains[0] @ rest[:-1] + rest[-1])
         self.reset()
 
     @property
     def memory(self) -> int:
-        """Number of states of the controller."""
+        """Number of states of the controller, including the last command."""
         return len(self._a) + 1
 
     @property
     def estimate(self) -> dict[str, float]:
-        """Predictions of all outputs at the next sample, and estimate of the input disturbance, by name."""
+        """Predictions of all outputs at the next sample, and prediction of the input disturbance, by name."""
         states = np.zeros(len(self._a)) if self._states is None else self._states
         estimates = (self.observer.realization.c @ states[:-1]).tolist()
         return dict(zip(self.observer.realization.outputs, estimates, strict=True)) | {UNKNOWN_INPUT: float(states[-1])}
 
     def reset(self) -> None:
-        """Reset all states."""
+        """Reset all states, so that the next sample is the first one."""
         self._states: Floats | None = None
         self._applied = 0.0
 
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
-        """Return the command for the measured outputs of a sample, in the observer's order, and a reference."""
+        """Return the command from the measured outputs of one sample and the reference of the tracked output.
+
+        The measured outputs are in the order of `observer.measured`. Raise ModelError if the command is not finite.
+        """
         y = _measured_values(self.observer, measured)
         with np.errstate(over="ignore", invalid="ignore"):
             if self._states is None:
@@ -337,7 +358,10 @@ class Lqg:
         return self._applied
 
     def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
-        """Return frequency responses of the command to the measured outputs, (measured, W), and the reference, (W,)."""
+        """Return the frequency responses of the command at w [rad/s], without saturation.
+
+        The first is to the measured outputs, shape (measured outputs, W), the second to the reference, shape (W,).
+        """
         z = np.exp(1j * check_vector("w", as_complex("w", w)) / self.rate)
         a, into = self._transition_matrices()
         system = z[:, None, None] * np.eye(len(a)) - a
@@ -346,16 +370,16 @@ class Lqg:
         return np.asarray(-z[None] * answer[:, :-1].T), np.asarray(self.ahead * (1.0 - answer[:, -1]))
 
     def poles(self) -> Complex:
-        """Poles of the controller in the z-plane."""
+        """Return the poles of the controller in the z-plane."""
         return np.asarray(np.linalg.eigvals(self._transition_matrices()[0]))
 
     def _transition_matrices(self) -> tuple[Floats, Floats]:
-        """Return the state matrix and the input matrix of the controller."""
+        """Return the state matrix of the controller, and its input matrix from the measured outputs."""
         into = self._a @ self.observer.gain
         return self._a - self._b @ self._gains - into @ self._c, into
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the controller as a dictionary for JSON."""
+        """Return signals, matrices and approximation errors of the controller as a dictionary for JSON."""
         realization = self.observer.realization
         return {
             "kind": "lqg",
@@ -391,13 +415,13 @@ class LqgDesign(LoopDesign):
     controller
         Designed discrete-time controller.
     realization
-        Realization of the model, with its approximation error.
+        Integer-order realization of the model, and its approximation error.
     nominal
-        Margins of the loop, opened at the plant input, at the nominal parameters.
+        Stability margins of the loop, opened at the plant input, at the nominal parameters of the model.
     samples
-        Margins at parameters drawn from the covariance; empty without a covariance.
+        Stability margins at parameters drawn from their covariance; empty if the model has no covariance.
     plants
-        Plants from the input to the measured outputs.
+        Plants from the manipulated input to all outputs that depend on it.
     """
 
     controller: Lqg
@@ -412,12 +436,16 @@ class LqgDesign(LoopDesign):
         return self.realization.rate
 
     def controller_response(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
-        """Return measured outputs, and responses of the command to each and to the reference at w [rad/s]."""
+        """Return the frequency responses of the controller at w [rad/s] that a loop analysis requires.
+
+        They are the names of the measured outputs, the responses of the command to minus each measured output, shape
+        (outputs, W), and the response of the command to the reference, shape (W,).
+        """
         heard, reference_response = self.controller.response(w)
         return self.controller.observer.measured, -heard, reference_response
 
     def with_limit(self, limit: float) -> Lqg:
-        """Return the controller with another maximum magnitude of its command."""
+        """Return a new controller of this design whose command saturates at the magnitude `limit`."""
         return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)
 
     def to_dict(self) -> dict[str, Any]:
@@ -468,22 +496,22 @@ def lqg(
     model
         Linear model that is stable except for an integrator.
     max_deviation : mapping
-        Maximum acceptable deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip), from which
-        Bryson's rule gives the weights.
+        Maximum acceptable deviation of each output, or of sums of outputs such as ``"theta11 + theta12"`` (a tip).
+        Bryson's rule gives the weights of the cost function from these values.
     max_input
-        Maximum acceptable input, in its unit.
+        Maximum acceptable magnitude of the input, in its unit.
     input, output : str, optional
-        Manipulated input, and output that follows the reference. The default output is the one with an integrator, else
-        the first. The input may be omitted for a model with one input.
+        Manipulated input, and output that follows the reference. The input may be omitted for a model with one input.
+        The default output is the first with an integrator, or else the first.
     measured, noise, rate, band, poles, coupling, sensor
-        See :func:`observer`.
+        As for :func:`observer`.
     process_noise
-        Process noise intensity; see :func:`observer`. The default is a fifth of `max_input`. Larger values give a
+        Process noise intensity; see :func:`observer`. The default is a fifth of `max_input`. A larger value gives a
         faster observer and more noise in the command.
     limit
-        Maximum command.
+        Magnitude at which the command saturates.
     samples, seed
-        Number of parameter samples from the covariance, 0 to 10000, and their seed.
+        Number of parameter vectors drawn from the covariance of the model, 0 to 10000, and seed of the drawing.
 
     Returns
     -------
@@ -494,8 +522,10 @@ def lqg(
     Raises
     ------
     ModelError
-        In the cases of :func:`observer`, or if the maximum sensitivity with the exact model exceeds 3, nominally or for
-        more than 5 % of the parameter samples.
+        If the model is unstable or has no accurate low-order realization, a name is unknown, or an argument is invalid.
+        Also if states are not observable, an integrating output has no maximum deviation, or python-control is not
+        installed. Also if the maximum sensitivity with the exact model exceeds 3, nominally or for more than 5 % of the
+        parameter samples.
 
     Notes
     -----
@@ -553,7 +583,10 @@ def lqg(
 
 
 def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
-    """Return the name of the output that follows the reference; raise ModelError if it is unknown."""
+    """Return the name of the output that follows the reference; raise ModelError if `output` is unknown.
+
+    By default it is the first output with an integrator, or else the first output.
+    """
     names = [p.output for p in plants]
     if output is not None:
         return select_outputs("output", [output], tuple(names))[0]
@@ -561,7 +594,10 @@ def _tracked_output(output: str | None, plants: Sequence[Plant]) -> str:
 
 
 def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
-    """Return (output coefficients, maximum acceptable deviation) for each weighted sum of outputs."""
+    """Return (coefficients of the outputs, maximum acceptable deviation) for each key of `max_deviation`.
+
+    A key is an output or a sum of outputs. Raise ModelError if a key or a deviation is invalid.
+    """
     if not isinstance(max_deviation, Mapping) or not max_deviation:
         raise ModelError(
             f"{setting('max_deviation')} {short_repr(max_deviation)} is not a mapping from outputs, or sums of them, "
@@ -575,7 +611,10 @@ def _weights(max_deviation: Mapping[str, float], names: tuple[str, ...]) -> list
 
 
 def _equilibrium(realization: Realization, tracked: str) -> Floats:
-    """Return the states and the input at rest, as one vector, with the tracked output at 1."""
+    """Return states and input in the equilibrium with tracked output 1, as one vector (states + 1,).
+
+    Raise ModelError if the output is unknown, or if its steady-state gain is zero.
+    """
     if tracked not in realization.outputs:
         raise ModelError(
             f"tracked = {short_repr(tracked)} is not an output; give one of {', '.join(realization.outputs)}"

@@ -1,4 +1,4 @@
-"""Low-order realization of a model by vector fitting of its exact frequency response, and its discretization."""
+"""Low-order state-space realization of a model by vector fitting of its exact frequency response, in discrete time."""
 
 from __future__ import annotations
 
@@ -26,40 +26,43 @@ from ftlm.utils.validation import (
     frequency_pair,
 )
 
-#: Number of fitted frequencies; the error is also evaluated between them.
+#: Number of frequencies of the fit. The error is evaluated at these and at as many frequencies between them.
 FIT_FREQUENCIES = 120
-#: Maximum number of iterations of pole relocation, and relative change of converged poles.
+#: Maximum number of pole relocations of vector fitting, and relative change of the poles at which they have converged.
 MAX_POLE_ITERATIONS, POLE_TOLERANCE = 30, 1e-6
-#: Minimum contribution of a pole, relative to every output at every frequency; smaller ones are dropped.
+#: Minimum contribution of a pole to the response of an output, relative to this response. A pole whose contributions
+#: are smaller for all outputs and frequencies is removed.
 MIN_POLE_CONTRIBUTION = 1e-6
-#: Poles closer to 0 than this share of the band's lower end are integrators.
+#: Fraction of the lower end of the band. Poles closer to 0 duplicate the integrator and are removed.
 INTEGRATOR_BAND_SHARE = 1e-3
-#: Target errors of gain [dB] and phase [degrees], and range of the number of poles.
+#: Target values of the maximum gain error [dB] and phase error [degrees].
 GAIN_DB, PHASE_DEGREES = 0.1, 1.0
+#: Range of the number of poles without the integrator.
 MIN_POLES, MAX_POLES = 2, 30
-#: Maximum errors of a realization that a design may use.
+#: Maximum gain error [dB] and phase error [degrees] of a realization on which a controller may be designed.
 COARSE_DB, COARSE_DEGREES = 1.0, 6.0
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Realization:
-    """Integer-order state-space realization of a model from one input, in continuous and discrete time.
+    """Integer-order state-space realization of a model from one input to several outputs, in discrete time.
 
     Parameters
     ----------
     outputs, input
-        Signal names.
+        Names of the outputs and of the input.
     rate
          Sampling rate [Hz]; the input has a zero-order hold.
     band
-        Frequency band of the fit [rad/s].
+        Frequency band (low, high) of the fit [rad/s].
     poles
-        Poles in the s-plane [rad/s], one of each conjugate pair; 0 for an integrator.
+        Poles in the s-plane [rad/s], one of each conjugate pair. An integrator (0) comes first.
     a, b, c
-        Discrete-time state space: x' = a x + b u, y = c x.
+        Matrices of the discrete-time system x_{k+1} = a x_k + b u_k, y_k = c x_k. Shapes are (states, states),
+        (states, 1) and (outputs, states).
     gain_error, phase_error
-        Maximum gain error [dB] and phase error [degrees] of each output over the band, relative to the exact response.
+        Maximum gain error [dB] and phase error [degrees] over the band, by output, relative to the exact response.
     """
 
     outputs: tuple[str, ...]
@@ -79,7 +82,7 @@ class Realization:
         return len(self.a)
 
     def response(self, w: Floats) -> Complex:
-        """Return the frequency response of the samples to a zero-order-hold input at w [rad/s], shape (outputs, W)."""
+        """Return the frequency response of the discrete-time system at w [rad/s], shape (outputs, W)."""
         z = np.exp(1j * check_vector("w", as_floats("w", w)) / self.rate)
         system = z[:, None, None] * np.eye(self.states) - self.a
         states = np.linalg.solve(system, np.broadcast_to(self.b, (z.size, *self.b.shape)))[:, :, 0]
@@ -99,11 +102,16 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
     Parameters
     ----------
     plants
-        Plants of one model, input and rate, one per output.
+        Plants of one model, one per output, with the same input and sampling rate.
     band
         Frequency band (low, high) [rad/s]; by default from 1/5000 to 1/8 of the Nyquist frequency.
     poles
         Number of poles without the integrator; by default as many as errors below 0.1 dB and 1 degree require.
+
+    Returns
+    -------
+    Realization
+        Discrete-time system with its approximation errors.
 
     Raises
     ------
@@ -112,8 +120,9 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
 
     Notes
     -----
-    Vector fitting gives poles that are common to all outputs, with equal weight on relative errors (Gustavsen and
-    Semlyen 1999, doi:10.1109/61.772353). python-control discretizes the system with a zero-order hold.
+    Vector fitting (Gustavsen and Semlyen 1999, doi:10.1109/61.772353) gives poles that are common to all outputs.
+    Relative errors have equal weight for all outputs and frequencies. python-control discretizes the system with a
+    zero-order hold.
     """
     low, high = _band(band, plants[0].rate)
     counts = (
@@ -153,12 +162,12 @@ def fit_realization(plants: Sequence[Plant], band: tuple[float, float] | None, p
 
 @contextmanager
 def catch_numerical_errors(what: str, way_out: str) -> Iterator[None]:
-    """Convert overflow and numerical singularity within a block to a ModelError.
+    """Raise ModelError in place of an overflow, a singular matrix or another numerical error in a ``with`` block.
 
-    `what` and `way_out` are the failed computation and the remedy in its message.
+    The message names the failed computation (`what`) and a remedy (`way_out`).
     """
     with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
-        # SciPy only warns of a singular matrix.
+        # SciPy reports a singular matrix only by a warning.
         warnings.simplefilter("error", RuntimeWarning)
         try:
             yield
@@ -182,9 +191,9 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
 
 
 def _initial_poles(own: Sequence[complex], low: float, high: float, count: int) -> Complex:
-    """Return initial poles for vector fitting: oscillatory modes of the model, and real poles over the band.
+    """Return initial poles for vector fitting [rad/s], one of each conjugate pair; pairs count twice in `count`.
 
-    Of each conjugate pair one pole is returned.
+    They are the poles `own` of oscillatory modes of the model, followed by real poles that are spread over the band.
     """
     pairs = list(own)[: count // 2]
     real = -np.geomspace(low, high, count - 2 * len(pairs))
@@ -192,9 +201,10 @@ def _initial_poles(own: Sequence[complex], low: float, high: float, count: int) 
 
 
 def _basis(s: Complex, poles: Complex) -> Complex:
-    """Return the partial fractions 1/(s - p) of every pole, shape (S, number of poles).
+    """Return the partial-fraction basis of the poles at the points s: 1/(s - p) for a real pole p.
 
-    A conjugate pair gives two columns, with real residues.
+    The shape is (number of points, number of poles with their conjugates). A conjugate pair has two columns, whose
+    coefficients are real.
     """
     columns = []
     for p in poles:
@@ -208,7 +218,7 @@ def _basis(s: Complex, poles: Complex) -> Complex:
 
 
 def _system(poles: Complex) -> tuple[Floats, Floats]:
-    """Return matrices of a system whose states have the responses 1/(s - p) of :func:`_basis` to its input."""
+    """Return matrices (a, b) of a real system whose states respond to the input by the columns of :func:`_basis`."""
     size = int(np.sum(np.where(poles.imag == 0, 1, 2)))
     a, b = np.zeros((size, size)), np.zeros((size, 1))
     at = 0
@@ -224,7 +234,12 @@ def _system(poles: Complex) -> tuple[Floats, Floats]:
 
 
 def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> tuple[Complex, Floats, bool]:
-    """Return the poles, the residues of each output (the integrator's first), and whether there is an integrator."""
+    """Fit a system with common poles to the responses `exact`, shape (outputs, points), at the points s.
+
+    `integrates` states for each output whether it has an integrator, and `poles` are the initial poles. Return (poles,
+    residues, whether there is an integrator). Residues have one row per output. Their first column belongs to the
+    integrator, 0 without one.
+    """
     weight = 1.0 / np.abs(exact)
     for _ in range(MAX_POLE_ITERATIONS):
         basis = _basis(s, poles)
@@ -243,7 +258,7 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         solved = _least(matrix / scale, vector) / scale
         a, b = _system(poles)
         relocated = np.linalg.eigvals(a - b @ solved[None, each * len(exact) :])
-        # A stable model has no poles on the right; where noise of the fit puts one, it is mirrored.
+        # The model is stable. A pole that errors of the fit put into the right half-plane is mirrored.
         relocated = -np.abs(relocated.real) + 1j * relocated.imag
         poles_before, poles = (
             poles,
@@ -252,8 +267,8 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
         if len(poles_before) == len(poles) and np.max(np.abs(poles_before - poles) / np.abs(poles)) < POLE_TOLERANCE:
             break
     residues = _residues(s, exact, integrates, poles)
-    # Poles beyond the order of the model have negligible residues, and no observer would find their states.
-    # The same holds for a second integral.
+    # Superfluous poles have negligible residues, so their states would not be observable. A second integrator would not
+    # be observable either.
     at, is_significant = 1, []
     slow = INTEGRATOR_BAND_SHARE * float(np.min(s.imag)) if any(integrates) else 0.0
     for p in poles:
@@ -268,14 +283,18 @@ def _fit(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex)
 
 
 def _least(matrix: Complex, vector: Complex) -> Floats:
-    """Return the real least-squares solution of complex equations, by QR factorization."""
+    """Return the real least-squares solution x of complex equations matrix x = vector, by QR factorization."""
     both = np.column_stack([matrix, vector])
     triangle = np.asarray(np.linalg.qr(np.concatenate([both.real, both.imag]), mode="r"), dtype=np.float64)
     return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1])[0])
 
 
 def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Complex) -> Floats:
-    """Return the residues of the integrator and of the columns of :func:`_basis`, by output."""
+    """Return the residues for given poles, shape (outputs, 1 + number of poles with their conjugates).
+
+    The first column is the residue of the integrator, 0 for an output without one. The others are coefficients of the
+    columns of :func:`_basis`.
+    """
     basis = _basis(s, poles)
     residues = np.zeros((len(exact), basis.shape[1] + 1))
     for i, line in enumerate(exact):
@@ -290,7 +309,11 @@ def _residues(s: Complex, exact: Complex, integrates: Sequence[bool], poles: Com
 def _discretize(
     library: Any, plants: Sequence[Plant], band: tuple[float, float], poles: Complex, residues: Floats, integral: bool
 ) -> Realization:
-    """Return the discretized realization with its approximation errors."""
+    """Return the discrete-time realization of a system with given poles and residues, and its approximation errors.
+
+    `library` is the module of python-control. `integral` states whether the first column of `residues` belongs to an
+    integrator.
+    """
     a, b = _system(poles)
     c = residues[:, 1:]
     if integral:
@@ -300,7 +323,7 @@ def _discretize(
         poles = np.append(0.0, poles)
     rate = plants[0].rate
     system = library.sample_system(library.ss(a, b, c, np.zeros((len(c), 1))), 1.0 / rate, "zoh")
-    # Scale the states, so that units have no influence on the weights of a design.
+    # Scale the states, so that their units do not influence the process noise and the weights of a design.
     size = np.maximum(np.sqrt(np.sum(c * c, axis=0)), 1e-300)
     realization = Realization(
         tuple(p.output for p in plants),
@@ -323,6 +346,6 @@ def _discretize(
 
 
 def _scaled_error(realization: Realization) -> float:
-    """Return the largest approximation error, divided by its target."""
+    """Return the largest ratio of a gain or phase error to its target; at most 1 if the targets are met."""
     worst = max(max(realization.gain_error.values()) / GAIN_DB, max(realization.phase_error.values()) / PHASE_DEGREES)
     return worst if math.isfinite(worst) else math.inf

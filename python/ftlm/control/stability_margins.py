@@ -1,4 +1,4 @@
-"""Stability margins on the exact frequency response of a model."""
+"""Stability margins of sampled loops, from the exact frequency response of the model."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from ftlm.errors import ModelError
 from ftlm.model.model import Model
 from ftlm.utils.validation import Complex, Floats, as_complex
 
-#: Number of frequencies of a Nyquist curve, from a thousandth of the crossover to the Nyquist frequency.
+#: Number of frequencies of a Nyquist curve, and its lowest frequency as a fraction of the crossover.
 NYQUIST_POINTS = 1500
 LOWEST_FREQUENCY_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Stability margins of a loop with loop transfer function L.
+    """Stability margins of a feedback loop with the loop transfer function L.
 
     Parameters
     ----------
@@ -38,9 +38,10 @@ class Margins:
     crossover
         Highest frequency with abs(L) = 1 [rad/s]; NaN without one.
     phase
-        Minimum phase margin over all crossovers [degrees].
+        Minimum phase margin over all frequencies with abs(L) = 1 [degrees]; 180 without one.
     gain
-        Gain margin: smallest factor by which an increase or decrease of the loop gain makes L = -1 at some frequency.
+        Gain margin: smallest factor above 1 such that multiplying or dividing the loop gain by it makes L = -1 at some
+        frequency.
     sensitivity
         Maximum sensitivity: largest abs(1/(1 + L)) over frequency.
     """
@@ -61,18 +62,24 @@ class Margins:
 
 
 class LoopDesign:
-    """Base class of loop designs, with margins at the nominal parameters and at parameter samples."""
+    """Base class of loop designs, with stability margins at the nominal parameters and at parameter samples.
+
+    Parameter samples are drawn from the covariance of the model.
+    """
 
     nominal: Margins
     samples: tuple[Margins, ...]
 
     @property
     def stable_share(self) -> float:
-        """Fraction of the parameter samples with a stable loop; 1 without samples."""
+        """Fraction of the parameter samples for which the loop is stable; 1 without samples."""
         return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
 
     def margin_interval(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
-        """Return the central 95 % interval of a margin over the parameter samples."""
+        """Return the central 95 % interval (low, high) of a margin over the parameter samples.
+
+        Without samples, both limits are the nominal value.
+        """
         if not self.samples:
             value = getattr(self.nominal, what)
             return value, value
@@ -80,7 +87,7 @@ class LoopDesign:
         return float(low), float(high)
 
     def _margins(self) -> dict[str, Any]:
-        """Return nominal and sampled margins as a dictionary for JSON."""
+        """Return the margins, nominal and for each parameter sample, as a dictionary for JSON."""
         margins = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
         for one in margins:
             one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
@@ -102,18 +109,18 @@ class LoopDesign:
 
 @dataclass(frozen=True)
 class Plant:
-    """Model from one input to one output, as plant of a sampled loop.
+    """Plant of a sampled feedback loop: a model from one input to one output.
 
     Parameters
     ----------
     model
-        The model.
+        Model in continuous time.
     output, input
-        Signal names.
+        Names of output and input.
     rate
          Sampling rate [Hz]. A command acts with one sample of delay and a zero-order hold.
     coupling, sensor
-        See :func:`ftlm.analysis.frequency_response`.
+        As for :func:`ftlm.analysis.frequency_response`.
     """
 
     model: Model
@@ -124,7 +131,10 @@ class Plant:
     sensor: bool = False
 
     def exact(self, w: Floats | Complex) -> Complex:
-        """Return the response of the continuous-time model at frequencies w [rad/s], which may be complex: s = jw."""
+        """Return the frequency response of the continuous-time model at w [rad/s], shape (W,).
+
+        Frequencies may be complex; s = jw.
+        """
         if np.iscomplexobj(w):
             transfer = transfer_functions(self.model, coupling=self.coupling)
             s: Complex = 1j * as_complex("w", w)
@@ -138,7 +148,7 @@ class Plant:
         return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
 
     def _filter_response(self, s: Complex) -> Complex:
-        """Return the response of the sensor filter at s."""
+        """Return the factor by which the sensor filter changes the response at the points s; 1 without a filter."""
         passed = self.model.structure.sensor_filter if self.sensor else None
         if passed is None:
             return np.ones_like(s)
@@ -147,16 +157,19 @@ class Plant:
         return np.asarray((above / below) ** power)
 
     def held_response(self, w: Floats | Complex) -> Complex:
-        """Return the response with a zero-order hold of the input, at frequencies below the Nyquist frequency."""
+        """Return the frequency response with a zero-order hold of the input, at w [rad/s] below Nyquist frequency."""
         turn = 1j * w / self.rate
         return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
 
     def response(self, w: Floats | Complex) -> Complex:
-        """Return the response with a zero-order hold and one sample of delay, at frequencies w [rad/s]."""
+        """Return the frequency response with a zero-order hold and one sample of delay, at w [rad/s]."""
         return np.asarray(self.held_response(w) * np.exp(-1j * w / self.rate))
 
     def integral_order(self) -> float:
-        """Return the order of the plant's pole at s = 0."""
+        """Return the order of the plant's pole at s = 0, which may be fractional and is negative for a zero.
+
+        Raise ModelError if the output does not depend on the input.
+        """
         transfer = transfer_functions(self.model, coupling=self.coupling)
         above = transfer.numerators[self.output, self.input]
         if not above:
@@ -164,7 +177,7 @@ class Plant:
         return transfer.denominator[self.output][-1][1] - above[-1][1]
 
     def count_unstable_poles(self) -> float:
-        """Return the number of poles with a positive real part; NaN if a pole is on the imaginary axis."""
+        """Return the number of poles of the model with a positive real part; NaN if a pole is on the imaginary axis."""
         result = stability(self.model, coupling=self.coupling)
         return math.nan if result.on_axis else result.unstable_poles
 
@@ -173,7 +186,7 @@ class Plant:
         return bool(transfer_functions(self.model, coupling=self.coupling).numerators[self.output, self.input])
 
     def check_stable(self) -> None:
-        """Raise ModelError if the model is unstable; an integrator is allowed."""
+        """Raise ModelError if the model is unstable; an integrator is permitted."""
         grows = self.count_unstable_poles()
         if grows != 0:
             why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
@@ -183,11 +196,11 @@ class Plant:
             )
 
     def samples(self, count: int, seed: int) -> list[Plant]:
-        """Return plants with parameters drawn from the model's covariance; empty without a covariance."""
+        """Return `count` plants with parameters drawn from the covariance of the model; empty without a covariance."""
         matrix = covariance_of(self.model)
         if matrix is None:
             return []
-        # A non-identifiable parameter has an infinite variance, which is replaced by a large one for sampling.
+        # A parameter that is not identifiable has an infinite variance, which is replaced by a large one.
         matrix = np.nan_to_num(matrix, nan=0.0, posinf=1e12, neginf=-1e12)
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         spread = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -197,12 +210,15 @@ class Plant:
 
 
 def nyquist_frequencies(crossover: float, rate: float) -> Floats:
-    """Return frequencies [rad/s] at which a Nyquist curve is computed."""
+    """Return the frequencies [rad/s] of a Nyquist curve, ascending, up to just below the Nyquist frequency.
+
+    `crossover` is the crossover frequency [rad/s] and `rate` the sampling rate [Hz].
+    """
     return np.geomspace(LOWEST_FREQUENCY_SHARE * crossover, 0.999 * math.pi * rate, NYQUIST_POINTS)
 
 
 def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) -> Margins:
-    """Return the margins of a loop from its frequency response on a fine grid.
+    """Return the stability margins of a loop from its frequency response on a fine grid of frequencies.
 
     Parameters
     ----------
@@ -213,13 +229,14 @@ def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) 
     integrates
         Order of the pole of L at s = 0.
     grows
-        Number of unstable poles of L.
+        Number of unstable poles of L; with NaN the loop counts as unstable.
     """
     if not np.isfinite(loop).all() or math.isnan(grows):
         return Margins(False, math.nan, math.nan, math.nan, math.inf)
     difference = 1.0 + loop
     turned = np.unwrap(np.angle(difference))
-    # Upper half of the contour, and of the small circle around the origin.
+    # Number of unstable poles of the closed loop, from the phase of 1 + L over the upper half of the Nyquist contour
+    # and over the upper half of the small circle around the origin.
     closed = grows + integrates / 2.0 - (turned[-1] - turned[0]) / math.pi
     size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
     at = np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:]))

@@ -1,1 +1,1 @@
-"""Experiment design: optimal inputs for the identification of parameters."""
+"""Experiment design: inputs with which the parameters of a model are identified most precisely."""

@@ -1,4 +1,4 @@
-"""Design of an optimal input: arguments, initial inputs and the best candidate."""
+"""Design of an optimal input: validation of arguments, initial inputs, and choice of the best candidate input."""
 
 from __future__ import annotations
 
@@ -29,23 +29,24 @@ from ftlm.utils.resources import duration_bounds, estimate_duration, stop_flag
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats, check_seed, nearest, real_number, short_repr
 
-#: Iterations that clip the crest of a multisine and restore its spectrum.
+#: Number of iterations that clip the peaks of a multisine and restore its spectrum.
 CREST_ITERATIONS = 200
-#: Clipping level as a fraction of the peak.
+#: Clipping level of these iterations, as a fraction of the peak.
 CREST_CLIP_RATIO = 0.85
-#: Quantiles of the power of the best spectrum that define its low, middle and high frequency.
+#: Fractions of the power of a spectrum that lie below its low, middle and high frequency.
 LOW_POWER_QUANTILE, MEDIAN_POWER_QUANTILE, HIGH_POWER_QUANTILE = 0.05, 0.5, 0.95
 
 
 def square_wave(rows: int, period: int) -> Floats:
-    """Return a square wave of amplitude 1 that starts high; the period is in samples."""
+    """Return a square wave of amplitude 1 that starts at +1, shape (rows,); `period` is in samples."""
     return np.where((np.arange(rows) % period) * 2 < period, 1.0, -1.0)
 
 
 def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -> Iterator[tuple[str, Floats]]:
-    """Yield (name, commands) of initial inputs; commands have shape (inputs, rows) and amplitude at most 1.
+    """Yield (name, commands) of initial inputs for the exchange algorithm: multisine, chirp, squares, random binary.
 
-    Random signals differ between inputs.
+    Commands have shape (inputs, rows) and magnitude at most 1. Their frequencies follow from the optimal spectrum.
+    `inputs` is the number of inputs, `rows` that of samples, and `step` the sampling interval [s].
     """
     rng = np.random.default_rng(seed)
     sines = multisine(spectrum, inputs, rows, step, rng)
@@ -69,7 +70,10 @@ def initial_inputs(spectrum: Spectrum, inputs: int, rows: int, step: float, seed
 
 
 def power_quantiles(spectrum: Spectrum, duration: float) -> tuple[float, float, float]:
-    """Return the frequencies [Hz] below which a small part, half and most of the power of a spectrum lie."""
+    """Return the frequencies [Hz] below which 5 %, 50 % and 95 % of the power of a spectrum lie.
+
+    For a spectrum without power, they are 1, 3 and 10 divided by `duration` [s].
+    """
     order = np.argsort(spectrum.lines.frequencies)
     frequencies, power = spectrum.lines.frequencies[order], spectrum.power[order]
     total = np.cumsum(power)
@@ -86,7 +90,8 @@ def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.r
     """Return multisines with the powers of a spectrum, amplitude 1 and a low crest factor, shape (inputs, rows).
 
     Starting from Schroeder's phases (doi:10.1109/TIT.1970.1054411), peaks are clipped and the power spectrum is
-    restored in turn (Van der Ouderaa, Schoukens & Renneboog, 1988).
+    restored alternately (Van der Ouderaa, Schoukens & Renneboog, 1988). An input without power gets a random binary
+    signal. `step` is the sampling interval [s].
     """
     points = len(spectrum.power)
     of_input = np.argmax(spectrum.lines.costs[:inputs] > 0, axis=0) if points else np.zeros(0, int)
@@ -119,21 +124,26 @@ def _chirp(time: Floats, low: float, high: float) -> Floats:
 
 #: Minimum and maximum number of samples of a designed run.
 MIN_RUN_SAMPLES, MAX_RUN_SAMPLES = 32, 50_000
-#: Number of holds of a run in the first search, and divisors of the hold length in the later ones.
+#: Number of holds (intervals of constant input) when the exchange algorithm is first applied, and divisors of the hold
+#: length with which it is then applied again.
 COARSE_HOLDS, HOLD_DIVISORS = 125, (1, 2, 4)
-#: Range of measured over estimated computing time. The number of exchanges is not known in advance.
+#: Range of the ratio of actual to estimated computing time, which is wide because the number of exchanges is unknown.
 TIME_FACTOR_RANGE = (0.4, 4.0)
-#: Maximum number of initial inputs for the exchange algorithm.
+#: Maximum number of initial inputs from which the exchange algorithm is started.
 MAX_EXCHANGE_STARTS = 4
-#: Periods of the reference square wave: five, as in the ten-second runs of the paper.
+#: Number of periods of the square wave for comparison: five, as in the ten-second runs of the paper.
 REFERENCE_SQUARE_PERIODS = 5
-#: Maximum output standard deviation due to parameter uncertainty, relative to the output's RMS value.
+#: Maximum standard deviation of an output due to parameter uncertainty, relative to the RMS value of the output.
 MAX_RELATIVE_UNCERTAINTY = 0.5
 
 
 @dataclass(frozen=True)
 class DesignTask:
-    """Arguments of an input design after validation."""
+    """Arguments of an input design after validation.
+
+    `step` is the sampling interval [s], `rows` the number of samples, and `period` that of the square wave for
+    comparison, in samples.
+    """
 
     fit: ModelFit
     step: float
@@ -161,36 +171,37 @@ def design_input(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> DesignedInput:
-    """Design the input from which the parameters of a model are identified most precisely, within given limits.
+    """Design the input with which the parameters of a model are identified most precisely, within given limits.
 
     The Fisher information of an input follows from the exact sensitivities of the outputs to the parameters, divided by
     the noise standard deviation. A convex problem gives the optimal periodic spectrum, with a certificate of its
-    optimality. A multisine with this spectrum, sweeps, square waves and random switching sequences are initial inputs
-    of an exchange algorithm over piecewise-constant levels, which stops at a local optimum. The design takes seconds to
-    a minute, and more for more samples and parameters.
+    optimality. An exchange algorithm then improves piecewise-constant inputs up to a local optimum. It is started from
+    a multisine with this spectrum, sweeps, square waves and random binary signals. The design takes seconds to a
+    minute, and more for more samples and parameters.
 
     Parameters
     ----------
     model : Identification or Model
-        Identification by output error, or a saved model from one.
+        Identification by output error, or a saved model of such an identification.
     reference_run : Run, optional
-        Run that is admissible for the machine. It gives the defaults of the other arguments, including limits of the
-        outputs. By default the first run of an identification.
+        Run that the machine is known to tolerate. Its duration, sampling interval and largest values are the defaults
+        of `duration`, `step`, `peak` and `limits`. By default the first run of the identification.
     duration, step : float, optional
         Duration and sampling interval of the run [s].
     peak : float or mapping, optional
-        Maximum magnitude of each input.
+        Maximum magnitude of each input, by name or equal for all; by default that of the reference run.
     slew : float or mapping, optional
         Maximum rate of change of each input [unit/s]; by default unlimited.
     limits : mapping, optional
-        Maximum magnitude of outputs by name, in the units of the model; infinite for no limit.
+        Maximum magnitude of each output by name; infinite for no limit. By default the largest deviation from its first
+        value in the reference run.
     parameters : sequence of str, optional
         Names of the parameters of interest; by default all free orders, or all parameters if no order is free.
     criterion : {"D", "E"}, default "D"
-        ``"D"``: smallest volume of the confidence ellipsoid of these parameters. ``"E"``: smallest length of its
-        longest axis, with coefficients relative to their values.
+        ``"D"`` minimizes the volume of the confidence ellipsoid of the parameters of interest, and ``"E"`` the length
+        of its longest axis. For E, coefficients are relative to their values.
     noise : mapping, optional
-        Noise standard deviation of each output; by default that of the fit.
+        Noise standard deviation of each output, by name; by default that of the fit.
     period : float, optional
         Period [s] of the square wave with which the design is compared; by default a fifth of the duration, as in the
         paper.
@@ -202,14 +213,16 @@ def design_input(
     Returns
     -------
     DesignedInput
-        Commands, active constraints, and confidence intervals: of the model now, predicted for the designed input, and
-        predicted for the square wave. ``.save`` writes the commands for a rig.
+        Commands, active constraints, and standard errors: of the model now, predicted for the designed input, and
+        predicted for the square wave. The method ``save`` writes the commands for a rig.
 
     Raises
     ------
     ModelError
-        If the model is unstable, has an integrator without a limit of its output, or has friction, saturations or dead
-        zones; if it is too uncertain; or if an argument is invalid or a limit cannot be met.
+        If the model is unstable, has an integrator without a limit of the output, has friction, saturations or dead
+        zones, or is too uncertain. Also if an argument is invalid or a limit cannot be met.
+    DataError
+        If the reference run lacks an input of the model.
     """
     if progress is not None and not callable(progress):
         raise ModelError(f"progress is a {type(progress).__name__}; give a function of (done, total)")
@@ -244,7 +257,7 @@ def design_input(
         raise ModelError(
             f"{setting('criterion')} {short_repr(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)"
         )
-    # The standard error of an order counts as such, that of any other parameter relative to its value.
+    # Standard errors of orders are absolute in the criterion, those of other parameters are relative to their values.
     units = [1.0 if fit.names[i] in fit.problem.orders else abs(fit.values[i]) or 1.0 for i in at]
     goal = Criterion(criterion, at, tuple(units))
     seed = check_seed(seed)
@@ -294,9 +307,9 @@ def design_input(
 def _design_candidates(
     task: DesignTask, sensitivities: Sensitivities, spectrum: Spectrum, course: ShareTracker
 ) -> list[Design]:
-    """Return all candidate inputs, best first.
+    """Return all candidate inputs, best first: initial inputs, and results of the exchange algorithm from the best.
 
-    They are the initial inputs, and the results of the exchange algorithm from the best of them.
+    Raise ModelError if no input makes the parameters of interest identifiable.
     """
     fit, bounds, goal, rows = task.fit, task.bounds, task.criterion, task.rows - 1
     ended = stop_flag()
@@ -316,7 +329,7 @@ def _design_candidates(
             f"no input of this length makes {', '.join(fit.names[i] for i in goal.indices)} separately identifiable "
             "from the other parameters; name fewer parameters, or make the run longer"
         )
-    # The best design of each kind is kept, because kinds lead to different local optima.
+    # The best initial input of each kind is used, because different kinds lead to different local optima.
     kinds: dict[str, Design] = {}
     for design in sorted(feasible, key=lambda d: -d.score):
         kinds.setdefault(design.name.split(",")[0].split(" by")[0], design)
@@ -345,7 +358,10 @@ def _bounds_of(
     slew: float | Mapping[str, float] | None,
     limits: Mapping[str, float] | None,
 ) -> Bounds:
-    """Return the limits of the machine; a run gives the defaults of peaks and outputs."""
+    """Return the limits of inputs, slew rates and outputs, with defaults of peaks and outputs from a reference run.
+
+    Raise ModelError if a limit is missing or invalid.
+    """
     peaks, swings = None, dict.fromkeys(fit.outputs, math.inf)
     if reference_run is not None:
         peaks = _largest_values(reference_run, fit.inputs, from_start=False)
@@ -362,7 +378,10 @@ def _bounds_of(
 
 
 def _check_slew(bounds: Bounds, step: float, rows: int) -> None:
-    """Raise if a change from one peak to the other takes more than a quarter of the run."""
+    """Raise ModelError if a change of an input from one peak to the opposite takes over a quarter of the run.
+
+    `step` is the sampling interval [s], and `rows` the number of samples.
+    """
     ramp = bounds.ramp_samples(step)
     if ramp > rows // 4:
         slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
@@ -374,7 +393,10 @@ def _check_slew(bounds: Bounds, step: float, rows: int) -> None:
 
 
 def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, ...]:
-    """Return a finding if the model lacks dynamics, or if the noise of its fit is not white."""
+    """Return findings on why predictions may be wrong: missing dynamics, or else noise that is not white.
+
+    Noise that is not white is not reported if the user gave the noise standard deviations (`noise_given`).
+    """
     findings = () if model.estimate is None else model.estimate.findings
     missing = [f for f in findings if f.code in LEFT_OUT_CODES]
     doubt = min(missing, key=lambda f: LEFT_OUT_CODES.index(f.code), default=None)
@@ -387,7 +409,7 @@ def _prediction_findings(model: Model, *, noise_given: bool) -> tuple[Finding, .
 
 
 def _check_signals(fit: ModelFit, reference_run: Run | None) -> None:
-    """Raise ModelError if a model has no usable input, or the reference run lacks its inputs."""
+    """Raise ModelError if a model has no input or a filtered one, and DataError if the reference run lacks an input."""
     if not fit.inputs:
         raise ModelError("the model has no input to design; give a model with an input")
     if fit.problem.structure.all_filtered:
@@ -415,9 +437,9 @@ def _positive(name: str, value: object, what: str) -> float:
 
 
 def _largest_values(run: Run, names: Sequence[str], *, from_start: bool) -> dict[str, float]:
-    """Return the largest absolute values of signals of a run by name; missing and constant signals are omitted.
+    """Return the largest absolute value of each signal of a run by name; missing and zero signals are omitted.
 
-    With ``from_start`` they are measured from the first value of each signal.
+    With `from_start`, it is the largest absolute deviation from the first value of the signal.
     """
     out = {}
     for name in names:
@@ -433,7 +455,10 @@ def _largest_values(run: Run, names: Sequence[str], *, from_start: bool) -> dict
 
 
 def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int, ...]:
-    """Return the indices of the parameters of interest; raise ModelError for an unknown name."""
+    """Return the indices of the parameters of interest; by default all free orders, or all parameters without orders.
+
+    Raise ModelError if a name is unknown or repeated.
+    """
     if isinstance(names, str):
         names = [names]
     if names is None:
@@ -456,7 +481,7 @@ def _parameter_indices(fit: ModelFit, names: Sequence[str] | None) -> tuple[int,
 
 
 def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
-    """Raise ModelError if a model is unstable, or has an integrator without a limit of its output."""
+    """Raise ModelError if a model is unstable, or has an integrator while an output has no limit."""
     poles = stability(fit.model)
     if poles.unstable_poles != 0 or poles.on_axis:
         raise ModelError(
@@ -473,7 +498,11 @@ def _check_stable(fit: ModelFit, bounds: Bounds) -> None:
 
 
 def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
-    """Raise ModelError if the model is so uncertain that an input optimal for it may be poor for the machine."""
+    """Raise ModelError if the model is so uncertain that an input optimal for it may be poor for the machine.
+
+    This is so if an order has a large standard error, or if parameter uncertainty has a large effect on an output.
+    `step` [s] and `length` [s] are the sampling interval and the duration of the run.
+    """
     spread = fit.covariance
     errors = np.sqrt(np.diag(spread))
     vague = [
@@ -499,14 +528,17 @@ def _check_uncertainty(fit: ModelFit, step: float, length: float) -> None:
 
 
 def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | None) -> None:
-    """Raise ModelError for an uncertain model, with a recommended first experiment."""
+    """Raise ModelError for a model that is too uncertain, with the reason `why` and a recommended first experiment.
+
+    `times` are (sampling interval, duration) of the run [s], or None.
+    """
     low, high = (0.1, 10.0) if times is None else (1.0 / times[1], 0.1 / times[0])
     try:
         own = [abs(m.pole) / (2 * math.pi) for m in modes(fit.model)]
         if own:
             low, high = max(low, min(own) / 10), min(high, 10 * max(own))
     except FtlmError:
-        # Without modes of the model the band of the run is used.
+        # If the modes of the model are unknown, the band of the run is used.
         pass
     band = f"{low:.2g}:{max(high, 2 * low):.2g}"
     raise ModelError(
@@ -517,7 +549,10 @@ def _raise_too_uncertain(fit: ModelFit, why: str, times: tuple[float, float] | N
 
 
 def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floats) -> float:
-    """Return the factor that keeps outputs within their limits over the confidence intervals of the model."""
+    """Return the factor, at most 1, for commands with which outputs meet their limits within 95 % confidence intervals.
+
+    The intervals are due to the uncertainty of the parameters.
+    """
     outputs, slopes = sensitivities.outputs(commands), sensitivities.derivatives(commands)
     spread = np.einsum("pot,pq,qot->ot", slopes, task.fit.covariance, slopes)
     noise = np.array([task.fit.noise[o] for o in task.fit.outputs])[:, None]
@@ -526,7 +561,11 @@ def _robust_scale(task: DesignTask, sensitivities: Sensitivities, commands: Floa
 
 
 def _errors(fit: ModelFit, reference: Run, run: Run) -> dict[str, Floats]:
-    """Return standard errors of the model, and those predicted for fits to the square wave and to the designed run."""
+    """Return the standard errors of the parameters, one array per case "now", "square", "designed" and "both".
+
+    They are those of the model, those predicted for fits to the square wave (`reference`) and to the designed run
+    (`run`), and those for the designed run together with the estimation runs.
+    """
     now, new = fit.covariance, fit.predicted_covariance(run)
     size = np.sqrt(np.diag(now))
     covariance = np.linalg.inv(now / np.outer(size, size)) + np.linalg.inv(new / np.outer(size, size))
@@ -549,7 +588,7 @@ def _predicted_extremes(run: Run, bounds: Bounds) -> tuple[PredictedExtreme, ...
 
 
 def _shape_text(best: Design, run: Run, task: DesignTask) -> str:
-    """Return text on the shape of the designed input."""
+    """Return text that describes the shape of the designed input: name of the initial input, number of switches."""
     if not best.name.endswith("exchanged"):
         return best.name
     first = next(iter(task.fit.inputs))

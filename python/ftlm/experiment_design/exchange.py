@@ -1,6 +1,6 @@
-"""Exchange algorithm for piecewise-constant inputs, which changes one or two holds at a time.
+"""Exchange algorithm for piecewise-constant inputs.
 
-A hold is an interval of constant input.
+A hold is an interval of constant input. An exchange changes the level of one hold, or of two holds by opposite amounts.
 """
 
 from __future__ import annotations
@@ -15,28 +15,29 @@ from numpy.typing import NDArray
 from ftlm.experiment_design.problem import Bounds, Criterion, Sensitivities
 from ftlm.utils.validation import Complex, Floats
 
-#: Levels of a command, as fractions of its peak.
+#: Levels that an input may have, as fractions of its peak.
 COMMAND_LEVELS = (-1.0, 0.0, 1.0)
-#: Changes of a level, and distances in holds at which a second hold may change by the opposite amount (0: none).
+#: Changes of the level of a hold that are tried, and distances [holds] of a second hold that changes by the opposite
+#: amount. A distance of 0 stands for an exchange of one hold.
 LEVEL_CHANGES, PAIR_GAPS_HOLDS = (-2.0, -1.0, 1.0, 2.0), (1, 2, 4, 8)
-#: Maximum number of exchanges with the largest linearized gain that are evaluated exactly.
+#: Maximum number of candidate exchanges, those with the largest linearized gain, that are evaluated exactly.
 MAX_EVALUATED_EXCHANGES = 200
-#: Maximum number of exchanges, and minimum gain in score of one.
+#: Maximum number of exchanges, and minimum gain in score of an exchange.
 MAX_EXCHANGES, MIN_SCORE_GAIN = 400, 1e-7
 
 
 @dataclass(frozen=True)
 class Design:
-    """Commands of a designed input and their score.
+    """Candidate input of an input design, and its score.
 
     Parameters
     ----------
     name
-        Origin of the commands, such as "sweep".
+        Description of the input, such as "multisine".
     commands
-        Commands of shape (inputs, rows), within all limits.
+        Commands, shape (inputs, rows), within all limits.
     score
-        Value of the criterion; higher is better.
+        Score of the optimality criterion; higher is better.
     """
 
     name: str
@@ -47,7 +48,7 @@ class Design:
 def scaled_design(
     name: str, commands: Floats, sensitivities: Sensitivities, criterion: Criterion, bounds: Bounds
 ) -> Design:
-    """Return commands scaled down until all limits hold, with their score."""
+    """Return a candidate input: commands, shape (inputs, rows), scaled down to meet all limits, with their score."""
     scale = bounds.scale(commands, sensitivities.outputs(commands))
     score = float(criterion.score(sensitivities.information(sensitivities.derivatives(commands)))) + math.log(scale)
     return Design(name, scale * commands, score)
@@ -61,13 +62,13 @@ def exchange_holds(
     bounds: Bounds,
     stopped: Callable[[], None] = lambda: None,
 ) -> Design:
-    """Improve a piecewise-constant input by exchanges of holds, one or two at a time, and return the design.
+    """Return the candidate input to which the exchange algorithm improves the candidate input `begin`.
 
-    Source: Fedorov, Theory of Optimal Experiments, 1972. `hold` is the length of a hold in samples.
-
-    The Fisher information is quadratic in the commands, so convolutions give its change by every exchange exactly. The
-    best feasible exchange is made until no exchange improves the score. The result is a local optimum with respect to
-    changes of one hold, and to opposite changes of two neighboring holds.
+    A hold is an interval of `hold` samples with constant input. First, `begin` is rounded to the levels -1, 0 and 1
+    times the peak. An exchange then changes the level of one hold, or of two holds by opposite amounts. The Fisher
+    information is quadratic in the commands, so convolutions give its change by every exchange exactly. The best
+    feasible exchange is made until none improves the score, which gives a local optimum. `stopped` is called before
+    each exchange and may raise an exception. Source: Fedorov, Theory of Optimal Experiments, 1972.
     """
     inputs, rows = begin.commands.shape
     starts = np.arange(0, rows, hold)
@@ -125,14 +126,17 @@ def exchange_holds(
 
 
 def _log_limit_excess(outputs: Floats, limits: Floats) -> float:
-    """Return the logarithm of the largest ratio of outputs to their limits; 0 if all limits are met."""
+    """Return the logarithm of the largest ratio of an output to its limit; 0 if all limits are met.
+
+    `outputs` has shape (outputs, rows), and `limits` shape (outputs, 1).
+    """
     return math.log(max(1.0, float(np.max(np.abs(outputs) / limits))))
 
 
 def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
-    """Return a mask of the holds that can change by a step.
+    """Return a mask of the holds whose level can change by `step`, shape (holds,).
 
-    The hold `gap` later changes by the opposite amount.
+    With `gap` above 0, the level of the hold `gap` later must also be able to change by -`step`.
     """
     is_feasible: NDArray[np.bool_] = np.abs(level + step) < COMMAND_LEVELS[-1] + 0.5
     if gap:
@@ -143,20 +147,23 @@ def _feasible_starts(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Hold:
-    """Response of the model to one hold of an input at its peak level, with quantities derived from it.
+    """Response of the model to one hold (interval of constant input) of one input at its peak, and derived quantities.
 
     Parameters
     ----------
     starts
-        Sample indices at which holds start.
+        Sample indices at which the holds of a run start, shape (holds,).
     block, response
-        Derivatives by parameters, shape (parameters, outputs, rows), and outputs, both from the start of a hold.
+        Derivatives of the outputs by the parameters, divided by the noise, shape (parameters, outputs, rows), and
+        outputs, shape (outputs, rows). Both begin at the start of the hold.
     spectrum
-        Fourier transform of the derivatives.
+        Fourier transform of `block` along its last axis.
     offsets
-        Projection of the response of a hold onto responses to offsets, by the start of the hold.
+        Inner products of `block`, for each start, with the basis of the responses to offsets, shape (holds, parameters,
+        basis vectors).
     own
-        Information of one hold by its start, and by gap that of one hold minus another that starts one gap later.
+        Fisher information, shape (holds, parameters, parameters), by distance in holds. For distance 0 it is that of
+        one hold for each start. For a larger one it is that of a hold minus another that starts this distance later.
     """
 
     starts: NDArray[np.int64]
@@ -168,7 +175,7 @@ class Hold:
 
     @classmethod
     def of(cls, sensitivities: Sensitivities, place: int, hold: int, starts: NDArray[np.int64], peak: float) -> Hold:
-        """Return the hold of the input with index `place`, of `hold` samples, from the sensitivities."""
+        """Return the response to a hold of `hold` samples of the input with index `place` at its peak value `peak`."""
         block, response = (
             _hold_response(sensitivities.kernels[place], hold) * peak,
             _hold_response(sensitivities.responses[place], hold) * peak,
@@ -194,7 +201,12 @@ class Hold:
     def information_changes(
         self, sensitivities: Sensitivities, derivatives: Floats
     ) -> Iterator[tuple[int, Floats, Floats]]:
-        """Yield, for each gap, the first- and second-order changes of the information by an exchange, by its start."""
+        """Yield (gap, first-order change, second-order change) of the information by exchanges of holds.
+
+        `gap` is the distance in holds of the second hold, 0 for an exchange of one hold. Changes have shape (holds,
+        parameters, parameters). A change of the level by s adds s times the first and s^2 times the second change.
+        `derivatives` are those of the current input.
+        """
         shared = _correlate_at_starts(sensitivities, derivatives, self.spectrum, self.starts)
         if len(sensitivities.nuisance):
             flat = derivatives.reshape(len(derivatives), -1) @ sensitivities.nuisance.T
@@ -208,7 +220,11 @@ class Hold:
             yield gap, pair, own
 
     def apply_exchange(self, series: Floats, at: int, gap: int, step: float, *, of_response: bool) -> Floats:
-        """Return derivatives (or outputs with `of_response`) after an exchange."""
+        """Return derivatives, or with `of_response` outputs, after an exchange.
+
+        `series` are their values before it. The level of the hold with index `at` changes by `step`, and with `gap`
+        above 0, that of the hold `gap` later by -`step`.
+        """
         block, out = self.response if of_response else self.block, series.copy()
         for begins, size in ((self.starts[at], step), *(((self.starts[at + gap], -step),) if gap else ())):
             out[..., begins:] += size * block[..., : block.shape[-1] - begins]
@@ -216,20 +232,23 @@ class Hold:
 
 
 def _nearest_level(values: Floats) -> Floats:
-    """Return values rounded to the nearest level; midpoints are rounded away from zero."""
+    """Return values rounded to the nearest of the levels -1, 0 and 1; midpoints are rounded away from zero."""
     levels = np.array(COMMAND_LEVELS)
     return np.asarray(levels[np.argmin(np.abs(values[..., None] * (1 + 1e-9) - levels), axis=-1)])
 
 
 def _hold_response(kernel: Floats, hold: int) -> Floats:
-    """Return the response to a hold, computed from the response to one sample."""
+    """Return the response to a constant input over `hold` samples, from that to one sample (last axis: time)."""
     total = np.cumsum(kernel, axis=-1)
     total[..., hold:] -= total[..., :-hold].copy()
     return total
 
 
 def _inner_products(sensitivities: Sensitivities, one: Floats, other: Floats, starts: NDArray[np.int64]) -> Floats:
-    """Return, for each start, the inner product of two responses that both begin there and end with the run."""
+    """Return the inner products of two responses that both begin at the same start and end with the run.
+
+    The responses have shapes (p, outputs, rows) and (q, outputs, rows), the result (starts, p, q).
+    """
     products = np.zeros((len(starts), len(one), len(other)))
     for p, row in enumerate(one):
         total = np.cumsum(np.einsum("ot,qot->qt", row, other), axis=-1)
@@ -240,7 +259,11 @@ def _inner_products(sensitivities: Sensitivities, one: Floats, other: Floats, st
 def _correlate_at_starts(
     sensitivities: Sensitivities, series: Floats, spectrum: Complex, starts: NDArray[np.int64]
 ) -> Floats:
-    """Return inner products of series with holds that start at given samples, shape (starts, parameters, series)."""
+    """Return inner products of series with the responses to holds that start at given samples.
+
+    `series` has shape (series, outputs, rows), and `spectrum` is the Fourier transform of the response to a hold. The
+    result has shape (starts, parameters, series).
+    """
     out = np.zeros((len(starts), spectrum.shape[0], len(series)))
     for place, one in enumerate(np.fft.rfft(series, sensitivities.length)):
         product = np.einsum("of,pof->pf", one, np.conj(spectrum))

@@ -1,4 +1,4 @@
-"""Problem of an input design: limits, criterion, and sensitivities of the outputs to the parameters."""
+"""Input-design problem: limits of signals, optimality criterion, and sensitivities of outputs to parameters."""
 
 from __future__ import annotations
 
@@ -24,26 +24,28 @@ from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.validation import Complex, Floats, nearest, real_number, short_repr
 
 Kind = Literal["D", "E"]
-#: Exponent of Kiefer's mean, the smooth substitute of the widest axis: within s^(1/16) of it for s parameters.
+#: Exponent of Kiefer's mean, which replaces the longest axis by a smooth function. For s parameters it is within a
+#: factor of s^(1/16) of the longest axis.
 KIEFER_MEAN_EXPONENT = 16
-#: Determinant of the information, scaled to a unit diagonal, below which it is numerically singular.
+#: Limit of the determinant of an information matrix, scaled to a unit diagonal, for numerical singularity.
 MIN_SCALED_DETERMINANT = 1e-28
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """Optimality criterion: logarithm of the precision of the parameters of interest.
+    """Optimality criterion of an input: score, higher is better, of its Fisher information matrix.
 
-    Twice the input amplitude adds ln 2.
+    The score is minus the logarithm of a size of the confidence ellipsoid of the parameters of interest. Twice the
+    input amplitude adds ln 2.
 
     Parameters
     ----------
     kind
-        ``"D"``: geometric mean of the axes of the confidence ellipsoid. ``"E"``: its longest axis.
+        Size of the ellipsoid. ``"D"``: geometric mean of its axes. ``"E"``: its longest axis.
     indices
-        Indices of the parameters of interest.
+        Indices of the parameters of interest among all p free parameters.
     units
-        Scale of each parameter of interest.
+        Scale of each parameter of interest, by which its standard error is divided.
     """
 
     kind: Kind
@@ -56,7 +58,10 @@ class Criterion:
         return len(self.indices)
 
     def score(self, information: Floats) -> Floats:
-        """Return the score of information matrices of shape (…, p, p); -inf if the parameters are not identifiable."""
+        """Return the scores, shape (…), of information matrices, shape (…, p, p).
+
+        A score is -inf if the parameters of interest are not identifiable.
+        """
         spread = self._inverse(information)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == "D":
@@ -68,9 +73,10 @@ class Criterion:
         return np.where(np.isfinite(spread[..., 0, 0]), scores, -np.inf)
 
     def smooth_score(self, information: Floats) -> float:
-        """Return a differentiable upper bound of the score.
+        """Return a differentiable upper bound of the score of an information matrix, shape (p, p).
 
-        For criterion E, Kiefer's mean over all axes of the confidence ellipsoid replaces the longest axis.
+        For criterion E, Kiefer's mean over all axes of the confidence ellipsoid replaces the longest axis. For D, it is
+        the score itself.
         """
         if self.kind == "D":
             return float(self.score(information))
@@ -83,7 +89,10 @@ class Criterion:
         )
 
     def gradient(self, information: Floats) -> Floats:
-        """Return the gradient of twice the smooth score, shape (p, p); its inner product with the information is 1."""
+        """Return the gradient of twice the smooth score with respect to the information matrix, shape (p, p).
+
+        Its inner product with the information matrix is 1.
+        """
         p = len(information)
         size = np.sqrt(np.diag(information))
         whole = np.linalg.inv(information / np.outer(size, size)) / np.outer(size, size)
@@ -98,7 +107,10 @@ class Criterion:
         return np.asarray((lever * weights) @ lever.T).reshape(p, p)
 
     def _inverse(self, information: Floats) -> Floats:
-        """Return the covariance of the scaled parameters of interest; infinite if the information is singular."""
+        """Return the covariance matrix of the scaled parameters of interest for each information matrix (…, p, p).
+
+        All its elements are infinite if the information matrix is singular.
+        """
         diagonal = np.diagonal(information, axis1=-2, axis2=-1)
         is_positive = np.all(diagonal > 0, axis=-1)
         size = np.sqrt(np.where(is_positive[..., None], diagonal, 1.0))
@@ -113,7 +125,7 @@ class Criterion:
         return np.where(good[..., None, None], inverse, np.inf)
 
 
-#: Range of a finite limit. Beyond it squares of ratios overflow.
+#: Range of finite limits of signals. Outside it, squares of ratios overflow.
 LIMIT_RANGE = (1e-50, 1e50)
 
 
@@ -136,13 +148,16 @@ class Bounds:
     output_limits: Mapping[str, float]
 
     def ramp_samples(self, step: float) -> int:
-        """Return the number of samples that a change from one peak to the opposite one takes at the maximum rates."""
+        """Return the maximum over inputs of the number of samples from one peak to the opposite at the maximum rate.
+
+        It is at least 1. `step` is the sampling interval [s].
+        """
         return max(1, *(math.ceil(min(2 * p / self.slews[n] / step, 1e18) - 1e-9) for n, p in self.peaks.items()))
 
     def scale(self, commands: Floats, outputs: Floats) -> float:
-        """Return the factor, at most 1, that keeps commands and outputs within their limits.
+        """Return the largest factor, at most 1, with which scaled commands and outputs meet their limits.
 
-        ``commands`` and ``outputs`` have one row per input and per output, in the order of the limits.
+        `commands` has one row per input and `outputs` one per output, in the order of the limits.
         """
         limits = [*self.output_limits.values(), *self.peaks.values()]
         rows = zip(limits, [*outputs, *commands], strict=True)
@@ -152,12 +167,14 @@ class Bounds:
 def per_signal_values(
     what: str, values: object, names: Sequence[str], default: Mapping[str, float] | None
 ) -> dict[str, float]:
-    """Return one positive number for each name, from a number, a mapping, or the default.
+    """Return one positive number for each of `names`, from a number, a mapping by name, or the default.
+
+    `what` is the argument in error messages.
 
     Raises
     ------
     ModelError
-        If a name is unknown, a value is not positive, or a value without a default is missing.
+        If a name is unknown, a value is not positive or out of range, or a value without a default is missing.
     """
     if isinstance(values, Mapping):
         for name in values:
@@ -192,22 +209,22 @@ def per_signal_values(
     return out
 
 
-#: Relative size below which a direction of the offset responses is rounding error.
+#: Relative singular value below which a direction of the responses to offsets counts as rounding error.
 OFFSET_RANK_TOLERANCE = 1e-10
-#: Relative change at which the step refinement of the simulations terminates.
+#: Relative change of a simulation at which its step refinement terminates.
 SIMULATION_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
 class ModelFit:
-    """Data of a fit that an input design requires: free parameters, their values, and the noise of each output.
+    """Model and results of its fit that an input design requires.
 
     Parameters
     ----------
     model
         Model with simulated coupling, whose outputs depend only on its inputs.
     problem, values
-        Estimation problem of a run that starts at rest, and the values of its free parameters.
+        Estimation problem of a run that starts at rest, and the values of its p free parameters.
     noise
         Noise standard deviation of each output.
     refinement
@@ -222,7 +239,7 @@ class ModelFit:
 
     @classmethod
     def of(cls, model: Model, noise: Mapping[str, float]) -> ModelFit:
-        """Return the data from a model whose file lists its free parameters."""
+        """Return the data from a model that was identified by output error, and noise standard deviations by output."""
         problem, values = problem_of(model)
         whole = replace(model, structure=replace(model.structure, coupling="simulated", initial="rest"))
         return cls(whole, problem, tuple(values), noise, parameter_set_of(model).refinement)
@@ -239,18 +256,21 @@ class ModelFit:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs of the coupled model."""
+        """Names of the inputs of the model: its signals that are not outputs."""
         return tuple(s for s in self.problem.structure.signals if s not in self.outputs)
 
     @property
     def covariance(self) -> Floats:
-        """Covariance matrix of the free parameters, as estimated."""
+        """Covariance matrix of the free parameters in the fit, shape (p, p)."""
         parameters = parameter_set_of(self.model)
         at = [parameters.names.index(n) for n in self.names]
         return np.asarray(parameters.covariance)[np.ix_(at, at)]
 
     def run(self, commands: Floats, step: float, name: str) -> Run:
-        """Return the run that the model simulates for commands of shape (inputs, rows)."""
+        """Return a run with commands, shape (inputs, rows), as inputs, and the simulated outputs of the model.
+
+        `step` is the sampling interval [s], and `name` the name of the run.
+        """
         blank = Run.from_arrays(
             step=step,
             inputs=dict(zip(self.inputs, commands, strict=True)),
@@ -262,10 +282,10 @@ class ModelFit:
         return blank.with_outputs({o: answer[o] for o in self.outputs})
 
     def jacobian(self, run: Run, *, offset: bool = True) -> Floats:
-        """Return output sensitivities of a simulated run over the noise, shape (parameters, outputs * samples).
+        """Return derivatives of the outputs by the parameters, divided by the noise, for a simulated run.
 
-        The core computes them in the same way as for a fit, without the first and the last sample. Responses to
-        offsets, if the model has any, are projected out unless ``offset`` is False.
+        The shape is (parameters, outputs * samples). As in a fit, the first and the last sample are not used. Responses
+        to offsets, if the model has any, are projected out unless `offset` is False.
         """
         problem = self.problem
         if not offset:
@@ -273,9 +293,10 @@ class ModelFit:
         return _derivatives(problem, self.values, run, [1.0 / self.noise[o] for o in self.outputs], self.refinement)
 
     def predicted_covariance(self, run: Run) -> Floats:
-        """Return the covariance that is predicted for a fit to a simulated run alone, from exact derivatives.
+        """Return the covariance matrix (p, p) that is predicted for a fit to a simulated run alone.
 
-        It is the inverse of the Fisher information. If a parameter is not identifiable, all variances are infinite.
+        It is the inverse of the Fisher information from exact derivatives. If a parameter is not identifiable, all
+        variances are infinite.
         """
         rows = self.jacobian(run)
         size = np.linalg.norm(rows, axis=1)
@@ -297,9 +318,9 @@ def _derivatives(problem: FreeProblem, values: tuple[float, ...], run: Run, weig
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """Sensitivities of the outputs to parameters for one zero-order-hold sample of each input.
+    """Derivatives of the outputs by the parameters, in response to one zero-order-hold sample of each input.
 
-    A convolution gives the sensitivities for any input. It is exact, because all equations are linear in their inputs
+    The derivatives for any input follow by convolution. This is exact, because all equations are linear in their inputs
     and start at rest.
 
     Parameters
@@ -307,15 +328,17 @@ class Sensitivities:
     fit
         Model and its fit.
     step, rows
-        Sampling interval of the run [s], and its number of compared samples: all but the last.
+        Sampling interval [s], and number of samples of the run without the last one, which the fit does not use.
     ramp
-        Number of samples over which a change of a command is spread: every input is a moving average over them.
+        Number of samples over which a change of a command is spread by a moving average, to limit its slew rate.
     kernels
-        Derivatives divided by the noise standard deviation, shape (inputs, parameters, outputs, rows).
+        Derivatives for one sample of each input, divided by the noise standard deviation of the output, shape (inputs,
+        parameters, outputs, rows).
     responses
         Outputs for one sample of each input, shape (inputs, outputs, rows).
     nuisance
-        Orthonormal basis of the responses to offsets, shape (basis vectors, outputs · rows).
+        Orthonormal basis of the responses to unknown offsets, divided by the noise, shape (basis vectors, outputs *
+        rows).
     """
 
     fit: ModelFit
@@ -328,10 +351,10 @@ class Sensitivities:
 
     @classmethod
     def of(cls, fit: ModelFit, step: float, rows: int, ramp: int) -> Sensitivities:
-        """Return the sensitivities, from simulations of the response to one sample of each input."""
+        """Return the sensitivities of a fitted model, from one simulation per input; parameters as for the class."""
         kernels, answers, inputs = [], [], len(fit.inputs)
         for k in range(inputs):
-            # The first sample of a run is not compared, so the pulse comes with the second.
+            # A fit does not use the first sample of a run, so the pulse is at the second.
             commands = np.zeros((inputs, rows + 2))
             commands[k, 1 : 1 + ramp] = 1.0 / ramp
             run = fit.run(commands, step, "pulse")
@@ -343,18 +366,18 @@ class Sensitivities:
 
     @cached_property
     def length(self) -> int:
-        """Length of the Fourier transforms, which avoids circular convolution."""
+        """Length of the Fourier transforms [samples], long enough to avoid circular convolution."""
         return fast_length(2 * self.rows)
 
     @cached_property
     def spectra(self) -> tuple[Complex, Complex]:
-        """Fourier transforms of the kernels and of the responses."""
+        """Fourier transforms of `kernels` and of `responses` along their last axis."""
         return np.fft.rfft(self.kernels, self.length), np.fft.rfft(self.responses, self.length)
 
     def derivatives(self, commands: Floats) -> Floats:
-        """Return derivatives of the outputs divided by the noise, shape (parameters, outputs, rows).
+        """Return derivatives of the outputs by the parameters, divided by the noise, shape (parameters, outputs, rows).
 
-        ``commands`` has shape (inputs, rows).
+        `commands` has shape (inputs, rows).
         """
         drive = np.fft.rfft(commands, self.length)
         total = np.einsum("ipof,if->pof", self.spectra[0], drive)
@@ -366,7 +389,10 @@ class Sensitivities:
         return np.asarray(np.fft.irfft(total, self.length)[..., : self.rows])
 
     def information(self, derivatives: Floats) -> Floats:
-        """Return the Fisher information of the free parameters; responses to offsets are projected out."""
+        """Return the Fisher information matrix of the free parameters from `derivatives`, shape (p, p).
+
+        Responses to offsets are projected out.
+        """
         flat = derivatives.reshape(len(derivatives), -1)
         information = flat @ flat.T
         if len(self.nuisance):
@@ -375,7 +401,7 @@ class Sensitivities:
         return np.asarray(information)
 
     def rig_commands(self, commands: Floats) -> Floats:
-        """Return commands for a rig, shape (inputs, rows + 1), with changes as ramps and a last row of zeros."""
+        """Return commands for a rig, shape (inputs, rows + 1): each change is a ramp, and the last sample is zero."""
         total = np.cumsum(commands, axis=1)
         delayed = np.pad(total, ((0, 0), (self.ramp, 0)))[:, : self.rows]
         smooth = commands if self.ramp == 1 else (total - delayed) / self.ramp
@@ -383,7 +409,11 @@ class Sensitivities:
 
 
 def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
-    """Return the responses, divided by the noise, to unknown constants (and ramps) in the equations."""
+    """Return an orthonormal basis of the responses to unknown constants (and ramps) in the equations.
+
+    Responses are divided by the noise standard deviation of the output. The shape is (basis vectors, outputs * rows).
+    Raise ModelError if the kind of offset of the model is unknown.
+    """
     structure = fit.problem.structure
     drives = {"none": 0, "level": 0, "constant": 1, "ramp": 2}.get(structure.offset)
     if drives is None:
@@ -410,12 +440,12 @@ def _offset_responses(fit: ModelFit, step: float, rows: int) -> Floats:
         fit.refinement,
     )
     own = [i for i, n in enumerate(problem.names) if n not in values]
-    # They are identifiable from the second sample on: at the first, a run from rest does not depend on them.
+    # The first sample of a run from rest does not depend on an offset, so the responses start at the second one.
     responses = derivatives[own].reshape(len(own), len(fit.outputs), rows)
     responses = np.pad(responses, ((0, 0), (0, 0), (1, 0)))[..., :rows]
     return orthonormal(responses.reshape(len(own), -1).T, OFFSET_RANK_TOLERANCE).T
 
 
 def fast_length(least: int) -> int:
-    """Return the smallest 2^a, 3·2^a, 5·2^a or 15·2^a that is at least ``least``, a fast length of an FFT."""
+    """Return the smallest number 2^a, 3·2^a, 5·2^a or 15·2^a that is at least `least`, for which an FFT is fast."""
     return min(f << max((least - 1) // f, 0).bit_length() for f in (1, 3, 5, 15))

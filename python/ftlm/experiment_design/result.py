@@ -1,4 +1,4 @@
-"""Result of an input design: the input, its predicted standard errors and its active constraints."""
+"""Result of an input design: designed input, predicted standard errors, and active constraints."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from ftlm.utils.formatting import attributes, finite, format_bound, json_value
 from ftlm.utils.statistics import NORMAL_95
 from ftlm.utils.validation import Floats
 
-#: A limit counts as active from this fraction of it on.
+#: Fraction of a limit from which on the limit counts as an active constraint.
 ACTIVE_LIMIT_FRACTION = 0.98
-#: Maximum number of candidate inputs in the printed text.
+#: Maximum number of candidate inputs that are listed in the printed text.
 MAX_PRINTED_INPUTS = 6
 
 
 @dataclass(frozen=True)
 class PredictedExtreme:
-    """Extreme value predicted for a signal or its rate of change in the designed run, and its limit."""
+    """Largest absolute value that is predicted for a signal or a slew rate in the designed run, and its limit."""
 
     name: str
     largest: float
@@ -35,7 +35,7 @@ class PredictedExtreme:
 
     @property
     def is_active(self) -> bool:
-        """Whether the extreme value reaches its limit, so that the constraint is active."""
+        """Whether the largest value is at least 98 % of its limit, so that the constraint is active."""
         return self.largest >= ACTIVE_LIMIT_FRACTION * self.limit
 
     def __str__(self) -> str:
@@ -50,36 +50,37 @@ class DesignedInput:
     Parameters
     ----------
     run
-        Designed run from rest: commands (zero-order hold) and the simulated response of the model.
+        Designed run from rest: commands (zero-order hold) and simulated outputs of the model.
     reference
-        Run with a square wave of the same length and peaks, for comparison.
+        Simulated run with a square wave of the same duration and peaks, for comparison.
     shape
-        Description of the shape of the input.
+        Text that describes the shape of the input.
     criterion
-        ``"D"`` or ``"E"``.
+        Optimality criterion, ``"D"`` or ``"E"``.
     parameters
         Names of the parameters of interest.
     values
         Values of the free parameters of the model by name.
     errors
-        Standard errors of the free parameters by case. ``"now"``: intervals of the model. ``"square"`` and
-        ``"designed"``: predicted for a fit to the square wave or to the designed run alone. ``"both"``: predicted for a
-        fit to the designed run together with the estimation runs.
+        Standard errors of the free parameters by case and name. ``"now"``: those of the model. ``"square"`` and
+        ``"designed"``: predicted for a fit to the square wave alone, or to the designed run alone. ``"both"``:
+        predicted for a fit to the designed run together with the estimation runs.
     gain
         Product of the interval widths of all parameters of interest with the square wave, divided by this product with
         the designed input.
     gains
-        Similar ratio for every candidate input, best first, in the measure of the criterion: for D the volume of the
-        confidence ellipsoid, for E its longest axis to the power of the number of parameters.
+        (name, gain) of every candidate input, best first. The gain is the size of the confidence ellipsoid with the
+        square wave, divided by that with the candidate. For D the size is the volume, and for E the longest axis to the
+        power of the number of parameters of interest.
     predicted_extremes
-        Extremes of inputs, slew rates and outputs, with their limits.
+        Largest absolute values of inputs, slew rates and outputs in the designed run, with their limits.
     spectrum
         Optimal spectrum of a periodic input in steady state under the same limits.
     efficiency
-        Precision of the designed input, divided by the maximum precision of a periodic input in steady state under the
-        limits. The start from rest adds information, so the ratio may exceed 1.
+        Precision with the designed input, divided by the upper bound of the precision with periodic inputs in steady
+        state under the limits. The start from rest adds information, so the ratio may exceed 1.
     findings
-        Findings on reasons why predictions may be wrong.
+        Findings on why predictions may be wrong.
     """
 
     run: Run
@@ -98,12 +99,12 @@ class DesignedInput:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Findings as sentences."""
+        """Texts of the findings, one per finding."""
         return texts(self.findings)
 
     @property
     def input(self) -> dict[str, Floats]:
-        """Commands by input name, one array over the rows of the run each."""
+        """Commands of the designed run, one array (rows,) per input name."""
         return {n: np.array(self.run[n]) for n in self.run.inputs}
 
     @property
@@ -113,13 +114,16 @@ class DesignedInput:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals (low, high) predicted for a fit to the designed run alone, centered at the model's values."""
+        """95 % intervals (low, high) by parameter name, predicted for a fit to the designed run alone.
+
+        They are centered at the values of the model.
+        """
         errors = self.errors["designed"]
         return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in self.values.items()}
 
     @property
     def active_constraints(self) -> tuple[str, ...]:
-        """Names of the signals and rates that reach their limits."""
+        """Names of the signals and slew rates whose predicted largest values reach their limits."""
         return tuple(r.name for r in self.predicted_extremes if r.is_active)
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -130,17 +134,17 @@ class DesignedInput:
         path
             File to write.
         force
-            Overwrite a file that exists.
+            Whether to overwrite an existing file.
 
         Raises
         ------
         DataError
-            If the file exists and ``force`` is False, or it cannot be written.
+            If the file exists and `force` is False, or it cannot be written.
         """
         self.run.to_csv(path, force=force)
 
     def to_frame(self) -> Any:
-        """Return a pandas DataFrame of the parameters: value, current standard error, and predicted standard errors."""
+        """Return a pandas DataFrame: one row per parameter, columns for its value and its standard error by case."""
         rows = [
             {"parameter": n, "value": v, **{kind: errors[n] for kind, errors in self.errors.items()}}
             for n, v in self.values.items()

@@ -1,4 +1,4 @@
-"""Optimal spectrum of a periodic input, a convex problem whose solution the equivalence theorem certifies."""
+"""Optimal spectrum of a periodic input: a convex problem, whose optimality the equivalence theorem certifies."""
 
 from __future__ import annotations
 
@@ -13,29 +13,32 @@ from ftlm.experiment_design.problem import Bounds, Criterion, ModelFit
 from ftlm.model.model import Model
 from ftlm.utils.validation import Complex, Floats
 
-#: Maximum number of lines of a spectrum. Information changes little between neighboring lines.
+#: Maximum number of lines of a spectrum. More are not needed, because neighboring lines give similar information.
 MAX_SPECTRAL_LINES = 240
-#: Highest line, as a fraction of the sampling frequency.
+#: Highest frequency of a line, as a fraction of the sampling frequency.
 MAX_FREQUENCY_RATIO = 0.25
-#: Maximum number of weight iterations at fixed prices of the limits, and of price updates.
+#: Maximum number of iterations of the weights at fixed prices (dual variables of the limits), and of price updates.
 MAX_WEIGHT_ITERATIONS, MAX_PRICE_ITERATIONS = 60, 40
-#: Relative gap in precision at which a design counts as optimal.
+#: Relative distance in precision from the optimum at which a spectrum counts as optimal.
 OPTIMALITY_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class SpectralLines:
-    """Fisher information, and share of each limit that is used, per unit of power at each spectral line.
+    """Fisher information of each spectral line per unit of power, and fraction of each squared limit that it uses.
+
+    A point is one line of one input. The points of the first input come first. Unit power means that the mean square
+    of the input equals its squared peak.
 
     Parameters
     ----------
     frequencies
-        Frequencies of the lines [Hz].
+        Frequency of each point [Hz], shape (points,).
     information
-        Fisher information, shape (points, parameters, parameters). Points are the lines of the first input, then of the
-        next input, each with a mean square equal to the squared peak.
+        Fisher information of each point at unit power, shape (points, parameters, parameters).
     costs
-        Fraction of each squared limit that a point uses, shape (limits, points); limits of inputs come first.
+        Mean square of each input and output at unit power of a point, divided by the squared limit of the signal,
+        shape (limits, points). Limits of inputs come first.
     """
 
     frequencies: Floats
@@ -45,18 +48,19 @@ class SpectralLines:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Optimal distribution of power over the spectral lines of the inputs.
+    """Optimal distribution of power over the spectral lines of all inputs.
 
     Parameters
     ----------
     lines
         Spectral lines of all inputs.
     power
-        Mean square of each point, relative to the squared peak of its input; within all limits.
+        Mean square of the input at each point (line of an input), relative to the squared peak of the input, shape
+        (points,). All limits are met.
     score
-        Value of the criterion.
+        Score of the optimality criterion; -inf if the parameters are not identifiable.
     bound
-        Upper bound of the criterion over all periodic inputs within the limits.
+        Upper bound of the score over all periodic inputs within the limits.
     """
 
     lines: SpectralLines
@@ -66,12 +70,16 @@ class Spectrum:
 
     @property
     def gap(self) -> float:
-        """Upper bound of the relative gain in precision that any other spectrum can have."""
+        """Upper bound of the relative gain in precision that another spectrum can have."""
         return math.expm1(self.bound - self.score)
 
 
 def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> SpectralLines:
-    """Return the spectral lines of a run of one period, distributed among inputs so that no two share a line."""
+    """Return the spectral lines of a periodic input whose period is the run of `rows` samples.
+
+    The lines are distributed among the inputs such that no two inputs share a line. `step` is the sampling interval
+    [s].
+    """
     inputs = fit.inputs
     most = max(int(MAX_FREQUENCY_RATIO * rows), len(inputs) + 1)
     numbers = np.unique(np.round(np.geomspace(1, most, MAX_SPECTRAL_LINES * 4)).astype(np.int64))
@@ -99,9 +107,10 @@ def spectral_lines(fit: ModelFit, bounds: Bounds, step: float, rows: int) -> Spe
 
 
 def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Complex, Complex]:
-    """Return the frequency responses to zero-order-hold inputs, and their derivatives by parameters.
+    """Return derivatives of the frequency responses to zero-order-hold inputs by the parameters, and the responses.
 
-    The derivatives come first and have shape (outputs, inputs, W, parameters).
+    Derivatives have shape (outputs, inputs, W, parameters), and responses shape (outputs, inputs, W). `w` are the
+    frequencies [rad/s], and `step` is the sampling interval [s].
     """
     hold_response = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
     gains = frequency_response(fit.model, w)
@@ -109,7 +118,7 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
     own = replace(fit.model, structure=replace(fit.model.structure, coupling=coupling))
     _, coefficients, _ = fit.problem.split(fit.values)
     chain = fit.problem.model_parameter_jacobian(coefficients)
-    # The other outputs in an equation are simulated or measured, depending on the coupling.
+    # With measured coupling, the other outputs in an equation are inputs of the equation.
     drives = (
         gains
         if coupling == "simulated"
@@ -127,9 +136,10 @@ def _response_sensitivities(fit: ModelFit, w: Floats, step: float) -> tuple[Comp
 
 
 def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, signals: Sequence[str]) -> Complex:
-    """Return the frequency responses of the outputs to the inputs, shape (outputs, inputs, frequencies).
+    """Return the frequency responses of the outputs to the inputs at w [rad/s], shape (outputs, inputs, W).
 
-    With measured coupling, other `signals` enter the equations; ``drives`` are their responses to the inputs.
+    With measured coupling, an equation also has other outputs as inputs. `drives` are then the responses of all
+    `signals` to the inputs, shape (signals, inputs, W).
     """
     if coupling == "simulated":
         return frequency_response(model, w)
@@ -141,12 +151,15 @@ def _output_responses(model: Model, w: Floats, coupling: str, drives: Complex, s
 
 
 def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
-    """Return the spectrum with the optimal power of each line under all limits.
+    """Return the spectrum whose powers at the lines maximize the criterion under all limits.
 
     Each limit has a dual variable (price). With fixed prices, the problem is an optimization of weights that sum to
-    one, solved by Titterington's multiplicative algorithm (Silvey, Titterington & Torsney, 1978). For any prices, its
-    optimum is an upper bound of the original problem. The equivalence theorem of Kiefer & Wolfowitz bounds the distance
-    of a design from this optimum. Prices are adapted to the use of the limits.
+    one. It is solved by Titterington's multiplicative algorithm (Silvey, Titterington & Torsney, 1978). For any prices,
+    its optimum is an upper bound of the original problem. The equivalence theorem of Kiefer & Wolfowitz bounds the
+    distance of the weights from this optimum. After each solution, the price of a limit is increased if much of the
+    limit is used, and decreased otherwise.
+
+    If the parameters are not identifiable, the powers are zero and the score is -inf.
     """
     limits, points = lines.costs.shape
     price = np.full(limits, 1.0 / limits)
@@ -183,9 +196,9 @@ def best_spectrum(lines: SpectralLines, criterion: Criterion) -> Spectrum:
 
 
 def _gain_per_point(weights: Floats, information: Floats, criterion: Criterion) -> Floats | None:
-    """Return the derivative of the criterion with respect to the power of each point; None if not identifiable.
+    """Return the derivative of twice the criterion with respect to the weight of each point, shape (points,).
 
-    Its weighted mean is 1.
+    Its mean, weighted with `weights`, is 1. None if the parameters are not identifiable.
     """
     total = np.tensordot(weights, information, 1)
     if not np.isfinite(criterion.score(total)):

@@ -1,1 +1,1 @@
-"""Order search: exhaustive search over a grid, checkpoints, executors, certificates."""
+"""Order search: exhaustive search for orders on a grid, with checkpoints, executors and certificates."""

@@ -1,6 +1,7 @@
 """Batches of an order search: evaluation in this process or on an executor, and checkpoints.
 
-A round is a group of candidates of one equation that the core evaluates together.
+A batch has candidates of a coupled search, or rounds. A round is a fixed group of candidates of one equation that the
+core evaluates together.
 """
 
 from __future__ import annotations
@@ -52,7 +53,11 @@ ProgressCallback = Callable[[int, int, int], None]
 
 @dataclass(frozen=True)
 class SearchProblem(ABC, Generic[Table]):
-    """Data that all batches of an order search share, with the functions of the core that evaluate them."""
+    """Data shared by all batches of an order search, and the functions of the Rust core that evaluate candidates.
+
+    `runs` are the block-pulse records as (pulse width [s], means, series of the sensor filter or None). `inputs` states
+    for each signal whether it is an input.
+    """
 
     runs: tuple[CoreRecord, ...]
     inputs: list[bool]
@@ -63,23 +68,23 @@ class SearchProblem(ABC, Generic[Table]):
     @property
     @abstractmethod
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core after the records."""
+        """Arguments of the search functions of the Rust core that follow the block-pulse records."""
 
     def core(self, *more: Any) -> tuple[Any, ...]:
-        """Return all arguments of the core, with `more` at the end."""
+        """Return the arguments of a search function of the Rust core: records, `core_arguments`, and then `more`."""
         return list(self.runs), *self.core_arguments, *more
 
     @abstractmethod
     def search(self, progress: ProgressCallback | None) -> Table:
-        """Run the whole search in this process, and return its table."""
+        """Run the whole search in this process, and return its result table."""
 
     @abstractmethod
     def build_evaluator(self) -> _core.OrderSearch | _core.StageSearch:
-        """Return the core's evaluator, which all blocks of the search share."""
+        """Return an object of the Rust core that evaluates blocks of candidates; one serves all blocks of a search."""
 
     @property
     def key(self) -> str:
-        """Digest that identifies the search among several searches of a worker."""
+        """Hexadecimal digest of records and arguments, which identifies the search in the cache of a worker process."""
         digest = hashlib.blake2b(digest_size=16)
         for step, means, sensor in self.runs:
             digest.update(msgspec.msgpack.encode((step, means.shape, sensor is None)))
@@ -91,26 +96,33 @@ class SearchProblem(ABC, Generic[Table]):
 
 @dataclass(frozen=True)
 class EquationProblem(SearchProblem["_core._Found"]):
-    """Order search of one equation: output, grid values of the highest order, and grid values of each term's order."""
+    """Order search of one equation, in the form that the Rust core takes.
+
+    `orders` is (output index, grid values of alpha, terms). A term is (signal index, grid values of its order, whether
+    coefficient and order are free). `fixed` is the fixed coefficient of each term, or None if it is estimated.
+    """
 
     orders: tuple[int, list[float], list[tuple[int, list[float], bool]]]
     fixed: list[float | None]
 
     @property
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core after the records."""
+        """Arguments of the search functions of the Rust core that follow the block-pulse records."""
         return self.orders, self.inputs, self.fixed, self.initial, self.settings.core_arguments(self.threads)
 
     def search(self, progress: ProgressCallback | None) -> _core._Found:
-        """Run the whole search in this process, and return its table."""
+        """Run the whole search in this process, and return its result table."""
         return _core.search(*self.core(progress))
 
     def build_evaluator(self) -> _core.OrderSearch:
-        """Return the core's evaluator, which all rounds share."""
+        """Return an object of the Rust core that evaluates candidates of one equation; one serves the whole search."""
         return _core.OrderSearch(*self.core())
 
     def plan(self) -> tuple[int, list[int]]:
-        """Return (number of candidates, end of each batch)."""
+        """Return the number of candidates, and the exclusive end of each batch, counted in rounds.
+
+        A round is a fixed group of candidates that are evaluated together.
+        """
         return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core_arguments(self.threads))
 
     @property
@@ -119,14 +131,19 @@ class EquationProblem(SearchProblem["_core._Found"]):
         return sum(int(means.shape[1]) for _, means, _ in self.runs)
 
     def join(self, parts: list[Part]) -> _core._Found:
-        """Return the table of the search from the results of all rounds."""
+        """Return the result table of the search, joined from the partial results of all its blocks."""
         settings = self.settings.core_arguments(self.threads)
         return _core.search_join(self.orders, self.inputs, self.initial, settings, self.samples, parts)
 
 
 @dataclass(frozen=True)
 class CoupledProblem(SearchProblem["_core._FoundStage"]):
-    """Order search of coupled equations: grid values of the free orders, the order law, and a scale for each score."""
+    """Order search of coupled equations under an order law, in the form that the Rust core takes.
+
+    `axes` are the grid values of each free order. `laws` and `fixed` have one entry per equation. An entry of `laws` is
+    (output index, law of alpha, terms), and a term is (signal index, law of its order). A law is (constant, weight of
+    each free order). `scales` are the numbers by which the scores of the equations are divided.
+    """
 
     axes: list[list[float]]
     laws: list[tuple[int, tuple[float, list[float]], list[tuple[int, tuple[float, list[float]]]]]]
@@ -135,7 +152,7 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
 
     @property
     def core_arguments(self) -> tuple[Any, ...]:
-        """Arguments of the core after the records."""
+        """Arguments of the search functions of the Rust core that follow the block-pulse records."""
         return (
             self.axes,
             self.laws,
@@ -147,11 +164,14 @@ class CoupledProblem(SearchProblem["_core._FoundStage"]):
         )
 
     def search(self, progress: ProgressCallback | None) -> _core._FoundStage:
-        """Run the whole search in this process, and return its table."""
+        """Run the whole search in this process, and return its result table."""
         return _core.search_stage(*self.core(progress))
 
     def build_evaluator(self, *, keeps_course: bool = False) -> _core.StageSearch:
-        """Return the core's evaluator, which all candidates share; with `keeps_course` it stores the search state."""
+        """Return an object of the Rust core that evaluates candidates.
+
+        With `keeps_course` it also stores the search state and collects the results.
+        """
         return _core.StageSearch(*self.core(keeps_course))
 
 
@@ -178,9 +198,11 @@ def evaluate_rounds(
     start: Any,
     threads: int,
 ) -> tuple[float, Part] | None:
-    """Evaluate rounds `first` to `last` in a worker, and return (seconds, result).
+    """Evaluate rounds (groups of candidates) `first` to `last` - 1 of one equation in a worker process.
 
-    None if the worker has no search with this key in its cache and `work` is None.
+    `seed` is (index, score) of each row found in earlier batches, and `start` a checkpoint to resume from, or None.
+    Return (computing time [s], partial result). Return None if `work` is None and the worker has not cached the search
+    that `key` identifies.
     """
     return _run_cached(
         key, work, lambda search: cast("Part", search.rounds(first, last, seed, start, threads, None, None))
@@ -190,9 +212,10 @@ def evaluate_rounds(
 def evaluate_candidates(
     key: str, work: CoupledProblem | None, spans: list[Span], threads: int
 ) -> tuple[float, Outcomes] | None:
-    """Evaluate candidates of a coupled search in a worker, and return (seconds, outcomes).
+    """Evaluate candidates of a coupled search in a worker process.
 
-    None if the worker has no search with this key in its cache and `work` is None.
+    `spans` are blocks of candidates: (equation, first, exclusive end, limit of the score). Return (computing time [s],
+    outcomes). Return None if `work` is None and the worker has not cached the search that `key` identifies.
     """
     return _run_cached(key, work, lambda search: cast("Outcomes", search.follow(spans, threads, None)))
 
@@ -211,19 +234,31 @@ def _run_cached(key: str, work: SearchProblem[Any] | None, do: Callable[[Any], P
     return time.monotonic() - began, piece
 
 
-#: Target duration of a task: long compared with its transfer, short enough to lose little.
+#: Target duration of a task: long compared with its transfer, and short enough that a lost task costs little.
 TASK_DURATION_S = 2.0
-#: Number of submitted tasks per worker, so that no worker idles.
+#: Number of tasks submitted per worker; more than one, so that no worker waits for work.
 TASKS_PER_WORKER = 2
-#: Maximum number of attempts at a task before the search fails.
+#: Number of failed attempts at one task after which the search fails.
 MAX_ATTEMPTS = 3
-#: Interval at which signals and the checkpoint file are serviced while tasks run.
+#: Maximum duration of one wait for running tasks; Ctrl-C takes effect between two waits.
 POLL_INTERVAL_S = 0.05
 
 
 @dataclass
 class CandidateBlock:
-    """Contiguous block of rounds or candidates to evaluate, from its start or from a checkpoint within it."""
+    """Contiguous block of work: rounds (groups of candidates) of one equation, or candidates of a coupled search.
+
+    Parameters
+    ----------
+    first, last
+        First index and exclusive end.
+    start
+        Checkpoint within the block from which the evaluation is resumed; None to begin at the start.
+    with_problem
+        Whether the search problem is sent with the task, because a worker has not cached it.
+    attempts
+        Number of failed attempts.
+    """
 
     first: int
     last: int
@@ -233,7 +268,7 @@ class CandidateBlock:
 
 
 def worker_count(executor: Executor) -> int:
-    """Return the number of tasks that an executor runs concurrently; a default if it cannot be determined."""
+    """Return the number of tasks that an executor runs concurrently; the number of CPUs if it cannot be determined."""
     count = getattr(executor, "_max_workers", None)
     client = getattr(executor, "_client", None)
     if count is None and client is not None:
@@ -244,17 +279,21 @@ def worker_count(executor: Executor) -> int:
 
 @dataclass
 class Throughput:
-    """Evaluation time per round or candidate, as measured; it determines the size of a task."""
+    """Evaluation time per item as measured, which determines the number of items in a task.
+
+    An item is a candidate of a coupled search, or a round (group of candidates) of one equation. The time is smoothed
+    exponentially, and is 0 before the first measurement. A task has at least `min_count` items.
+    """
 
     seconds_each: float = 0.0
     min_count: int = 1
 
     def count_for(self, seconds: float) -> int:
-        """Return the number of rounds or candidates that take about the given time."""
+        """Return the number of items that take about `seconds`; `min_count` before the first measurement."""
         return self.min_count if self.seconds_each == 0 else max(self.min_count, int(seconds / self.seconds_each))
 
     def update(self, seconds: float, count: int) -> None:
-        """Update the throughput from the time that a number of rounds or candidates took."""
+        """Update the smoothed time per item from the time [s] that `count` items took."""
         each = max(seconds, 1e-9) / count
         self.seconds_each = each if self.seconds_each == 0 else 0.7 * self.seconds_each + 0.3 * each
 
@@ -265,10 +304,14 @@ def run_on_executor(
     executor: Executor,
     throughput: Throughput,
 ) -> Iterator[tuple[CandidateBlock, Any]]:
-    """Submit blocks in tasks of about :data:`TASK_DURATION_S` seconds, and yield (block, result) pairs."""
+    """Evaluate blocks in tasks of about :data:`TASK_DURATION_S` seconds, and yield (block, result) pairs.
+
+    `send` returns the function that evaluates a block, followed by its arguments. Raise ConvergenceError if the
+    executor is broken, or if a task fails :data:`MAX_ATTEMPTS` times.
+    """
     count = worker_count(executor)
     queue_size = TASKS_PER_WORKER * count + 2
-    # In a small batch every worker gets a share.
+    # A small batch is divided evenly among the workers.
     share = max(throughput.min_count, -(-sum(s.last - s.first for s in blocks) // count))
     pending: dict[Future[Any], CandidateBlock] = {}
     waiting = blocks[::-1]
@@ -300,7 +343,11 @@ def run_on_executor(
 
 
 def _result(future: Future[Any], block: CandidateBlock) -> tuple[float, Any] | None:
-    """Return (seconds, result) of a task, or None if the worker lacked the search and the task must be sent again."""
+    """Return (computing time [s], result) of a finished task, or None if the task must be submitted again.
+
+    It must be submitted again after a failure, or if the worker had not cached the search problem. Raise
+    ConvergenceError after :data:`MAX_ATTEMPTS` failures, or if the executor is broken.
+    """
     try:
         timed = cast("tuple[float, Any] | None", future.result())
     except FtlmError:
@@ -313,7 +360,7 @@ def _result(future: Future[Any], block: CandidateBlock) -> tuple[float, Any] | N
             raise _executor_error(error) from error
         return None
     if timed is None and not block.with_problem:
-        # The worker lacks the problem of the search. The next attempt sends it along.
+        # The worker has not cached the search problem, so the next attempt sends it with the task.
         block.with_problem = True
         return None
     if not isinstance(timed, tuple) or len(timed) != 2:
@@ -328,20 +375,22 @@ def _executor_error(error: BaseException) -> ConvergenceError:
     )
 
 
-#: Time between two writes of candidates under an order law. Work lost on a crash is about this long.
+#: Time of local evaluation between two checkpoint records of a coupled search. A crash loses about this much work.
 CHECKPOINT_INTERVAL_S = 0.25
-#: Minimum number of candidates under an order law in one task, used for the first batch. The first worker then receives
-#: the record before the others ask for it.
+#: Minimum number of candidates in one task of a coupled search, and their number before the first time measurement.
 MIN_BLOCK_CANDIDATES = 256
 Frame = TypeVar("Frame", Rounds, Verdicts)
-#: Callback that stores a checkpoint of the rounds from the first to the last.
+#: Callback (first, last, checkpoint) that stores the checkpoint of a block of rounds (groups of candidates).
 Save = Callable[[int, int, Checkpoint | None], None]
 
 
 class SearchState(ABC, Generic[Frame, Table]):
-    """State of an order search in progress: number of evaluated candidates, total number, and current batch."""
+    """Order search in progress: processed candidates (`done`), all candidates known up to now (`total`), and a batch.
 
-    #: Whether the core reports progress of local evaluation itself.
+    A batch is evaluated in blocks, in any sequence. Later batches use its results.
+    """
+
+    #: Whether the core itself calls the progress callback during evaluation in this process.
     core_reports_progress = False
 
     def __init__(self, work: SearchProblem[Table], throughput: Throughput) -> None:
@@ -351,16 +400,16 @@ class SearchState(ABC, Generic[Frame, Table]):
 
     @cached_property
     def key(self) -> str:
-        """Key of the search in the workers' caches."""
+        """Key that identifies the search in the caches of the worker processes."""
         return self.work.key
 
     def payload(self, block: CandidateBlock) -> SearchProblem[Table] | None:
-        """Return the search problem if it must be sent with a block, because a worker reported that it lacks it."""
+        """Return the search problem if it is sent with the task of a block; None if workers have it cached."""
         return self.work if block.with_problem else None
 
     @abstractmethod
     def batches(self) -> Iterator[tuple[int, int]]:
-        """Yield (first index, end) of each batch; a batch is constructed when the previous one is complete."""
+        """Yield (first index, exclusive end) of each batch, after the results of the previous batch are added."""
 
     @abstractmethod
     def evaluate_locally(
@@ -370,28 +419,28 @@ class SearchState(ABC, Generic[Frame, Table]):
 
     @abstractmethod
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
-        """Return a function and its arguments that evaluate a block in a worker."""
+        """Return the function that evaluates a block in a worker process, followed by its arguments."""
 
     @abstractmethod
     def frame(self, number: int, block: CandidateBlock, piece: Any) -> Frame:
-        """Return the checkpoint record of a block's result; `number` is the index of the search in the file."""
+        """Return the checkpoint record with the result of a block; `number` is the index of the search in the file."""
 
     @abstractmethod
     def add_block(self, frame: Frame) -> int:
         """Add the result of a block to the current batch.
 
-        Return the number of its candidates without a complete score, which may need further evaluation.
+        Return the number of candidates whose evaluation was stopped before the complete score.
         """
 
     @abstractmethod
     def table(self) -> Table:
-        """Return the table of the search from all batches."""
+        """Return the result table of the search, after all batches are complete."""
 
 
 class EquationSearchState(SearchState[Rounds, "_core._Found"]):
-    """State of the order search of one equation.
+    """Order search of one equation in progress.
 
-    The rounds of a batch use the best rows of earlier batches as thresholds.
+    Candidates are excluded if their scores exceed those of the best rows of earlier batches.
     """
 
     core_reports_progress = True
@@ -408,9 +457,10 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         return self.work.build_evaluator()
 
     def batches(self) -> Iterator[tuple[int, int]]:
-        """Yield batches of rounds that use the same thresholds.
+        """Yield (first, exclusive end) of each batch, counted in rounds (groups of candidates).
 
-        Each batch has its own throughput, because later ones exclude more candidates.
+        All rounds of a batch start from the same best rows. Later batches exclude more candidates, so the evaluation
+        time per round is measured separately for each batch.
         """
         first, keep = 0, self.work.settings.top
         for end in self._ends:
@@ -425,7 +475,7 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
     def evaluate_locally(
         self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Part]]:
-        """Evaluate each block in one call of the core, from its checkpoint, and yield (block, result) pairs."""
+        """Evaluate each block in one call of the core, resumed from its checkpoint if any; yield (block, result)."""
         for block in blocks:
             first, last = block.first, block.last
             listener = None if progress is None else partial(self._report_progress, progress, self.done)
@@ -439,12 +489,12 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         progress(min(count_before + count, self.total), self.total, pruned)
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
-        """Return the function and its arguments that evaluate a block of rounds in a worker."""
+        """Return the function that evaluates a block of this search in a worker process, followed by its arguments."""
         ranged = block.first, block.last, self._seed, block.start, self.threads
         return evaluate_rounds, self.key, self.payload(block), *ranged
 
     def frame(self, number: int, block: CandidateBlock, piece: Part) -> Rounds:
-        """Return the checkpoint record of a block of rounds."""
+        """Return the checkpoint record with the partial result of a block of rounds (groups of candidates)."""
         return Rounds(number, block.first, block.last, piece)
 
     def add_block(self, frame: Rounds) -> int:
@@ -454,18 +504,18 @@ class EquationSearchState(SearchState[Rounds, "_core._Found"]):
         return 0
 
     def table(self) -> _core._Found:
-        """Return the table of the search from all rounds."""
+        """Return the result table of the search, joined from the partial results of all blocks."""
         return self.work.join(self._parts)
 
 
 def _drop_beaten_rows(worst: tuple[float, int], part: Part) -> Part:
-    """Return a result without rows that are worse than `worst`, the last row of the current table."""
+    """Return a partial result without rows that rank below `worst`, (score, index) of the last row of the table."""
     rows, counts, failures = part
     return tuple(row for row in rows if (row[1], row[0]) <= worst), counts, failures
 
 
 class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
-    """State of a coupled order search; the candidates of a batch depend on the results of earlier batches."""
+    """Order search of coupled equations in progress; candidates of a batch depend on results of earlier batches."""
 
     work: CoupledProblem
 
@@ -477,7 +527,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         self._wave: list[Verdicts] = []
 
     def batches(self) -> Iterator[tuple[int, int]]:
-        """Yield batches of the candidates that are required next, numbered consecutively through all batches."""
+        """Yield (first, exclusive end) of each batch of candidates, numbered consecutively through all batches."""
         while spans := self.search.pending_spans():
             end = self._first + sum(last - first for _, first, last, _ in spans)
             self._spans, self._wave = spans, []
@@ -490,7 +540,7 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
     def evaluate_locally(
         self, blocks: list[CandidateBlock], progress: ProgressCallback | None, save: Save | None
     ) -> Iterator[tuple[CandidateBlock, Outcomes]]:
-        """Evaluate candidates in steps of about :data:`CHECKPOINT_INTERVAL_S` seconds; yield (block, result) pairs."""
+        """Evaluate blocks in parts of about :data:`CHECKPOINT_INTERVAL_S` seconds; yield (part, result) pairs."""
         for block in blocks:
             at = block.first
             while at < block.last:
@@ -502,13 +552,13 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
                 at = piece.last
 
     def task(self, block: CandidateBlock) -> tuple[Any, ...]:
-        """Return the function and its arguments that evaluate a block of candidates in a worker."""
+        """Return the function that evaluates a block of candidates in a worker process, followed by its arguments."""
         return evaluate_candidates, self.key, self.payload(block), self._cut(block), self.threads
 
     def _cut(self, block: CandidateBlock) -> list[Span]:
-        """Return the candidates of a block as spans (ranges) of candidate indices.
+        """Return the candidates of a block as spans (equation, first index, exclusive end, limit of the score).
 
-        Indices of a block count the candidates of all spans of the batch.
+        A span has the candidate indices of its equation. A block is numbered through all spans and batches.
         """
         cut, at = [], self._first
         for equation, start, end, limit in self._spans:
@@ -519,22 +569,28 @@ class CoupledSearchState(SearchState[Verdicts, "_core._FoundStage"]):
         return cut
 
     def frame(self, number: int, block: CandidateBlock, piece: Outcomes) -> Verdicts:
-        """Return the checkpoint record of a block of candidates."""
+        """Return the checkpoint record with the outcomes of a block of candidates."""
         return Verdicts(number, block.first, block.last, *piece)
 
     def add_block(self, frame: Verdicts) -> int:
-        """Add the result of a block to the current batch; return the number of stopped or bounded candidates."""
+        """Add the result of a block to the current batch.
+
+        Return the number of candidates with only a lower bound or a partial sum of the score.
+        """
         self._wave.append(frame)
         self.done += len(frame.kinds)
         return frame.kinds.count(1) + frame.kinds.count(2)
 
     def table(self) -> _core._FoundStage:
-        """Return the table of the search, in which the equations are joined under their order law."""
+        """Return the result table of the search, whose rows combine all equations under the order law."""
         return self.search.outcome()
 
 
 def _join_verdicts(batch: list[Verdicts], first: int, end: int) -> Outcomes:
-    """Return the results of a batch in sequence; raise ModelError if its blocks do not cover the batch."""
+    """Return (values, kinds) of all candidates of a batch in sequence.
+
+    Raise ModelError if the blocks do not cover candidates `first` to `end` - 1.
+    """
     at, values, kinds = first, [], []
     for verdicts in sorted(batch, key=lambda v: v.first):
         if verdicts.first != at:
@@ -549,9 +605,9 @@ def _join_verdicts(batch: list[Verdicts], first: int, end: int) -> Outcomes:
 
 @dataclass(frozen=True)
 class Execution:
-    """How a search is executed: checkpoint file, index of the search in it, executor, and progress callback.
+    """Execution options of a search: checkpoint file, index of the search in the file, executor, progress callback.
 
-    Without a file and an executor, a search takes one call of the core. Otherwise it proceeds in batches.
+    Without file and executor, a search is one call of the core. Otherwise it is evaluated in batches.
     """
 
     store: Store | None
@@ -561,12 +617,12 @@ class Execution:
 
     @property
     def section(self) -> Section | None:
-        """Progress of the search in the checkpoint file; None without a file."""
+        """Content of the checkpoint file that belongs to this search; None without a file."""
         return None if self.store is None else self.store.contents.sections[self.number]
 
 
 def search_equation(work: EquationProblem, execution: Execution) -> _core._Found:
-    """Return the table of the order search of one equation."""
+    """Run the order search of one equation, and return its result table."""
     store = execution.store
     if store is None and execution.executor is None:
         return work.search(execution.progress)
@@ -574,7 +630,10 @@ def search_equation(work: EquationProblem, execution: Execution) -> _core._Found
 
 
 def search_coupled(work: CoupledProblem, execution: Execution) -> _core._FoundStage:
-    """Search the orders of coupled equations and return the table; a finished search is read from its file."""
+    """Run the order search of coupled equations, and return its result table.
+
+    The table of a finished search is read from the checkpoint file.
+    """
     store, section = execution.store, execution.section
     if store is None and execution.executor is None:
         return work.search(execution.progress)
@@ -587,7 +646,10 @@ def search_coupled(work: CoupledProblem, execution: Execution) -> _core._FoundSt
 
 
 def _run_batches(state: SearchState[Frame, Table], execution: Execution) -> Table:
-    """Evaluate all blocks that the checkpoint file lacks, batch by batch, and return the table."""
+    """Evaluate all blocks that the checkpoint file does not contain, batch by batch, and return the result table.
+
+    Raise ModelError if the file contains candidates of another search.
+    """
     store, number, section = execution.store, execution.number, execution.section
     executor, progress = execution.executor, execution.progress
     save = None if store is None else partial(store.save, number)
@@ -615,7 +677,10 @@ def _run_batches(state: SearchState[Frame, Table], execution: Execution) -> Tabl
 
 
 def equation_state(work: EquationProblem, section: Section) -> tuple[int, float | None]:
-    """Return the number of candidates of one equation, and the best score in a checkpoint file."""
+    """Return (number of candidates, best score in the checkpoint file) of the search of one equation.
+
+    The score is None if the file contains none.
+    """
     best = section.best
     if best is not None and work.settings.norm == "l2":
         best = math.sqrt(max(best, 0.0) / work.samples)
@@ -623,7 +688,10 @@ def equation_state(work: EquationProblem, section: Section) -> tuple[int, float 
 
 
 def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | None]:
-    """Return the number of candidates of a coupled search, as far as known, and the best score in a checkpoint file."""
+    """Return (number of candidates, best score) of a coupled search, as far as the checkpoint file determines them.
+
+    The score is None before the first one.
+    """
     if section.table is not None:
         return section.processed_count, _table(work, section.table)["rows"][0][1]
     state = CoupledSearchState(work)
@@ -636,9 +704,9 @@ def coupled_state(work: CoupledProblem, section: Section) -> tuple[int, float | 
 
 
 def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
-    """Return the stored table of a finished search in the form of the core.
+    """Return the table of a finished search from its checkpoint record, in the form that the Rust core returns.
 
-    Raise ModelError if it belongs to another search.
+    Raise ModelError if sizes or counts of the table do not match the search.
     """
     widths = [len(terms) for _, _, terms in work.laws]
     dealt = sum(v for k, v in joined.counts.items() if k != "candidates")
@@ -657,14 +725,14 @@ def _table(work: CoupledProblem, joined: CoupledTable) -> _core._FoundStage:
 
 
 def _stored_frames(section: Section | None, first: int, end: int) -> list[Any]:
-    """Return the checkpoint records of complete blocks of a batch."""
+    """Return the checkpoint records of complete blocks that start in the batch from `first` to `end` - 1."""
     return [] if section is None else [frame for at, frame in section.frames.items() if first <= at < end]
 
 
 def _pending_blocks(section: Section | None, first: int, end: int) -> Iterator[CandidateBlock]:
-    """Yield the blocks of a batch that remain to be evaluated.
+    """Yield the blocks of a batch from `first` to `end` - 1 that remain to be evaluated.
 
-    They are the partly evaluated blocks, from their checkpoints on, and the gaps between stored blocks.
+    They are the partly evaluated blocks, which are resumed from checkpoints, and the gaps between stored blocks.
     """
     blocks: list[CandidateBlock] = []
     if section is not None:

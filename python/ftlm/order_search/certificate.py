@@ -21,10 +21,12 @@ from ftlm.utils.parameters import parameter, setting
 from ftlm.utils.resources import memory_limit
 from ftlm.utils.validation import check_integer, real_number, short_repr
 
-#: Default tolerance of the certificate relative to the best equation error found, and maximum number of boxes.
+#: Default tolerance of the certificate, as a fraction of the smallest equation error found, and default maximum number
+#: of boxes of orders.
 DEFAULT_TOLERANCE = 0.05
 DEFAULT_MAX_CELLS = 20_000_000
-#: Default maximum RMS size of an equation's terms relative to the output. Larger terms cancel to within a hundredth.
+#: Default maximum RMS of all terms of an equation together, divided by the RMS of the output. Larger terms cancel one
+#: another to within a hundredth.
 DEFAULT_MAX_TERM_RATIO = 100.0
 #: Settings of an order search for which a certificate exists.
 CERTIFIED_SETTINGS: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
@@ -50,10 +52,10 @@ def certify_orders(
     It certifies that no orders have an error much smaller than the smallest error found.
 
     Branch and bound halves boxes of orders. It stops when every box has a lower bound of at least ``1 - tolerance``
-    times the smallest error found. The bound is that of the RMS equation error at all orders of the box, with the best
-    coefficients. The certificate covers only squared equation errors, equations at rest, and free coefficients. No such
-    certificate is known for output errors. A finding reports if the simulation at the best orders is unstable or
-    explains little of the output.
+    times the smallest error found. The bound holds for the RMS equation error at all orders of the box, with the best
+    coefficients. The certificate covers only squared equation errors, zero initial conditions, and free coefficients.
+    No such certificate is known for output errors. A finding reports if the simulation at the best orders is unstable
+    or explains little of the output.
 
     Parameters
     ----------
@@ -66,35 +68,36 @@ def certify_orders(
     tolerance
         Fraction (below 1) by which the error at other orders may be smaller than the smallest error found.
     start
-        Points to include, each with orders by name, such as results of another optimizer. The certificate has the error
-        of each point, and states whether other orders may be better than it.
+        Points to compare with the bound, each with orders by name, such as results of another optimizer. The
+        certificate contains the error of each point, and whether other orders may have a smaller error.
     min_separation
-        Minimum difference between alpha and the orders of output terms, and between the orders of one signal. Equations
-        with difference 0 are satisfied trivially. Default: the increment of the order grid.
+        Minimum difference between alpha and the order of every output term, and between the orders of two terms of the
+        same signal. An equation with a difference of 0 holds for any data. Default: the increment of the order grid.
     max_term_ratio
         Maximum RMS of all terms of an equation together, divided by the RMS of the output. Larger terms, which cancel
         one another, are not identifiable.
     max_cells
-        Maximum number of boxes. When it is reached, the bound so far is returned.
+        Maximum number of boxes. When it is reached, the bound computed up to then is returned.
     m
         Number of block pulses per run; by default 2048, or fewer for shorter runs.
     threads
         Number of threads; default all cores.
     progress
-        Callback with (boxes done, boxes so far), called about twenty times a second.
+        Callback with (boxes finished, boxes created), called about twenty times a second.
 
     Returns
     -------
     OrderCertificate
-        Lower bound and achieved tolerance, which may be larger than the requested one.
+        Lower bound of the error, and the achieved tolerance, which may be larger than the requested one.
 
     Raises
     ------
     DataError
         If runs lack a signal of the equation.
     ModelError
-        If the structure is coupled under an order law, has initial terms or known coefficients, an option is out of
-        range, or the intervals contain no orders or require too many boxes.
+        If the structure is coupled under an order law, or has initial terms, nonlinear terms or known coefficients.
+        Also if an option is out of range, the intervals contain no orders or require too many boxes, or the terms are
+        linearly dependent at a point of `start`.
     KeyboardInterrupt
         On Ctrl-C, within half a second.
     """
@@ -160,9 +163,10 @@ def certify_orders(
 
 
 def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: int) -> float:
-    """Return the minimum RMS equation error at given orders; infinite for linearly dependent terms.
+    """Return the minimum RMS equation error at given orders, over all coefficients.
 
-    `index` and `count` number the point for messages.
+    It is infinite if the computation raises ConvergenceError. Raise ModelError if an order is missing or outside its
+    interval, or if the terms are linearly dependent. The message names the point by its `index` among `count` points.
     """
     names = {name: (min(values), max(values)) for name, values in job.values.items()}
     numbers = {str(name): real_number("start", value) for name, value in orders.items()}
@@ -176,7 +180,10 @@ def _equation_error(job: Job, orders: Mapping[str, float], index: int, count: in
 
 
 def _check_certifiable(job: Job) -> None:
-    """Raise ModelError if no certificate can be computed for a search."""
+    """Raise ModelError if a search has an order law, nonlinear terms, initial terms or known coefficients.
+
+    No certificate can be computed for these.
+    """
     if job.structure.has_order_law:
         raise ModelError(
             "there is no certificate over the orders of coupled equations under an order law; certify the equations "
@@ -208,7 +215,11 @@ def _check_tolerance(tolerance: float) -> float:
 
 
 def _free_run(job: Job, orders: dict[str, float]) -> tuple[float, float]:
-    """Return the NR of the simulation at given orders (infinite if it fails), and the number of unstable poles."""
+    """Return (NR, number of unstable poles) of the least-squares model at given orders.
+
+    NR is the RMS simulation error divided by the standard deviation of the output. It is infinite if the simulation
+    fails. The number of poles is NaN if it is unknown.
+    """
     settings = SearchSettings(**{**CERTIFIED_SETTINGS, "criterion": "output-error", "pruning": False})
     values = {name: (orders[name],) for name in job.values}
     try:

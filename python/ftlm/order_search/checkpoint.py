@@ -1,9 +1,10 @@
 """Checkpoint file of an order search: its records, their validation, reading and writing.
 
 The first record is :class:`Requests`: all arguments and data of the searches, so that they can be resumed without the
-measured files. A search of one equation then appends :class:`PartialRounds` (a block of rounds with a resumption point)
-and :class:`Rounds` (a finished block). A search under an order law appends :class:`Verdicts` (a finished block of
-candidates) and, at its end, :class:`CoupledTable`.
+measured files. A search of one equation is evaluated in rounds, fixed groups of candidates. It appends
+:class:`PartialRounds` (a partly evaluated block of rounds, with a resumption point) and :class:`Rounds` (a finished
+block). A search under an order law appends :class:`Verdicts` (a finished block of candidates) and, at its end,
+:class:`CoupledTable`.
 """
 
 from __future__ import annotations
@@ -27,32 +28,36 @@ from ftlm.structure.structure import Structure, check_initial
 from ftlm.utils.checkpoint_file import RECORD_ENCODER, CheckpointFile, decode_array
 from ftlm.utils.parameters import parameter
 
-#: Version of the search algorithm. Rounds of two versions cannot be joined, so files of other versions are refused.
+#: Version of the search algorithm. Results of two versions cannot be combined, so files of other versions are rejected.
 ALGORITHM_VERSION = 1
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
-#: Counts: candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.
+#: Numbers of candidates: all, in the table, worse than the table, excluded by a bound, stopped early, singular, and
+#: diverged. An eighth number, if any, counts those that a bound excluded in whole boxes.
 Counts = Annotated[tuple[Natural, ...], msgspec.Meta(min_length=7, max_length=8)]
 
 
 def finished_count(counts: Counts) -> int:
-    """Return the number of candidates that are in the table or excluded.
+    """Return the number of processed candidates: those in the table and those excluded for any reason.
 
-    Candidates excluded in boxes are already counted as excluded by a bound.
+    The optional eighth count (excluded in boxes) is not added, because it is part of those excluded by a bound.
     """
     return sum(counts[1:7])
 
 
 Failures = tuple[tuple[Natural, bool], ...]
-#: Rows (index, raw score, coefficients, initial terms by record), counts, failures (index, whether diverged).
+#: Partial result: rows (candidate index, unscaled score, coefficients, initial terms by record), counts of candidates,
+#: and failures (candidate index, True if diverged or False if singular).
 Part = tuple[tuple[Row, ...], Counts, Failures]
-#: Round, number of evaluated candidates, then end, length and limit of the current chunk of candidates.
+#: Position in a block: number of the round (group of candidates), number of its evaluated candidates, then end, length
+#: and score limit of the current chunk of candidates.
 Place = tuple[Natural, Natural, Natural, Natural, float]
-#: Position of a partial block with the digest of the evaluation order, whether it was restarted, and its part.
+#: Checkpoint of a block: position with the digest of the evaluation order, whether the block was restarted, and its
+#: partial result.
 Checkpoint = tuple[tuple[Natural, Natural, Natural, Natural, float, Natural], bool, Part]
-#: Equation, first candidate, end (exclusive), limit.
+#: Range of candidates of one equation: index of the equation, first candidate, exclusive end, limit of the score.
 Span = tuple[int, int, int, float]
-#: Results of candidates under an order law: values and kinds (see :class:`Verdicts`).
+#: Results of candidates of a coupled search: values and kinds, as in :class:`Verdicts`.
 Outcomes = tuple[bytes, bytes]
 
 
@@ -61,7 +66,7 @@ MAX_FILTER_STATES = 10
 
 
 def check_record(record: Record) -> None:
-    """Raise ModelError if the arrays of a record have inconsistent sizes."""
+    """Raise ModelError if sizes, number of filter states or initial conditions of a block-pulse record are invalid."""
     sizes, sensor = (len(record.signals), len(record.inputs)), record.sensor
     shaped = record.means.ndim == 2 and (sensor is None or sensor.ndim == 1)
     if not shaped or sizes != record.means.shape[:1] * 2 or not record.means.size:
@@ -72,7 +77,7 @@ def check_record(record: Record) -> None:
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Definition of one search: its data, its settings, and the name of its result."""
+    """Definition of one order search: data, structure, order grid (`values`), settings, and name of the result."""
 
     name: str
     structure: Structure
@@ -83,7 +88,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     units: dict[str, str]
 
     def difference(self, other: Request) -> str | None:
-        """Return text on the first difference from another request; None if both are equal."""
+        """Return a text that describes the first difference from another request; None if both are equal."""
         if [r.offset for r in self.records] != [r.offset for r in other.records]:
             return "another offset"
         if RECORD_ENCODER.encode(self.records) != RECORD_ENCODER.encode(other.records):
@@ -99,7 +104,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="requests"):
-    """First record of the file, with the definitions of all searches."""
+    """First record of a checkpoint file: definitions of all searches, and versions of algorithm and ftlm."""
 
     algorithm: int
     version: str
@@ -107,12 +112,11 @@ class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="req
 
 
 class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
-    """Record of a partly evaluated block of rounds, with the rows found since the block's previous record.
+    """Checkpoint record of a partly evaluated block of rounds (groups of candidates of one equation).
 
-    ``failures`` is None if unchanged.
-
-    If the block was restarted, its earlier records are invalid. ``order`` is the digest of the sequence in which
-    candidates are evaluated; 0 before the first one.
+    ``rows`` are the table rows found since the previous record of the block. ``failures`` is None if they did not
+    change since then. With ``anew``, the block was restarted and its earlier records are invalid. ``order`` is the
+    digest of the sequence in which candidates are evaluated, 0 before the first candidate.
     """
 
     search: Natural
@@ -127,7 +131,7 @@ class PartialRounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
 
 class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rounds"):
-    """Record of a completely evaluated block of rounds."""
+    """Checkpoint record of a completely evaluated block of rounds (groups of candidates) and their partial result."""
 
     search: Natural
     first: Natural
@@ -136,7 +140,7 @@ class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="round
 
 
 class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="verdicts"):
-    """Checkpoint record of a coupled search for one block of candidates that is completely evaluated.
+    """Checkpoint record of a completely evaluated block of candidates, in a search of coupled equations.
 
     ``values`` are unscaled scores as little-endian doubles. ``kinds`` has one byte per value: 0 for a complete score, 1
     for a lower bound, 2 for a partial sum, 3 for a singular candidate, 4 for a diverged one.
@@ -149,15 +153,16 @@ class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ver
     kinds: bytes
 
 
-#: Index, score, free orders, and of each equation score, alpha, orders, coefficients, initial terms by record.
+#: One equation in a table row: score, alpha, orders and coefficients of the terms, initial terms by record.
 StagePart = tuple[float, float, tuple[float, ...], tuple[float, ...], tuple[tuple[float, ...], ...]]
+#: Row of the table: candidate index, score, free orders, equations.
 StageRow = tuple[Natural, float, tuple[float, ...], tuple[StagePart, ...]]
-#: Index, free orders, reason.
+#: Candidate without a score: candidate index, free orders, reason.
 StageFailure = tuple[Natural, tuple[float, ...], Literal["singular", "diverged"]]
 
 
 class CoupledTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joined"):
-    """Record of the final table of a coupled search: rows, counts by reason, and first failures."""
+    """Checkpoint record of the final table in a search of coupled equations: rows, numbers of candidates, failures."""
 
     search: Natural
     rows: tuple[StageRow, ...]
@@ -171,7 +176,7 @@ FRAME_DECODER = msgspec.msgpack.Decoder(Requests | Frame, dec_hook=decode_array)
 
 @dataclass
 class PartialBlock:
-    """Partly evaluated block of rounds, with all rows that were found in it so far."""
+    """Partly evaluated block of rounds (groups of candidates), with all table rows found in the block up to now."""
 
     last: int
     place: Place
@@ -182,16 +187,16 @@ class PartialBlock:
 
     @property
     def checkpoint(self) -> Checkpoint:
-        """Return the state from which the core resumes the block."""
+        """Checkpoint from which the evaluation of the block is resumed."""
         return (*self.place, self.order), False, (tuple(self.rows), self.counts, self.failures)
 
 
 @dataclass
 class Section:
-    """Progress of one search in a checkpoint file: complete blocks of rounds and partly evaluated blocks.
+    """Progress of one search in a checkpoint file: complete blocks, partly evaluated blocks, and the final table.
 
-    A round is a fixed range of candidates. The key of a block is the number of its first round. In a coupled search it
-    is the number of the first candidate.
+    A search of one equation has blocks of rounds (fixed ranges of candidates), which are stored by the number of the
+    first round. A coupled search (``law``) has blocks of candidates, stored by the number of the first candidate.
     """
 
     law: bool = False
@@ -201,7 +206,11 @@ class Section:
     _firsts: list[int] = field(default_factory=list)
 
     def add_frame(self, frame: Frame) -> None:
-        """Add a record; raise ModelError if it is a duplicate, has an empty block, or is of another kind of search."""
+        """Add a checkpoint record of this search.
+
+        Raise ModelError if its block is empty or overlaps a stored block, if it contradicts an earlier record, or if it
+        belongs to another kind of search.
+        """
         if self.table is not None or (isinstance(frame, CoupledTable) and not self.law):
             raise ModelError("it has an unexpected final table")
         if isinstance(frame, CoupledTable):
@@ -237,20 +246,20 @@ class Section:
 
     @property
     def processed_count(self) -> int:
-        """Number of candidates evaluated or excluded."""
+        """Number of candidates that were evaluated or excluded up to now."""
         counts = (len(f.kinds) if isinstance(f, Verdicts) else finished_count(f.part[1]) for f in self.frames.values())
         return sum(counts) + sum(finished_count(half.counts) for half in self.open.values())
 
     @property
     def best(self) -> float | None:
-        """Lowest unscaled score found so far in the search of one equation; None for a coupled search."""
+        """Lowest unscaled score up to now in the search of one equation; None without a row or for a coupled search."""
         rows = [row for frame in self.frames.values() if isinstance(frame, Rounds) for row in frame.part[0]]
         return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
 
 
 @dataclass
 class Contents:
-    """Contents of a checkpoint file: definitions and progress of its searches."""
+    """Contents of a checkpoint file: definition and progress of each search, and the ftlm version that created it."""
 
     requests: tuple[Request, ...]
     sections: list[Section]
@@ -260,13 +269,19 @@ class Contents:
 
 
 def read_store(path: str | os.PathLike[str]) -> Contents:
-    """Return the contents of the intact part of a checkpoint file, which may be in use."""
+    """Return the contents of the intact part of a checkpoint file, which another process may be writing.
+
+    Raise DataError if the file cannot be read or is not the file of an order search.
+    """
     with CheckpointFile(path, "search") as file:
         return contents_of(path, *file.read())
 
 
 def contents_of(path: str | os.PathLike[str], payloads: Sequence[bytes], corruption: str | None) -> Contents:
-    """Return the contents that records of a checkpoint file encode; raise DataError if they are no order search."""
+    """Return the contents of a checkpoint file from its encoded records; raise DataError if one is invalid.
+
+    `corruption` describes damage to later records, or is None.
+    """
     if not payloads:
         why = (
             f"cannot be used: {corruption}" if corruption else "ends before its first record: its search had not begun"
@@ -301,28 +316,39 @@ def _contents_of_requests(frame: Requests | Frame, corruption: str | None) -> Co
     return Contents(frame.requests, sections, frame.version, corruption)
 
 
-#: Maximum time between two writes, each flushed to disk. Less than a second of work is lost on a crash.
+#: Minimum time between two writes of partial results, each flushed to disk. A crash loses less than a second of work.
 FLUSH_INTERVAL_S = 0.3
 
 
 class Store:
-    """Checkpoint file that is open for writing, and locked until it is closed.
+    """Checkpoint file of order searches that is open for writing, and locked until it is closed.
 
-    Results are on disk within :data:`FLUSH_INTERVAL_S`.
+    Partial results are written about every :data:`FLUSH_INTERVAL_S` seconds, complete blocks immediately.
 
-    `requests` define the searches of a new file. An existing file must contain the same searches; with None, any
-    searches are accepted. With `recover` the intact records of a corrupt file are kept, and a copy of the corrupt file
-    is saved.
+    Parameters
+    ----------
+    path
+        Path of the file.
+    requests
+        Definitions of the searches, with which a new file is created. An existing file must contain the same searches.
+        With None, an existing file is opened, whatever its searches.
+    recover
+        Whether to keep the intact records of a damaged file, and to save a copy of the damaged file.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be opened, contains other searches, or is damaged and `recover` is False.
     """
 
     def __init__(
         self, path: str | os.PathLike[str], requests: Sequence[Request] | None = None, *, recover: bool = False
     ) -> None:
         self.path = Path(path)
-        #: Descriptions of repairs.
+        #: Texts on repairs of a damaged file.
         self.notes: list[str] = []
         self._last = time.monotonic()
-        #: By search and first round: frames not written yet, and the failures written last.
+        #: Records that are not written yet, and the failures written last, by (search, first round of the block).
         self._waiting: dict[tuple[int, int], PartialRounds] = {}
         self._failures: dict[tuple[int, int], Failures | None] = {}
         self._file = CheckpointFile(path, "search", "resume" if requests is None else "create")
@@ -335,7 +361,7 @@ class Store:
     def _begin(self, requests: Sequence[Request] | None, *, recover: bool) -> None:
         payloads, corruption = self._file.read()
         if requests is not None and not payloads and corruption is None:
-            # The stored request is compared with the given one, so that encoding errors appear before the search.
+            # The encoded request is decoded and compared below, so that encoding errors appear before the search.
             payloads = [RECORD_ENCODER.encode(Requests(ALGORITHM_VERSION, __version__, tuple(requests)))]
             self._file.append(payloads)
         self.contents = contents = contents_of(self.path, payloads, corruption)
@@ -374,7 +400,11 @@ class Store:
             self.contents.sections[frame.search].add_frame(frame)
 
     def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
-        """Queue the progress of a block of rounds for writing; write the queue if the flush interval has elapsed."""
+        """Queue a checkpoint of a partly evaluated block; write the queue if the last write was `FLUSH_INTERVAL_S` ago.
+
+        `search` is the index of the search in the file, and `first` and `last` (exclusive) are the limits of the block.
+        With None as checkpoint, nothing is queued.
+        """
         if checkpoint is not None:
             (*place, order), anew, (rows, counts, failures) = checkpoint
             rounds_before = self._waiting.get((search, first))
@@ -388,7 +418,7 @@ class Store:
             self.flush()
 
     def flush(self) -> None:
-        """Write all queued records."""
+        """Write all queued records to the file."""
         due = []
         for key, frame in self._waiting.items():
             same = not frame.anew and self._failures.get(key) == frame.failures
@@ -399,13 +429,13 @@ class Store:
             self._append(due)
 
     def append_block(self, frame: Rounds | Verdicts) -> None:
-        """Write a complete block."""
+        """Write the record of a complete block to the file, and remove its queued partial results."""
         self._waiting.pop((frame.search, frame.first), None)
         self._failures.pop((frame.search, frame.first), None)
         self._append([frame])
 
     def append_table(self, search: int, table: _core._FoundStage) -> None:
-        """Write the final table of a coupled search."""
+        """Write the final table of the coupled search with index `search` to the file."""
         frame = {"type": "joined", "search": search, **{k: table[k] for k in ("rows", "counts", "failures")}}
         self._append([msgspec.convert(frame, CoupledTable)])
 

@@ -18,24 +18,25 @@ from ftlm.utils.validation import check_choice, check_integer, real_number, whol
 
 #: Increment of the order grid in the paper.
 DEFAULT_INCREMENT = 0.05
-#: Default interval of the highest order: a flexible link has an order of 2 or slightly less.
+#: Default interval of the highest order alpha of an equation: that of a flexible link is 2 or slightly less.
 DEFAULT_ALPHA_RANGE = (1.05, 2.0)
 
 
 @check_arguments
 @dataclass(frozen=True)
 class OrderGrid:
-    """Grid of an order search: intervals of the orders, and the increment within them.
+    """Grid of an order search: interval of each order, and increment within the interval.
 
     Parameters
     ----------
     increment
         Increment of every order for which `orders` gives none.
     alpha
-        (low, high) of the order alpha of every equation.
+        Interval (low, high) of the highest order of every equation.
     orders
-        Other orders by name: a number, a tuple (low, high) or (low, high, step), ``"low:high:step"`` or a list of
-        values. The name ``alpha`` denotes the order of every equation and replaces the interval above.
+        Values of other orders by name: a number, a tuple (low, high) or (low, high, increment), the text
+        ``"low:high:increment"``, or a list. The name ``alpha`` stands for the highest order of every equation. Its
+        values replace the argument `alpha`.
     """
 
     increment: float = DEFAULT_INCREMENT
@@ -47,12 +48,12 @@ class OrderGrid:
         """Return the grid values of each free order of a structure, by name.
 
         An order without values in the structure and in this grid takes all multiples of the increment from 0 to the
-        largest alpha. The search uses only orders of output terms below alpha, and orders of other signals up to alpha.
+        largest alpha. Of these, the search uses orders below alpha for output terms, and up to alpha for other signals.
 
         Raises
         ------
         ModelError
-            If a name is not a free order, or an interval is out of range.
+            If `orders` contains a name that is not a free order, or an interval is out of range.
         """
         free = structure.order_names
         check_order_grid_names(self, structure)
@@ -83,25 +84,25 @@ class OrderGrid:
 def order_grid(
     increment: float = DEFAULT_INCREMENT, alpha: tuple[float, float] = DEFAULT_ALPHA_RANGE, **orders: Values
 ) -> OrderGrid:
-    """Return the grid of an order search: intervals of the orders, and the increment within them.
+    """Return the grid of an order search: interval of each order, and increment within the interval.
 
-    Unless named here, the order nu of an output term takes all multiples of the increment with 0 <= nu < alpha, and the
-    order of another signal all with 0 <= nu <= alpha. Terms of the same signal have different orders, and their
-    permutations count once.
+    An order nu that is not given here takes all multiples of the increment. For a term in the output of the equation,
+    they satisfy 0 <= nu < alpha, and for other signals 0 <= nu <= alpha. Terms of the same signal have different
+    orders, and permutations of these orders count once.
 
     Parameters
     ----------
     increment
         Positive increment of the grid; the paper uses 0.05.
     alpha
-        (low, high) of the order alpha of an equation, in (0, 10].
+        Interval (low, high) of the highest order alpha of every equation, within (0, 10].
     **orders
-        Other orders by name; see :class:`OrderGrid`.
+        Values of other orders by name; see :class:`OrderGrid`.
 
     Returns
     -------
     OrderGrid
-        Grid whose values depend on the structure it is applied to.
+        Order grid; its values for a structure follow from :meth:`OrderGrid.values`.
 
     Raises
     ------
@@ -118,7 +119,7 @@ def order_grid(
 
 
 def check_order_grid(order_grid: OrderGrid | None) -> None:
-    """Raise ModelError if an argument is not an order grid."""
+    """Raise ModelError unless `order_grid` is None or an OrderGrid."""
     if not (order_grid is None or isinstance(order_grid, OrderGrid)):
         raise ModelError(f"order_grid is {type(order_grid).__name__}, not an OrderGrid; use ftlm.order_grid(…)")
 
@@ -132,7 +133,7 @@ def check_order_grid_names(grid: OrderGrid | None, structure: Structure) -> None
 
 
 def restrict_order_grid(grid: OrderGrid | None, part: Structure) -> OrderGrid | None:
-    """Return an order grid restricted to the free orders of the structure `part`."""
+    """Return an order grid without orders that are not free in the structure `part`; None if the grid is None."""
     if grid is None:
         return None
     names = (*part.order_names, "alpha")
@@ -143,13 +144,13 @@ Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
 Norm = Literal["l1", "l2"]
 RowBasis = Literal["haar", "time"]
-#: Innovation lengths of the paper's tables.
+#: Innovation lengths p that the paper's tables compare.
 COMPARED_INNOVATION_LENGTHS = (1, 3, 5, 7)
-#: Bound on the refined-instrumental-variables iterations per candidate; most converge earlier.
+#: Maximum number of iterations of refined instrumental variables per candidate; most candidates converge earlier.
 MAX_IV_ITERATIONS = 5
-#: Maximum number of rows of a table.
+#: Maximum number of rows of the result table.
 MAX_TOP = 100_000
-#: Settings of multi-innovation alone.
+#: Settings that only the coefficient estimator "multi-innovation" uses.
 MULTI_INNOVATION_SETTINGS = ("innovation_length", "prior_covariance", "row_basis")
 
 
@@ -207,16 +208,16 @@ class SearchSettings:
                 )
 
     def differs(self, name: str) -> bool:
-        """Whether an option differs from its default."""
+        """Whether the option `name` differs from its default."""
         return bool(getattr(self, name) != getattr(type(self), name))
 
     @property
     def needs_haar(self) -> bool:
-        """Whether Haar rows are used, so that the number of block pulses must be a power of two."""
+        """Whether the Haar row basis is used, which requires a power of two as number of block pulses."""
         return self.coefficients == "multi-innovation" and self.row_basis == "haar"
 
     def core_arguments(self, threads: int) -> _core._Options:
-        """Return the settings in the form that the core takes, with the memory limit of this machine."""
+        """Return the settings in the form that the Rust core takes, with the memory limit of this machine [bytes]."""
         return {
             "criterion": self.criterion,
             "norm": self.norm,
@@ -231,6 +232,6 @@ class SearchSettings:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings by name, as results and reports show them."""
+        """Return the settings by name that results and reports show, without those of other coefficient estimators."""
         own = MULTI_INNOVATION_SETTINGS if self.coefficients == "multi-innovation" else ()
         return {name: getattr(self, name) for name in ("criterion", "norm", "coefficients", *own)}

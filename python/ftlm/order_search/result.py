@@ -18,9 +18,9 @@ from ftlm.utils.parameters import choose_text, parameter
 if TYPE_CHECKING:
     from ftlm.estimation.verdict import Verdict
 
-#: NR of a simulation above which it explains little of the output.
+#: RMS simulation error over standard deviation of the output (NR) above which a simulation explains little of it.
 MAX_FREE_RUN_NR = 0.5
-#: Relative difference below which scores and coefficients of two rows are those of one model.
+#: Relative difference of scores and coefficients below which two rows of the table count as one model.
 SAME_MODEL_TOLERANCE = 1e-6
 
 
@@ -31,18 +31,19 @@ class OrderCertificate:
     Parameters
     ----------
     lower_bound
-        Lower bound of the RMS equation error for all orders in the intervals and all coefficients within
-        `max_term_ratio`, for exact arithmetic on the block-pulse means. 0 if nothing is proved.
+        Lower bound of the RMS equation error for all orders in the intervals and all coefficients that
+        `max_term_ratio` admits. It holds for exact arithmetic on the block-pulse means. 0 if nothing is proved.
     best
         Minimum RMS equation error found; infinite if none was found.
     orders
-        Free orders with the smallest error, by name.
+        Values of the free orders with the smallest error found, by name; empty if none was found.
     requested_tolerance
-        Requested fraction by which the error at other orders may be smaller.
+        Requested maximum fraction by which the error at any orders may be below `best`.
     intervals
         Lowest and highest value of each free order.
     min_separation
-        Minimum difference between alpha and the orders of output terms, and between the orders of one signal.
+        Minimum difference between alpha and the order of every output term, and between the orders of two terms of the
+        same signal.
     max_term_ratio
         Maximum RMS of all terms of an equation together, divided by the RMS of the output.
     cells
@@ -53,13 +54,12 @@ class OrderCertificate:
     m
         Block pulses per run.
     free_run_nr
-        RMS of the output minus the simulation of the best orders, relative to the standard deviation of the output,
-        with the coefficients of least equation error; infinite if the simulation overflows. The certificate
-        bounds the equation error alone.
+        RMS simulation error of the model with `orders` and its least-squares coefficients, divided by the standard
+        deviation of the output; infinite if the simulation fails. The certificate does not bound this error.
     unstable_poles
-        Number of poles of that model with a positive real part; NaN if unknown.
+        Number of poles of this model with a positive real part; NaN if unknown.
     start_errors
-        RMS equation error at each point given as `start`.
+        RMS equation error at each point of the argument `start`.
     """
 
     lower_bound: float
@@ -78,12 +78,18 @@ class OrderCertificate:
 
     @property
     def beatable(self) -> tuple[bool, ...]:
-        """Whether, for each `start` point, other orders may have an error lower by more than the tolerance."""
+        """Whether other orders may have an error lower by more than the requested tolerance, for each start point.
+
+        False means that the lower bound excludes this.
+        """
         return tuple(self.lower_bound < (1 - self.requested_tolerance) * error for error in self.start_errors)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the simulation at the best orders, which the certificate of the equation error does not cover."""
+        """Finding if the simulation at the best orders is unstable or poor; empty otherwise.
+
+        The certificate covers only the equation error.
+        """
         if self.unstable_poles > 0:
             return (make_finding("best_orders_unstable", poles=int(self.unstable_poles), nr=self.free_run_nr),)
         if self.free_run_nr > MAX_FREE_RUN_NR:
@@ -92,7 +98,7 @@ class OrderCertificate:
 
     @property
     def proved_tolerance(self) -> float:
-        """Upper bound of the fraction by which other orders can reduce the error; 1 without a proof."""
+        """Maximum fraction by which other orders can reduce the smallest error found; 1 without a proof."""
         return max(0.0, 1 - self.lower_bound / self.best)
 
     def to_dict(self) -> dict[str, Any]:
@@ -148,8 +154,9 @@ class SearchRow:
     index
         Index of the candidate in the order grid, which decides ties.
     score
-        Score: sum of absolute errors (45) for norm ``"l1"``, RMSE for ``"l2"``. For coupled equations it is the sum of
-        their scores, each divided by its scale.
+        Sum of absolute errors, eq. (45) of the paper, for the norm ``"l1"``, or RMSE for ``"l2"``. For coupled
+        equations, these values are divided by the standard deviation of the output, and for ``"l1"`` also by the number
+        of block pulses. The score is then their sum over the equations.
     orders
         Values of the free orders by name.
     coefficients
@@ -172,30 +179,30 @@ class SearchResult:
     table
         Rows of the best candidates, best first.
     model
-        Model of the first row.
+        Model with the orders and coefficients of the first row.
     candidates
-        Number of candidates.
+        Number of candidates of the search.
     exclusion_counts
-        Number of candidates that are not in the table, by reason: "beaten" (fully evaluated), "bound" (excluded by a
-        lower bound of the score), "stopped early" (excluded by a partial sum of the score), "singular", "diverged". The
-        counts and the rows of the table add up to all candidates. An excluded candidate might have diverged in a full
-        evaluation.
+        Number of candidates that are not in the table, by reason: "beaten" (fully evaluated, worse than the table),
+        "bound" (excluded by a lower bound of the score), "stopped early" (excluded by a partial sum of the score),
+        "singular" (linearly dependent terms) and "diverged" (simulation). Counts and table rows add up to all
+        candidates. A candidate excluded by a bound or stopped early might have diverged in a full evaluation.
     failures
-        First candidates without a score, each as (orders by name, reason).
+        First singular or diverged candidates, each as (orders by name, reason).
     m
         Block pulses per run.
     settings
         Options by name: criterion, norm, coefficients, innovation length, prior covariance, row basis, initial terms.
     at_grid_edge
-        Orders of the first row that are at a limit of their interval, by name.
+        Values of those orders of the first row that are at a limit of their interval, by name.
     excluded_by_box
         Number of candidates, counted as "bound", that were excluded together with a whole box of orders.
     free_runs
-        Number of candidates with non-linear terms that were simulated, the best ones by equation error; 0 for linear
-        equations, for which the search is exhaustive.
+        Number of candidates that were simulated if the equations have nonlinear terms: the best by equation error. 0
+        for linear equations, for which the search is exhaustive.
     verdict, model_findings
-        Verdict and findings of :func:`ftlm.identify` at the orders of rank 1. None and empty for a search resumed from
-        a checkpoint file, which does not contain the runs.
+        Verdict and findings of :func:`ftlm.identify` at the orders of rank 1. They are None and empty for a search
+        resumed from a checkpoint file, which does not contain the runs.
     """
 
     table: list[SearchRow]
@@ -213,23 +220,23 @@ class SearchResult:
 
     @property
     def orders(self) -> dict[str, float]:
-        """Free orders of the best model."""
+        """Values of the free orders of the best model, by name."""
         return self.table[0].orders
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Coefficients of the best model."""
+        """Coefficients of the best model, by name."""
         return self.table[0].coefficients
 
     @property
     def parameters(self) -> dict[str, Parameter]:
-        """Parameters of the best model by name, without standard errors, which a search does not give."""
+        """Parameters of the best model by name, without standard errors, because a search does not compute them."""
         values = {**self.orders, **self.coefficients}
         return parameter_estimates(self.model, values, errors={}, intervals={}, free=values)
 
     @property
     def score(self) -> float:
-        """Score of the best model."""
+        """Score of the first row of the table."""
         return self.table[0].score
 
     def _repr_html_(self) -> str:
@@ -237,14 +244,14 @@ class SearchResult:
 
     @property
     def excluded_summary(self) -> str:
-        """Counts of the excluded candidates by reason, as text."""
+        """Numbers of excluded candidates by reason, as text that continues a sentence: ``, 12 bound, 3 singular``."""
         texts = {reason: f"{count} {reason}" for reason, count in self.exclusion_counts.items() if count}
         if self.excluded_by_box:
             texts["bound"] += f" ({self.excluded_by_box} of them in boxes excluded whole)"
         return "".join(f", {words}" for words in texts.values())
 
     def to_frame(self) -> Any:
-        """Return the ranked table as a pandas DataFrame, one row per rank."""
+        """Return the ranked table as a pandas DataFrame: one row per rank, columns for score, orders, coefficients."""
         rows = [{"rank": r.rank, "score": r.score, **r.orders, **r.coefficients} for r in self.table]
         return to_frame(rows, ["rank"])
 
@@ -262,10 +269,10 @@ class SearchResult:
 
     @property
     def distinct_rows(self) -> list[tuple[SearchRow, int]]:
-        """Return rows with different models, each with the number of table rows that are equivalent to it.
+        """Table rows with different models, each as (row, number of equivalent rows including itself).
 
-        Rows are equivalent if all their orders differ by the same number, because a run from rest then satisfies both
-        equations.
+        Rows are equivalent if their scores and coefficients are equal up to rounding. This occurs if all orders of two
+        rows differ by the same number, because a run from rest then satisfies both equations.
         """
         distinct: list[tuple[SearchRow, int]] = []
         for row in self.table:
@@ -278,7 +285,7 @@ class SearchResult:
 
     @property
     def search_findings(self) -> tuple[Finding, ...]:
-        """Findings on the table: orders at a limit of their interval, and equivalent rows."""
+        """Findings on the table: orders at a limit of their interval, candidates not simulated, equivalent rows."""
         edges = [make_finding("order_on_edge", parameter=n, value=v) for n, v in self.at_grid_edge.items()]
         if 0 < self.free_runs < self.candidates:
             edges.append(make_finding("candidates_not_simulated", count=self.free_runs, candidates=self.candidates))
@@ -292,7 +299,7 @@ class SearchResult:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the table and on the model of rank 1."""
+        """Findings on the table, followed by those on the model of rank 1, without duplicates."""
         return unique([*self.search_findings, *(f for f in self.model_findings if f.code != "order_on_edge")])
 
     def __str__(self) -> str:
@@ -331,7 +338,7 @@ class SearchResult:
 
 
 def _is_same_model(row: SearchRow, other: SearchRow) -> bool:
-    """Whether score and coefficients of two rows are equal up to rounding."""
+    """Whether scores and coefficients of two rows agree within the relative difference `SAME_MODEL_TOLERANCE`."""
     pairs = [(row.score, other.score), *((v, other.coefficients[n]) for n, v in row.coefficients.items())]
     return all(math.isclose(a, b, rel_tol=SAME_MODEL_TOLERANCE) for a, b in pairs)
 
@@ -346,20 +353,19 @@ class StoreStatus:
         Output of the searched equation, or ``"stage"`` for coupled equations.
     candidates
         Total number of candidates. Under an order law it is the number of candidates of the separate equations that
-        must be evaluated, as far as known.
+        must be evaluated, as far as it is known.
     done_count
-        Number of candidates evaluated or excluded.
+        Number of candidates that were evaluated or excluded.
     best
-        Best score so far: sum of absolute errors (45) for norm ``"l1"``, RMSE for ``"l2"``. None before the first
-        score.
+        Best score up to now, in the measure of :attr:`SearchRow.score`. None before the first score.
     settings
-        Criterion, norm and coefficient estimator by name.
+        Options by name, such as criterion, norm and coefficient estimator.
     runs
         Names of the runs.
     version
         Version of ftlm that created the file.
     corruption
-        Description of corrupt data with the number of its record, or None.
+        Description of damage to the file, with the number of the damaged record; None for an intact file.
     """
 
     name: str
@@ -373,7 +379,7 @@ class StoreStatus:
 
     @property
     def complete(self) -> bool:
-        """Whether the search is complete."""
+        """Whether all candidates were evaluated or excluded."""
         return self.done_count == self.candidates
 
     def to_dict(self) -> dict[str, Any]:
@@ -391,7 +397,7 @@ class StoreStatus:
 
 
 def search_summary(searches: Mapping[str, SearchResult]) -> Table:
-    """Return a table with the numbers of candidates in the table and excluded, by reason, for each search."""
+    """Return a report table: one row per search with numbers of candidates in the table and excluded, by reason."""
     reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.exclusion_counts))
     rows: list[list[Cell]] = [
         [
@@ -420,16 +426,16 @@ def search_summary(searches: Mapping[str, SearchResult]) -> Table:
 
 
 def search_top(name: str, search: SearchResult, *, rows: int = 10) -> Table:
-    """Return a table of the first rows of an order search.
+    """Return a report table of the best candidates of an order search: rank, score, orders, coefficients.
 
     Parameters
     ----------
     name
-        Output of the searched equation, or ``"stage"``.
+        Output of the searched equation, or ``"stage"`` for coupled equations; shown in the title.
     search
         Result of the search.
     rows
-        Maximum number of rows.
+        Maximum number of rows of the report table.
     """
     law = len(search.model.equations) > 1
     score = {"l1": "error (45)", "l2": "RMSE"}.get(search.settings["norm"], "score")
@@ -454,7 +460,7 @@ def _search_name(name: str) -> str:
 
 
 def search_html(result: SearchResult) -> str:
-    """Return HTML with the best rows of an order search and the counts of the excluded candidates."""
+    """Return an order search as HTML: table of the best rows, and numbers of excluded candidates by reason."""
     rows: list[list[Cell]] = [["kept", len(result.table)]]
     for reason, count in result.exclusion_counts.items():
         rows.append([reason, count])

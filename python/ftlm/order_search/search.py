@@ -56,14 +56,15 @@ from ftlm.utils.arguments import check_arguments
 from ftlm.utils.formatting import symbol
 from ftlm.utils.validation import Floats, check_threads
 
-#: Candidates of an order search that get a free run.
+#: Minimum number of best candidates by equation error that are simulated if the equations have nonlinear terms.
 FREE_RUN_CANDIDATES = 300
 
 
 def record_run(rec: Record, structure: Structure) -> Run:
-    """Return a run with the same pulse means as a block-pulse record.
+    """Return a run made from a block-pulse record, with one sample at each boundary between pulses.
 
-    Output samples are means of neighboring pulses.
+    Inputs have a zero-order hold and the pulse means of the record. An output sample is the mean of the two neighboring
+    pulse means. The first and the last output sample are extrapolated linearly.
     """
     rows = {name: rec.of(name) for name in structure.signals}
     inputs = {
@@ -80,14 +81,21 @@ def record_run(rec: Record, structure: Structure) -> Run:
 
 
 def record_structure(rec: Record, structure: Structure) -> Structure:
-    """Return the structure for a run made from a record, without the delays and non-linearities already applied."""
+    """Return a structure for runs made from a block-pulse record.
+
+    It has no delays and input nonlinearities, because the signals of the record already include them. Initial
+    conditions and offset are those of the record.
+    """
     return replace(
         structure, delay={}, free_delays={}, input_nonlinearities=UNSET, initial=rec.initial, offset=rec.offset
     )
 
 
 def free_run_errors(model: Model, rec: Record, run: Run) -> dict[str, Floats]:
-    """Return measured minus simulated block-pulse means by output; not finite if the simulation diverges."""
+    """Return measured minus simulated block-pulse means, one array (pulses,) per output name.
+
+    Values are not finite if the simulation diverges.
+    """
     simulated, _ = simulate_samples(replace(model, structure=record_structure(rec, model.structure)), run, 1, None)
     with np.errstate(over="ignore", invalid="ignore"):
         return {
@@ -98,11 +106,11 @@ def free_run_errors(model: Model, rec: Record, run: Run) -> dict[str, Floats]:
 def free_run_score(
     model: Model, records: Sequence[Record], runs: Sequence[Run], norm: Norm, scales: Sequence[float]
 ) -> float:
-    """Return the score of a model's simulations, summed over outputs.
+    """Return the score of a model's simulations over all records, summed over outputs.
 
-    The score of an output is the sum of absolute errors (45), or the RMSE, divided by the scale of the output.
-
-    The score is infinite if a simulation diverges or has no solution in a block pulse.
+    For the norm ``"l1"``, the score of an output is the sum of absolute errors, eq. (45) of the paper, and for ``"l2"``
+    the RMSE. Each is divided by the entry of `scales` for this output. The score is infinite if a simulation fails or
+    diverges.
     """
     try:
         errors = [free_run_errors(model, rec, run) for rec, run in zip(records, runs, strict=True)]
@@ -120,7 +128,9 @@ def free_run_score(
 def rank_by_free_runs(
     table: Sequence[SearchRow], structure: Structure, records: Sequence[Record], norm: Norm, scales: Sequence[float]
 ) -> list[SearchRow]:
-    """Return the rows whose simulation is finite, sorted by its score.
+    """Return the rows of a search table whose simulations are finite, ranked by the score of the simulation.
+
+    Score and rank of each returned row are replaced. Equal scores are ranked by the index of the candidate.
 
     Raises
     ------
@@ -148,7 +158,7 @@ Failures = list[tuple[dict[str, float], str]]
 
 @dataclass(frozen=True)
 class Job:
-    """Order search with validated arguments and block-pulse records."""
+    """Order search with validated arguments, and with the block-pulse records of its runs."""
 
     runs: tuple[str, ...]
     units: Mapping[str, str]
@@ -161,14 +171,14 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Name of the result: the output, or ``"stage"`` for coupled equations under an order law."""
+        """Name of the result: the name of the output, or ``"stage"`` for coupled equations under an order law."""
         return "stage" if self.structure.has_order_law else self.structure.outputs[0]
 
     def request(self, name: str) -> Request:
-        """Return the definition of the search that a checkpoint file stores under a name."""
+        """Return the definition of this search for a checkpoint file, which stores it under `name`."""
         # Hints are initial guesses of a fit and do not change a search.
         structure = replace(self.structure, hints=UNSET)
-        # The records say it, where there is one: what has none is written as it always was.
+        # The records store the kind of offset, so the stored structure omits it.
         object.__setattr__(structure, "offset", UNSET)
         return Request(
             name, structure, dict(self.values), asdict(self.settings), tuple(self.records), self.runs, dict(self.units)
@@ -176,7 +186,7 @@ class Job:
 
     @classmethod
     def of(cls, request: Request, threads: int, progress: ProgressCallback | None) -> Job:
-        """Return the job that a checkpoint file defines; raise ModelError if the definition is invalid."""
+        """Return the order search that a request of a checkpoint file defines; raise ModelError if it is invalid."""
         try:
             settings: dict[str, Any] = {f.name: request.settings[f.name] for f in fields(SearchSettings)}
         except KeyError as error:
@@ -209,13 +219,16 @@ class Job:
         return runs, list(record.inputs), record.start, self.settings, self.threads
 
     def equation_problem(self) -> EquationProblem:
-        """Return the search problem of the job's single equation."""
+        """Return the search problem of the single equation, in the form that the Rust core takes."""
         item = self.structure.equations[0]
         orders = order_grid_tuple(item, self.records[0].signals, self.values)
         return EquationProblem(*self._common_arguments(), orders=orders, fixed=[t.fixed for t in item.terms])
 
     def coupled_problem(self) -> CoupledProblem:
-        """Return the search problem of the job's coupled equations under their order law."""
+        """Return the search problem of the coupled equations, in the form that the Rust core takes.
+
+        Raise ModelError if the standard deviation of an output is 0 or not finite.
+        """
         structure, signals = self.structure, self.records[0].signals
         names = structure.order_names
         law = partial(affine, names=names)
@@ -232,14 +245,21 @@ class Job:
         )
 
     def scales(self) -> list[float]:
-        """Scales by which the scores of the equations are divided: 1 for one equation without an order law."""
+        """Return the number by which the score of each equation is divided.
+
+        Without an order law it is 1. Otherwise it is the standard deviation of the output, which for the norm ``"l1"``
+        is multiplied by the number of block pulses of all records.
+        """
         if not self.structure.has_order_law:
             return [1.0] * len(self.structure.equations)
         points = sum(r.m for r in self.records)
         return [s * points if self.settings.norm == "l1" else s for s in self.standard_deviations()]
 
     def standard_deviations(self) -> list[float]:
-        """Standard deviation of each output, by which the scores of coupled equations are divided."""
+        """Return the standard deviation of each output, in the order of the outputs.
+
+        Deviations are taken from the mean of each record. Raise ModelError if a standard deviation is 0 or not finite.
+        """
         points, spreads = sum(r.m for r in self.records), []
         for output in self.structure.outputs:
             with np.errstate(over="ignore", invalid="ignore"):
@@ -255,7 +275,7 @@ class Job:
 
 
 def check_executor(executor: object) -> None:
-    """Raise ModelError unless an argument is None or an executor of `concurrent.futures`."""
+    """Raise ModelError unless `executor` is None or an executor of `concurrent.futures`."""
     if executor is not None and not isinstance(executor, Executor):
         raise ModelError(
             f"executor = {executor!r} is not an executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
@@ -264,16 +284,20 @@ def check_executor(executor: object) -> None:
 
 
 def threads_per_task(threads: int | None, executor: Executor | None) -> int:
-    """Return the number of threads of one task, by default all cores, or one with an executor."""
+    """Return the number of threads of one task.
+
+    If `threads` is None, it is 1 with an executor. Without one it is ``FTLM_THREADS``, or else the number of cores.
+    Raise ModelError if the number is out of range.
+    """
     return check_threads(1 if threads is None and executor is not None else threads)
 
 
 def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
-    """Run a search, and return its result.
+    """Run an order search and return its result; raise ModelError if no candidate has a finite score.
 
-    `number` is the index of the search in the checkpoint file.
-
-    Candidates with non-linear terms are ranked by equation error first, and the best of them by simulations.
+    `number` is the index of the search in the checkpoint file `store`. If the equations have nonlinear terms and the
+    criterion is the output error, all candidates are ranked by equation error. Only the best of them are simulated and
+    ranked by output error.
     """
     settings = job.settings
     if job.structure.has_nonlinear_terms and settings.criterion == "output-error":
@@ -299,7 +323,10 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
 
 
 def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[SearchRow], Failures]:
-    """Return the rows and the failures of a search of one equation, with orders and coefficients by name."""
+    """Return (table rows, failures) of the search of one equation from the result of the Rust core.
+
+    Orders and coefficients have names. A failure is (orders by name, reason).
+    """
     item = structure.equations[0]
 
     def orders_by_name(alpha: float, orders: list[float]) -> dict[str, float]:
@@ -320,7 +347,10 @@ def _equation_rows(structure: Structure, answer: _core._Found) -> tuple[list[Sea
 
 
 def _stage_rows(structure: Structure, answer: _core._FoundStage) -> tuple[list[SearchRow], Failures]:
-    """Return the rows and the failures of a coupled search, with free orders and all coefficients by name."""
+    """Return (table rows, failures) of the search of coupled equations from the result of the Rust core.
+
+    Free orders and coefficients have names. A failure is (free orders by name, reason).
+    """
     names, table = structure.order_names, []
     for rank, (index, score, free, parts) in enumerate(answer["rows"], 1):
         coefficients: dict[str, float] = {}
@@ -346,7 +376,7 @@ def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core.
     edges = {
         n: v for n, v in best.orders.items() if len(values[n]) > 2 and v in (values[n][0], values[n][-1]) and v != 0
     }
-    # alpha = 2 is where the physics puts it, not an accident of the interval.
+    # The highest order 2 is the physical one, so a limit of 2 needs no finding.
     highest = {n for e in structure.equations for n in e.order.names}
     edges = {n: v for n, v in edges.items() if not (v == 2.0 and n in highest)}
     pruned = {k: cast("int", v) for k, v in counts.items() if k not in ("candidates", "kept")}
@@ -365,7 +395,10 @@ def rank_orders(
     executor: Executor | None = None,
     **settings: Any,
 ) -> SearchResult:
-    """Return the result of an order search without a verdict; see :func:`ftlm.search_orders`."""
+    """Run an order search and return its result without a verdict.
+
+    Arguments are those of :func:`ftlm.search_orders`. Raise ModelError or DataError if an argument is invalid.
+    """
     search_settings = SearchSettings(**settings)
     check_executor(executor)
     job = make_job(
@@ -387,7 +420,10 @@ def make_job(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Job:
-    """Return an order search with validated arguments and records; see :func:`ftlm.search_orders`."""
+    """Validate the arguments of an order search, and return it as a job; arguments as for :func:`ftlm.search_orders`.
+
+    Raise ModelError or DataError if an argument is invalid.
+    """
     checked, workers = as_runs(runs), check_threads(threads)
     if not isinstance(equation, Structure):
         raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
@@ -429,19 +465,19 @@ def resume_search(
     threads, progress, executor
         As for :func:`search_orders`.
     recover
-        Whether to continue a damaged file. The part before the damage is kept, the rest is computed again, and the
-        damaged file is renamed to ``….damaged``.
+        Whether to resume from a damaged file. The records before the damage are kept, and the rest is computed again.
+        The damaged file is renamed to ``….damaged``.
 
     Returns
     -------
     dict of SearchResult
-        Results by output, or by ``"stage"`` for a search under an order law. They equal the results of uninterrupted
-        searches bit for bit. The results of a complete file are only read.
+        Results by output name, or under ``"stage"`` for a search under an order law. They equal the results of
+        uninterrupted searches bit for bit. A completed search is read from the file and not repeated.
 
     Raises
     ------
     DataError
-        If the file is not a checkpoint file, is in use, is damaged (the message has the offset) or cannot be written.
+        If the file is not a checkpoint file, is in use or cannot be written, or is damaged and `recover` is False.
     ModelError
         If `threads` is out of range.
     ConvergenceError
@@ -464,7 +500,10 @@ def resume_job(
     progress: Callable[[int, int], None] | None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Resume one search of a checkpoint file, and return its result; `number` is its index in the file."""
+    """Resume the search with index `number` in a checkpoint file, and return its result.
+
+    Raise DataError if the stored search is invalid.
+    """
     check_executor(executor)
     job = replace(job_of(store, number, threads_per_task(threads, executor)), progress=_core_callback(progress))
     with _usable(store.path, store.contents.requests[number]):
@@ -472,7 +511,7 @@ def resume_job(
 
 
 def job_of(store: Store, number: int, threads: int | None) -> Job:
-    """Return one search of a checkpoint file as a job; `number` is its index in the file."""
+    """Return the search with index `number` in a checkpoint file; raise DataError if it is invalid."""
     request = store.contents.requests[number]
     with _usable(store.path, request):
         return Job.of(request, check_threads(threads), None)
@@ -480,7 +519,7 @@ def job_of(store: Store, number: int, threads: int | None) -> Job:
 
 @contextlib.contextmanager
 def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
-    """Convert the ModelError of an invalid request to a DataError that names search and checkpoint file."""
+    """Convert a ModelError within a ``with`` block to a DataError that names the search and the checkpoint file."""
     try:
         yield
     except ModelError as error:
@@ -491,24 +530,24 @@ def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
 
 @check_arguments
 def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
-    """Return the progress of the searches of a checkpoint file, which may be in use.
+    """Return the progress of every search in a checkpoint file, which another process may be writing.
 
     For an unfinished search under an order law, bounds are computed again, which takes seconds for a fine grid.
 
     Parameters
     ----------
     path
-        A file written with ``store=``.
+        Checkpoint file that :func:`ftlm.search_orders` wrote with ``store=``.
 
     Returns
     -------
     dict of StoreStatus
-        Status by output, or by ``"stage"``.
+        Status by output name, or under ``"stage"`` for a search under an order law.
 
     Raises
     ------
     DataError
-        If the file is not a checkpoint file.
+        If the file is not a checkpoint file, or one of its searches is invalid.
     """
     contents = read_store(path)
     states = {}
@@ -533,9 +572,9 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
 
 
 def _core_callback(progress: Callable[[int, int], None] | None) -> ProgressCallback | None:
-    """Return a progress callback in the form of the core.
+    """Return a progress callback with the arguments that the Rust core passes: (done, total, stopped early).
 
-    A progress bar also receives the fraction of excluded candidates; other callables do not.
+    All three are numbers of candidates. A progress bar receives all of them, any other callable only (done, total).
     """
     if progress is None or isinstance(progress, Progress):
         return progress
@@ -552,7 +591,7 @@ def landscape(
     orders: tuple[str, str] | None = None,
     threads: int | None = None,
 ) -> Landscape:
-    """Compute the score of the search on a grid of two orders.
+    """Compute the score of an order search over two orders, with the other orders as in the best model.
 
     Parameters
     ----------
@@ -563,16 +602,17 @@ def landscape(
     orders
         Names of the two orders; by default the first two free orders with several values in the order grid.
     threads
-        See :func:`ftlm.search_orders`.
+        Number of threads; see :func:`ftlm.search_orders`.
 
     Returns
     -------
     Landscape
+        Score at each pair of grid values; infinite at pairs without a finite score.
 
     Raises
     ------
     ModelError
-        If fewer than two orders have several values, or a name is not one of them.
+        If fewer than two orders have several grid values, or `orders` contains another name or the same name twice.
     """
     axes = {n: v for n, v in (order_grid or OrderGrid()).values(structure).items() if len(v) > 1}
     best = search.orders
@@ -602,7 +642,7 @@ def landscape(
 def score_profiles(
     runs: Sequence[Run], structure: Structure, search: SearchResult, order_grid: OrderGrid
 ) -> list[LineChart]:
-    """Return a chart for each order with several grid values: its score, with the other orders at those of rank 1."""
+    """Return one chart per order with several grid values: score over this order, other orders as in rank 1."""
     charts = []
     best = search.orders
     score = "sum of absolute errors" if search.settings["norm"] == "l1" else "RMSE"
@@ -631,20 +671,24 @@ def score_profiles(
     return charts
 
 
-#: Factors by which each axis of the order grid is subsampled, coarsest first.
+#: Subsampling factors of the order grid, coarsest first, for searches whose measured time is extrapolated.
 SUBSAMPLING_FACTORS = (16, 12, 10, 8, 6, 5, 4, 3, 2)
-#: Maximum fraction of the candidates in a probing search, and the probing time [s] that suffices for an estimate.
+#: Maximum fraction of all candidates in such a search, and time [s] from which its measurement is long enough.
 MAX_PROBE_FRACTION, PROBE_TIME_S = 1 / 12, 0.3
-#: Range of the exponent of time over candidates. It is below 1 because finer grids exclude more.
+#: Range of the exponent e in time ~ candidates^e. It is often below 1, because finer grids exclude more candidates.
 TIME_EXPONENT_RANGE = (0.7, 1.1)
-#: Range of measured over estimated computing time.
+#: Range of the ratio of the actual to the extrapolated computing time.
 TIME_FACTOR_RANGE = (0.6, 4.0)
-#: Number of candidates from which on whole boxes may be excluded, not seen on coarse grids, and the exponent then.
+#: Number of candidates from which on whole boxes may be excluded, and the exponent of time over candidates above it.
+#: Searches on coarse grids do not show this effect.
 BOX_EXCLUSION_CANDIDATES, BOX_TIME_EXPONENT = 1 << 25, 0.5
 
 
 def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = None) -> None:
-    """Show the expected time of all searches on a progress bar; with a checkpoint file, of the remaining work."""
+    """Show the expected time of several order searches on a progress bar; other callables show nothing.
+
+    With a checkpoint file, the time is that of the remaining work.
+    """
     if not isinstance(progress, Progress) or progress.quiet:
         return
     least = most = 0.0
@@ -656,9 +700,9 @@ def announce_time(progress: object, jobs: Sequence[Job], store: Store | None = N
 
 
 def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -> tuple[float, float]:
-    """Return a lower and an upper estimate of the time of a search on this machine [s]; (0, 0) for a small grid.
+    """Return (lower, upper) estimates of the time of a search on this machine [s]; (0, 0) for a small grid.
 
-    The measurement takes at most a tenth of the search and half a second.
+    The time is extrapolated from searches on coarser grids. They take at most a tenth of the search and half a second.
     """
     whole = _candidates(job)
     trials: list[tuple[float, float]] = []
@@ -673,7 +717,7 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
             start_time = clock()
             (part.coupled_problem() if job.structure.has_order_law else part.equation_problem()).search(None)
         except FtlmError:
-            # So coarse a grid may have no candidate, or none with a finite score.
+            # A grid this coarse may have no candidate, or none with a finite score.
             continue
         trials.append((count, clock() - start_time))
         if trials[-1][1] >= PROBE_TIME_S:
@@ -696,14 +740,17 @@ def expected_seconds(job: Job, clock: Callable[[], float] = time.perf_counter) -
 
 
 def _candidates(job: Job) -> float:
-    """Return the number of candidates of a search; under an order law the number of grid points."""
+    """Return the number of candidates of a search; under an order law, the number of points of the order grid."""
     if job.structure.has_order_law:
         return float(math.prod(len(axis) for axis in job.values.values()))
     return float(job.equation_problem().plan()[0])
 
 
 def _remaining_fraction(job: Job, store: Store, number: int) -> float:
-    """Return the fraction of a search that a checkpoint file does not contain."""
+    """Return the fraction (0 to 1) of a search's candidates that a checkpoint file does not contain.
+
+    Under an order law it is 1 until the search is complete, then 0. `number` is the index of the search in the file.
+    """
     section = store.contents.sections[number]
     if job.structure.has_order_law:
         return 0.0 if section.table is not None else 1.0

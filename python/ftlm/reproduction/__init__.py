@@ -1,4 +1,4 @@
-"""Reproduction of the paper's section 5, and the demonstration, a short form of it."""
+"""Reproduction of the paper's section 5, and a short demonstration."""
 
 from ftlm.reproduction.checks import Check, table_3_coefficients
 from ftlm.reproduction.cross_validation import (

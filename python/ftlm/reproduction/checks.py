@@ -1,4 +1,8 @@
-"""Checks of the paper's claims: computed and printed numbers, and a verdict over cases."""
+"""Checks of the paper's claims: computed numbers, numbers printed in the paper, and a verdict over cases.
+
+A case is the outcome of one test of a claim, for one angle, record or arm. In this module, p is the innovation length
+and K0 the prior covariance of multi-innovation.
+"""
 
 from __future__ import annotations
 
@@ -32,29 +36,30 @@ if TYPE_CHECKING:
     from ftlm.reproduction.reproduction import Reproduction
 
 Word = Literal["holds", "does not hold", "depends on", "not decidable by a simulation", "inconclusive"]
-#: Case of a claim: whether the claim holds, and the conditions by name, the same names in all cases of a claim.
+#: Case of a claim: whether the claim holds, and the level of each factor, such as the angle, by the factor's name. All
+#: cases of a claim have the same factors.
 Case = tuple[bool, dict[str, str]]
-#: Factor chosen by the simulation; a verdict that it alone decides reproduces this choice.
+#: Factor that the author of the simulation chose: which arm is simulated. A claim that depends on it is not decidable.
 ARM_FACTOR = "the arm"
-#: Numbers of the rules; relative differences in percent.
+#: Thresholds in the rules of claims.toml, by name; relative differences are in percent.
 RULE_NUMBERS: Mapping[str, float] = read_texts("claims")["rules"]
 FIRST_P, LAST_P = INNOVATION_LENGTHS[0], INNOVATION_LENGTHS[-1]
 
 
 @dataclass(frozen=True)
 class ClaimVerdict:
-    """Verdict over all cases of a claim.
+    """Verdict on a claim over all its cases.
 
     Parameters
     ----------
     word
-        The verdict.
+        Verdict, to which "depends on" adds the factors.
     factors
         Factors on which the outcome depends, the most decisive first.
     cases, holding_cases
         Number of cases, and number of cases in which the claim holds.
     levels
-        (level, cases, cases in which it holds) of the first factor.
+        (level, number of cases, number of cases in which the claim holds) for each level of the first factor.
     """
 
     word: Word
@@ -69,23 +74,24 @@ class ClaimVerdict:
 
     @property
     def counts(self) -> str:
-        """Number of cases in which the claim holds, also by level of the deciding factor."""
+        """Text with the number of cases in which the claim holds, in all and for each level of the first factor."""
         name = "K0 = " if self.factors[:1] == ("K0",) else ""
         parts = "; ".join(f"{name}{level}: {holding} of {count}" for level, count, holding in self.levels)
         return f"{self.holding_cases} of {self.cases} cases" + (f"; {parts}" if parts else "")
 
 
 def case(holds: bool, **factors: str) -> Case:
-    """Return a case: whether the claim holds, and the level of each factor; "_" in a keyword stands for a space."""
+    """Return (whether the claim holds, level of each factor by name); "_" in a keyword becomes a space in the name."""
     return holds, {name.replace("_", " "): level for name, level in factors.items()}
 
 
 def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> ClaimVerdict:
-    """Return the verdict over all cases.
+    """Return the verdict on a claim over all its cases.
 
     A claim holds if it holds in every case, and does not hold if it holds in none. Otherwise it depends on each factor
-    whose change, with all others fixed, changes the outcome. A claim about the machine is not decidable by simulation
-    if it depends on the arm, or if there is only one arm.
+    whose change, with all others fixed, changes the outcome. If a single factor determines the outcome of every case,
+    only this factor is named. A claim about the real machine (`of_the_machine`) is not decidable by simulation if it
+    depends on the simulated arm, or if only one arm was simulated.
     """
     holding = sum(holds for holds, _ in cases)
 
@@ -96,7 +102,7 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
         return outcomes_by_level
 
     def flips(name: str) -> int:
-        """Return the number of pairs of cases that differ in this factor only and in the outcome."""
+        """Return the number of pairs of cases with different outcomes that differ in no factor but `name`."""
         groups = outcomes(lambda factors: tuple(level for n, level in factors.items() if n != name))
         return sum(sum(g) * (len(g) - sum(g)) for g in groups.values())
 
@@ -115,7 +121,7 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
     turning = sorted(filter(flips, names), key=flips, reverse=True)
     if of_the_machine and ARM_FACTOR in turning:
         return verdict("not decidable by a simulation", [ARM_FACTOR], ARM_FACTOR)
-    # One factor that decides every outcome says all.
+    # If one factor determines every outcome, the others need not be named.
     deciding = [n for n in names if all(len(set(g)) == 1 for g in outcomes(itemgetter(n)).values())]
     factors = deciding[:1] or turning or names
     return verdict("depends on", factors, factors[0])
@@ -123,18 +129,18 @@ def combine_cases(cases: Sequence[Case], *, of_the_machine: bool = False) -> Cla
 
 @dataclass(frozen=True)
 class Check:
-    """Claim of the paper, or an error in it, with a verdict from computed numbers.
+    """Claim of the paper (or error in the paper) with a verdict from computed numbers.
 
     Parameters
     ----------
     claim
-        Text of the claim.
+        Claim as a sentence.
     ruling
-        Verdict with the cases that it follows from.
+        Verdict and numbers of cases.
     computed, printed
-        Computed numbers, and the paper's.
+        Texts with the computed numbers and with the numbers printed in the paper.
     rule
-        Condition under which the claim holds in a case.
+        Text of the condition under which the claim holds in a case.
     """
 
     claim: str
@@ -145,33 +151,33 @@ class Check:
 
     @property
     def verdict(self) -> str:
-        """Verdict as text: holds, does not hold, depends on …, not decidable by simulation."""
+        """Verdict as text, such as "holds", "does not hold" or "depends on the angle"."""
         return str(self.ruling)
 
     @property
     def brief(self) -> str:
-        """First of the computed numbers, as text."""
+        """First sentence of the text with the computed numbers."""
         return self.computed.partition(". ")[0]
 
     @property
     def holds(self) -> bool | None:
-        """Whether the claim holds in every case; None if it depends on a factor or is not decidable."""
+        """Whether the claim holds: True in every case, False in none, None for any other verdict."""
         return {"holds": True, "does not hold": False}.get(self.ruling.word)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the check for JSON."""
+        """Return the check as a dictionary for JSON."""
         counts = {"cases": self.ruling.cases, "held": self.ruling.holding_cases}
         texts = {"computed": self.computed, "printed": self.printed, "rule": self.rule}
         return {"claim": self.claim, "verdict": self.verdict, "depends on": list(self.ruling.factors)} | counts | texts
 
 
 def by_angle(numbers: Mapping[str, Iterable[float]], digits: int = 3) -> str:
-    """Format the numbers of every angle."""
+    """Return text with the symbol of each angle and its numbers, with `digits` significant digits."""
     return "; ".join(f"{symbol(name)} {format_list(values, digits)}" for name, values in numbers.items())
 
 
 def format_list(values: Iterable[float], digits: int = 3) -> str:
-    """Format numbers as a list."""
+    """Return numbers as text, separated by commas, with `digits` significant digits."""
     return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
 
 
@@ -192,7 +198,10 @@ def _of_trials(trials: Sequence[Trial], holds: Callable[[Trial], Any], **of: boo
 
 
 def _by_prior(reproduction: Reproduction, numbers: Callable[[Trial], Iterable[float]]) -> str:
-    """Format numbers of the trials on the first record of the main arm, by K0 and angle."""
+    """Return text with numbers from multi-innovation (trials) on the first record of the main arm.
+
+    They are ordered by prior covariance K0 and angle.
+    """
     texts = []
     for prior in PRIOR_COVARIANCES:
         first = {t.output: numbers(t) for t in reversed(reproduction.panel.trials) if t.prior == prior}
@@ -206,14 +215,21 @@ def _printed_text(
     lengths: Sequence[int] = (LAST_P,),
     digits: int = 5,
 ) -> str:
-    """Format a number of the fractional rows of Tables 4 and 5 for some innovation lengths, by angle."""
+    """Return text with one number of each fractional row of the paper's Tables 4 and 5, by angle.
+
+    `number` selects it from a row, and `lengths` are the innovation lengths p of the rows.
+    """
     return by_angle({o: [number(printed.FRACTIONAL_ROWS[o][p]) for p in lengths] for o in outputs}, digits)
 
 
 def deviation_text(reproduction: Reproduction) -> str:
-    """Describe the ratio of implied to simulated standard deviations, and the NR that it implies."""
+    """Return text on the ratios of implied to simulated standard deviations of the printed models.
+
+    NR is the RMSE divided by the standard deviation. If a ratio makes the printed NR of a row impossible, the text also
+    has the smallest possible NR.
+    """
     ratios = sorted(r.deviation_ratio for r in reproduction.ran)
-    # A response r times smaller than the angle leaves at least 1 - 1/r of its deviation.
+    # If the standard deviation of a response is r times smaller than that of the angle, NR is at least 1 - 1/r.
     floors = [max(1 - 1 / r.deviation_ratio, 0.0) for r in reproduction.ran]
     values = [printed.FRACTIONAL_ROWS[r.output][r.p].nr for r in reproduction.ran]
     count = sum(low > nr for low, nr in zip(floors, values, strict=True))
@@ -224,12 +240,15 @@ def deviation_text(reproduction: Reproduction) -> str:
     return page_text("deviations", ratios=middle, floors=floor, values=nr, count=count, rows=len(values))
 
 
-#: Verdict on a claim, and the computed fields of its texts in claims.toml.
+#: Verdict on a claim, and numbers for the placeholders in its texts in claims.toml.
 Evidence = tuple[ClaimVerdict, dict[str, Any]]
 
 
 def movement(reproduction: Reproduction) -> Evidence:
-    """Return whether the printed models move as much as the paper's arm."""
+    """Return verdict and numbers on the claim that the models printed in the paper move as much as the paper's arm.
+
+    It holds if the ratio of standard deviations is within a factor of 2.
+    """
     worst, most = max(reproduction.ran, key=lambda r: r.deviation_ratio), RULE_NUMBERS["deviation_ratio"]
     return _of_rows(reproduction, lambda r: 1 / most < r.deviation_ratio < most), {
         "angle": symbol(worst.output),
@@ -243,14 +262,17 @@ def movement(reproduction: Reproduction) -> Evidence:
 
 
 def stability(reproduction: Reproduction) -> Evidence:
-    """Return whether the printed models are stable."""
+    """Return verdict and numbers on the claim that the models printed in the paper are stable."""
     outputs = dict.fromkeys(r.output for r in reproduction.ran)
     poles = {o: [r.stability.unstable_poles for r in reproduction.ran if r.output == o] for o in outputs}
     return _of_rows(reproduction, lambda r: r.stability.stable), {"poles": by_angle(poles, 2)}
 
 
 def returned_coefficients(reproduction: Reproduction) -> Evidence:
-    """Return whether a fit to the response of each published model recovers its coefficient `a`."""
+    """Return verdict and numbers on the claim that printed models can be recovered from their own simulated responses.
+
+    It holds for a model if a fit at the printed orders returns its coefficient a within 2 %.
+    """
     cases: list[Case] = []
     last: dict[float, dict[str, list[float]]] = {k: {} for k in PRIOR_COVARIANCES}
     orders: list[str] = []
@@ -273,7 +295,11 @@ def returned_coefficients(reproduction: Reproduction) -> Evidence:
 
 
 def recomputed_tables(reproduction: Reproduction) -> Evidence:
-    """Return whether Tables 4 and 5 follow from the data and methods that the paper states."""
+    """Return verdict and numbers on the claim that Tables 4 and 5 of the paper can be recomputed.
+
+    It holds for an angle if recomputed coefficients and normalized residuals (NR) are within a factor of 1.25 of the
+    printed ones, with equal signs.
+    """
     tables = reproduction.as_printed
     settings = (f"{symbol(o)} {t.reading}, with K0 = 1 {t.ratio_at_unit_prior:.3g}" for o, t in tables.items())
     return _of_angles({o: t.is_close for o, t in tables.items()}), {
@@ -285,7 +311,10 @@ def recomputed_tables(reproduction: Reproduction) -> Evidence:
 
 
 def printed_orders(reproduction: Reproduction) -> Evidence:
-    """Return whether no neighboring orders have a smaller equation error than the printed ones."""
+    """Return verdict and numbers on the claim that the orders printed in the paper are the best ones.
+
+    It holds for an angle if no neighboring orders on a grid have a smaller equation error.
+    """
     tables = reproduction.as_printed
     return _of_angles({o: t.rank == 1 for o, t in tables.items()}), {
         "places": ", ".join(f"{symbol(o)} {t.rank} of {t.among}" for o, t in tables.items()),
@@ -294,23 +323,26 @@ def printed_orders(reproduction: Reproduction) -> Evidence:
 
 
 def error_falls(t: Trial) -> bool:
-    """Whether the error, paper (45), never increases with p, and is smaller at the largest p than at the first."""
+    """Whether the error, eq. (45) of the paper, never increases with innovation length p and falls by over 2 %."""
     e = [t.errors[p] for p in INNOVATION_LENGTHS]
     return all(b <= a for a, b in pairwise(e)) and e[-1] < (1 - RULE_NUMBERS["difference"] / 100) * e[0]
 
 
 def converges_faster(arrived: Mapping[int, float]) -> bool | None:
-    """Whether larger p need fewer steps; None if all converge at the first evaluated step."""
+    """Whether larger innovation lengths p converge in fewer steps; None if all converge at the first evaluated step.
+
+    `arrived` is the number of steps by p. The largest p must save at least 10 % of the steps of the smallest.
+    """
     steps = [arrived[p] for p in INNOVATION_LENGTHS]
     if max(steps) <= TRACE_EVERY:
         return None
-    # An error that never converges is not faster than another one that does not.
+    # The claim fails if an error never converges, because infinite numbers of steps cannot be compared.
     earlier = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - RULE_NUMBERS["saving"] / 100) * steps[0]
     return math.isfinite(max(steps)) and earlier
 
 
 def innovation_length(reproduction: Reproduction) -> Evidence:
-    """Return whether a larger p gives a smaller error."""
+    """Return verdict and numbers on the claim that a larger innovation length p gives a smaller simulation error."""
     return _of_trials(reproduction.panel.trials, error_falls), {
         "errors": _by_prior(reproduction, lambda t: t.errors.values()),
         "stated": _printed_text(lambda row: row.error, lengths=INNOVATION_LENGTHS),
@@ -318,7 +350,7 @@ def innovation_length(reproduction: Reproduction) -> Evidence:
 
 
 def convergence(reproduction: Reproduction) -> Evidence:
-    """Return whether a larger p needs fewer steps."""
+    """Return verdict and numbers on the claim that a larger innovation length p converges in fewer recursion steps."""
     trials = reproduction.panel.trials
     comparable = [t for t in trials if converges_faster(t.convergence_steps) is not None]
     return _of_trials(comparable, lambda t: converges_faster(t.convergence_steps)), {
@@ -329,7 +361,10 @@ def convergence(reproduction: Reproduction) -> Evidence:
 
 
 def weak_prior(reproduction: Reproduction) -> Evidence:
-    """Return whether a larger p gives a smaller error with a weak prior."""
+    """Return verdict and numbers on the claim that a larger innovation length p gives a smaller simulation error.
+
+    Only results with a weak prior are used.
+    """
     weak = [t for t in reproduction.panel.trials if t.prior == WEAK_PRIOR]
     ruling = _of_trials(weak, error_falls)
     ratios = [t.errors[LAST_P] / e for t in weak if math.isfinite(e := t.errors[FIRST_P]) and e]
@@ -344,18 +379,24 @@ def weak_prior(reproduction: Reproduction) -> Evidence:
 
 
 def weak_prior_variation(each: Mapping[int, Mapping[str, float]]) -> float:
-    """Largest relative change of a coefficient between p = 1 and any other p."""
+    """Return the largest relative change of a coefficient from innovation length p = 1 to any other p.
+
+    `each` has the coefficients by p and name.
+    """
     first = each[FIRST_P]
     return max(abs(c[n] / first[n] - 1) for c in each.values() for n in first if first[n])
 
 
 def beats(error: float, seeds: Iterable[float]) -> bool:
-    """Whether an error is finite and below the median over seeds; the minimum would depend on the number of seeds."""
+    """Whether an error is finite and below the median of an optimizer's errors over its seeds (`seeds`).
+
+    The minimum over seeds would depend on their number.
+    """
     return math.isfinite(error) and error < statistics.median(seeds)
 
 
 def optimizers(reproduction: Reproduction) -> Evidence:
-    """Return whether multi-innovation has a smaller error than the other optimizers."""
+    """Return verdict and numbers on the claim that multi-innovation has a smaller error than the other optimizers."""
     contests = reproduction.panel.contests
     cases = [
         case(beats(error, errors.values()), K0=prior_text(k), the_arm=c.arm, the_angle=symbol(c.output), the_rival=name)
@@ -379,7 +420,11 @@ def optimizers(reproduction: Reproduction) -> Evidence:
 
 
 def manual(reproduction: Reproduction) -> Evidence:
-    """Return whether the model with p = 7 has a smaller error than the manual's model, if the simulated arms agree."""
+    """Return verdict and numbers on the claim that multi-innovation is more accurate than the manufacturer's model.
+
+    It holds if the normalized residual (NR) of the model with innovation length 7 is smaller. With simulated arms, it
+    is decidable only if the outcome does not depend on the arm.
+    """
     both = {o: [printed.INTEGER_ROWS[o].nr, printed.FRACTIONAL_ROWS[o][LAST_P].nr] for o in ANGLE_NAMES}
     return _of_trials(reproduction.panel.trials, lambda t: t.nr < t.manual, of_the_machine=reproduction.simulated), {
         "errors": _by_prior(reproduction, lambda t: (t.manual, t.nr)),
@@ -388,7 +433,10 @@ def manual(reproduction: Reproduction) -> Evidence:
 
 
 def fractional_orders(reproduction: Reproduction) -> Evidence:
-    """Return whether fractional orders improve the fit significantly, if the simulated arms agree."""
+    """Return verdict and numbers on the claim that fractional orders improve the fit significantly.
+
+    With simulated arms, it is decidable only if the outcome does not depend on the arm.
+    """
     freed = reproduction.panel.order_comparisons
     verdicts = [(f, o, improves) for f in freed for o in f.free_nr if (improves := f.improves(o)) is not None]
     cases = [case(improves, the_arm=f.arm, the_angle=symbol(o)) for f, o, improves in verdicts]
@@ -401,7 +449,11 @@ def fractional_orders(reproduction: Reproduction) -> Evidence:
 
 
 def close_orders(reproduction: Reproduction) -> Evidence:
-    """Return whether models with the printed orders describe the arm."""
+    """Return verdict and numbers on the claim that models with the orders printed in the paper describe the arm.
+
+    It holds for an angle if the normalized residual (NR) of the simulation is small, also relative to that of the
+    equation error.
+    """
     near = {o: s.printed_orders.estimation for s, o in reproduction.angles}
     nr = {o: (c.equation_error[o].nr, c.output_error[o].nr) for o, c in near.items()}
     holding = {
@@ -414,7 +466,11 @@ def close_orders(reproduction: Reproduction) -> Evidence:
 
 
 def published_form(reproduction: Reproduction) -> Evidence:
-    """Return whether the published form recovers the orders of an arm whose links move with their hubs."""
+    """Return verdict and numbers on the claim that the published equations recover the orders of the arm.
+
+    The published equations are (22)-(25) of the paper. The arm is simulated by its eqs. (14)-(15). The claim holds for
+    a joint if all order estimates are within four standard errors of the true values.
+    """
     cases: list[Case] = []
     away: list[str] = []
     fits: dict[str, list[float]] = {}
@@ -428,7 +484,7 @@ def published_form(reproduction: Reproduction) -> Evidence:
         fits |= {o: [c.estimation.output_error[o].fit for c in both] for o in stage.outputs}
         count_before = len(away)
         for name, value in result.orders.items():
-            # The one order that the published form alone leaves free is fixed in the other.
+            # One order is free in the published form only; in the simulated arm it is fixed at 2.
             truth, error = reproduction.truth[number].get(name, 2.0), result.standard_errors[name]
             if not (math.isfinite(error) and abs(value - truth) <= RULE_NUMBERS["standard_errors"] * error):
                 away.append(f"{symbol(name)} {value:.4g} ± {error:.2g} ({truth:g})")
@@ -439,7 +495,10 @@ def published_form(reproduction: Reproduction) -> Evidence:
 
 
 def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
-    """Return (from Table 3, from effective parameters, printed) of each coefficient of the paper's (22)-(25)."""
+    """Return three values of each coefficient of eqs. (22)-(25) of the paper, by name.
+
+    They follow from Table 3 of the paper and from the manufacturer's effective parameters, or are printed in the paper.
+    """
     sets = [{1: PARAMETER_SETS[n][1], 2: PARAMETER_SETS[n][2]} for n in ("table-3", "effective")]
     coefficients = {}
     for output, row in printed.INTEGER_ROWS.items():
@@ -452,7 +511,10 @@ def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
 
 
 def dropped_derivative(reproduction: Reproduction) -> Evidence:
-    """Return whether the paper's (19) and (21) may drop the derivative of the current."""
+    """Return verdict and numbers on the claim that the paper may drop the derivative of the current.
+
+    Equations (19) and (21) drop it. The claim holds if the printed orders give this derivative the order 0.
+    """
     orders = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGE_NUMBERS}
     dropped = {n: order_law(n, "derived")["input"].at(each) for n, each in orders.items()}
     parts = [stage.derived for stage in reproduction.stages.values()]
@@ -465,7 +527,10 @@ def dropped_derivative(reproduction: Reproduction) -> Evidence:
 
 
 def table_3(_: Reproduction) -> Evidence:
-    """Return whether Table 3 gives the printed integer-order models."""
+    """Return verdict and numbers on the claim that the parameters in Table 3 give the printed integer-order models.
+
+    It holds if all coefficients agree within 2 %.
+    """
     rows = table_3_coefficients()
     ratios = {n: t / p for n, (t, _, p) in rows.items()}
     off = {n: r for n, r in ratios.items() if abs(r - 1) > RULE_NUMBERS["difference"] / 100}
@@ -481,21 +546,27 @@ def table_3(_: Reproduction) -> Evidence:
 
 
 def one_record(_: Reproduction) -> Evidence:
-    """Return whether Table 7 implies one standard deviation of each angle."""
+    """Return verdict and numbers on the claim that Table 7 of the paper is based on one record.
+
+    It holds for an angle if both of its rows imply the same standard deviation (RMSE / NR) within 15 %.
+    """
     spreads = printed.implied_spreads()
     agreeing = {o: abs(g / m - 1) <= RULE_NUMBERS["mismatch"] / 100 for o, (g, m) in spreads.items()}
     return _of_angles(agreeing), {"deviations": by_angle(spreads)}
 
 
 def possible_row(_: Reproduction) -> Evidence:
-    """Return whether a mean absolute error is at most the RMSE of the same row."""
+    """Return verdict and numbers on the claim that the mean absolute error of one printed row is at most its RMSE.
+
+    This inequality holds for any data.
+    """
     row = printed.INTEGER_ROWS["theta22"]
     mean = row.error / printed.PULSE_COUNT
     numbers = {"mean": mean, "pulses": printed.PULSE_COUNT, "error": row.error, "rmse": row.rmse}
     return combine_cases([case(mean <= row.rmse, the_angle="θ₂₂")]), numbers
 
 
-#: Fields that the texts of several claims have.
+#: Values of placeholders that the texts of several claims contain.
 SHARED_FIELDS = {
     "first_p": FIRST_P,
     "last_p": LAST_P,
@@ -503,7 +574,7 @@ SHARED_FIELDS = {
     "weak_prior": WEAK_PRIOR,
     "published": printed,
 }
-#: Checks in the order of the page; their texts are in claims.toml, by the names of the functions.
+#: Checks in the order of the page. Their texts are in claims.toml under the names of the functions.
 CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
     movement,
     stability,
@@ -526,7 +597,7 @@ CLAIM_CHECKS: tuple[Callable[[Reproduction], Evidence], ...] = (
 
 
 def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduction) -> Check:
-    """Return the check of one claim."""
+    """Evaluate the check of one claim, and return it with its texts from claims.toml."""
     ruling, fields = check(reproduction)
     texts, values = (
         read_texts("claims")[check.__name__],
@@ -536,7 +607,7 @@ def make_check(check: Callable[[Reproduction], Evidence], reproduction: Reproduc
 
 
 def checks(reproduction: Reproduction) -> list[Check]:
-    """Compare the claims of the paper, and its errors, with computed numbers; claims without numbers are omitted."""
+    """Return the checks of all claims of the paper; a claim is omitted if the reproduction lacks results for it."""
     texts = read_texts("claims")
     return [
         make_check(check, reproduction)

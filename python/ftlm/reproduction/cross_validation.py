@@ -36,7 +36,8 @@ from ftlm.utils.resources import duration_bounds, estimate_duration, output_erro
 from ftlm.utils.validation import check_threads, join_names
 from ftlm.validation.comparison import Comparison
 
-#: Free orders of each structure; the other orders are integer.
+#: Free orders of each structure (beta: elasticity, mu: damping), by the structure's label ("kind"). Other orders are
+#: integer.
 INTEGER_KIND = "whole orders"
 FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
     INTEGER_KIND: (),
@@ -44,49 +45,50 @@ FREE_ORDERS_BY_KIND: dict[str, tuple[str, ...]] = {
     "fractional damping": ("mu",),
     "both fractional": ("beta", "mu"),
 }
+#: Integer order of each of these terms.
 WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
-#: Maximum number of samples of a run in a fit; the arm's modes are a decade below the reduced rate of a 20 s run.
+#: Maximum number of samples of a run in a fit. For a run of 20 s, the modes of the arm are a decade below this rate.
 MAX_SAMPLES = 1250
-#: Label of the structures of ``Deflection.without_rate``.
+#: Label of structures without the term in the other deflection's rate (``Deflection.without_rate``).
 WITHOUT_RATE_LABEL = "without the rate of the other deflection"
 
 
-#: Structure in the charts: elasticity and damping fractional, as in the paper.
+#: Structure that charts compare with integer orders: elasticity and damping are fractional, as in the paper.
 CHARTED_KIND = "both fractional"
-#: Kinds with a fractional order.
+#: Structures with at least one fractional order.
 FRACTIONAL_KINDS = tuple(kind for kind in FREE_ORDERS_BY_KIND if kind != INTEGER_KIND)
-#: Verdict in a table cell.
+#: Text of a verdict (`Verdict.improves`) in a table cell.
 VERDICT_CELLS = {True: "yes", False: "no", None: "inconclusive"}
-#: Points of a line.
+#: Maximum number of points of a line in a chart.
 LINE_POINTS = 700
 
 
 @dataclass(frozen=True)
 class RunFit:
-    """Structure fitted to one run, with its simulations on all runs.
+    """Fit of one structure to one run, with simulations of the model on all runs.
 
     Parameters
     ----------
     result
-        The identification.
+        Identification from the estimation run.
     comparisons
-        Comparisons by the name of the run, the estimation run included.
+        Comparison of each run with its simulation by the model, by name of the run. The estimation run is included.
     """
 
     result: Identification
     comparisons: dict[str, Comparison]
 
     def fit(self, run: str) -> float:
-        """Fit of the simulation in percent; minus infinity on overflow."""
+        """Return the fit of the simulation on the run with this name [%]; minus infinity if it overflows."""
         value = next(iter(self.comparisons[run].fit.values()))
         return value if math.isfinite(value) else -math.inf
 
     @property
     def estimates(self) -> dict[str, tuple[float, float, float]]:
-        """Value and both ends of the 95 % interval of each free parameter, by name; orders first.
+        """(estimate, low, high) of each free parameter by name, with its 95 % interval; orders come first.
 
-        The elasticity a D^beta and the damping d D^mu of the deflection differ only in their orders, so a fit may
-        exchange them. The term of the lower order is therefore named a and beta here.
+        The elasticity a D^beta y and the damping d D^mu y of the deflection y differ only in their orders, so a fit may
+        exchange them. Here, a and beta always belong to the term of the lower order.
         """
         joint = self.result.joint
         values = {**self.result.orders, **({} if joint is None else joint.coefficients)}
@@ -103,7 +105,7 @@ class RunFit:
         return len(self.estimates)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fit for JSON."""
+        """Return fits, estimates, intervals and warnings as a dictionary for JSON."""
         return {
             "numbers": self.numbers,
             "fit": {run: finite(self.fit(run)) for run in self.comparisons},
@@ -115,16 +117,16 @@ class RunFit:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Decision whether a kind of fractional order improves the prediction significantly.
+    """Verdict on whether fractional orders improve the prediction of other runs significantly.
 
     Parameters
     ----------
     kind
-        A key of ``FREE_ORDERS_BY_KIND``.
+        Structure with fractional orders, a key of ``FREE_ORDERS_BY_KIND``.
     improves
-        The decision; None if it is inconclusive.
+        Whether they improve it; None if the test is inconclusive.
     words
-        Numbers that it follows from, as text.
+        Text with the fits and intervals from which the verdict follows.
     """
 
     kind: str
@@ -134,20 +136,23 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Deflection:
-    """Cross-validation of one deflection of the arm.
+    """Cross-validation of integer and fractional orders on one deflection of the arm.
+
+    A kind is a structure with certain free orders, a key of ``FREE_ORDERS_BY_KIND``.
 
     Parameters
     ----------
     output
         Name of the deflection.
     structure
-        Structure with both orders free.
+        Structure with free orders of elasticity and damping.
     fits
-        Fits by kind, then by estimation run.
+        Fits by kind, then by name of the estimation run.
     failed
-        Reasons for missing fits, by kind and run.
+        Error message of each failed fit, by (kind, estimation run).
     without_rate
-        Cross-validation without the rate of the other deflection; None if the other stage was not measured.
+        Cross-validation of structures without the term in the other deflection's rate. None if the other joint was not
+        measured.
     """
 
     output: str
@@ -157,7 +162,10 @@ class Deflection:
     without_rate: Deflection | None = None
 
     def gains(self, kind: str) -> dict[tuple[str, str], float]:
-        """Gain in fit over integer orders by (estimation run, validation run) [percentage points]."""
+        """Return the gain in fit of a kind over integer orders [percentage points].
+
+        Keys are (estimation run, validation run). The gain is minus infinity if the fit of this kind failed.
+        """
         gains = {}
         for run, whole in self.fits[INTEGER_KIND].items():
             other = self.fits[kind].get(run)
@@ -168,12 +176,15 @@ class Deflection:
         return gains
 
     def worse(self, kind: str) -> list[str]:
-        """Runs on which a fit is worse than the fit of integer orders, a special case of its structure."""
+        """Return the names of estimation runs to which a kind fits worse than integer orders.
+
+        Integer orders are a special case of every kind, so such a fit has not found the optimum.
+        """
         both = ((run, each, self.fits[INTEGER_KIND][run]) for run, each in self.fits[kind].items())
         return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MIN_FIT_GAIN]
 
     def intervals(self, kind: str) -> dict[str, dict[str, tuple[float, float]]]:
-        """Return the 95 % intervals of the free orders, by order name, then by estimation run."""
+        """Return the 95 % intervals (low, high) of the free orders of a kind, by order name, then by estimation run."""
         return {
             name: {run: each.estimates[name][1:] for run, each in self.fits[kind].items()}
             for name in self.structure.order_names
@@ -182,11 +193,14 @@ class Deflection:
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """Verdicts of all kinds with a fractional order."""
+        """Verdicts on all kinds with a fractional order."""
         return [self.verdict(kind) for kind in FRACTIONAL_KINDS]
 
     def verdict(self, kind: str) -> Verdict:
-        """Verdict of one kind, from its gains and intervals."""
+        """Return the verdict on one kind with fractional orders, from its gains in fit and the intervals of its orders.
+
+        It is inconclusive if a fit failed, is unusable, or is worse than integer orders on its estimation run.
+        """
         intervals, whole_fits, fits = self.intervals(kind), self.fits[INTEGER_KIND], self.fits[kind]
         worse = self.worse(kind)
         bad = [run for each in (fits, whole_fits) for run, f in each.items() if is_degenerate(f.result)]
@@ -216,7 +230,7 @@ class Deflection:
         return Verdict(kind, improves, words)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return fits and verdicts of this structure for JSON."""
+        """Return equation, verdicts, fits and failures as a dictionary for JSON, without ``without_rate``."""
         return {
             "equation": str(self.structure),
             "verdicts": {v.kind: {"improves": v.improves, "words": v.words} for v in self.verdicts},
@@ -226,7 +240,7 @@ class Deflection:
 
 
 def _range(low: float, high: float) -> str:
-    """Format an interval; unbounded ends are omitted."""
+    """Return an interval as text, such as "0.10 to 0.25"; infinite limits are omitted ("from 0.10 up")."""
     ends = [f"{v:.2f}".replace("-", "−") if math.isfinite(v) else "" for v in (low, high)]
     if all(ends):
         return " to ".join(ends)
@@ -234,7 +248,7 @@ def _range(low: float, high: float) -> str:
 
 
 def percent(value: float) -> str:
-    """Format a fit in percent."""
+    """Return a fit [%] as text with one decimal and a typographic minus sign; "−∞" if it is not finite."""
     return f"{value:.1f}".replace("-", "−") if math.isfinite(value) else "−∞"
 
 
@@ -245,13 +259,13 @@ class OrderCrossValidation:
     Parameters
     ----------
     runs
-        Runs as used for estimation and validation.
+        Runs as used for estimation and validation, decimated if they are long.
     deflections
-        Results by output.
+        Cross-validation of each deflection by its name.
     filtered
-        Whether the deflections passed the stock filter.
+        Whether the measured deflections passed the stock 2 Hz low-pass.
     notes
-        Preprocessing of the runs.
+        Texts on decimation, and on angles that are constant in a part of a run.
     """
 
     runs: tuple[Run, ...]
@@ -260,7 +274,7 @@ class OrderCrossValidation:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return fits and verdicts for JSON."""
+        """Return runs, fits and verdicts as a dictionary for JSON."""
         return {
             "runs": [run.name for run in self.runs],
             "filtered": self.filtered,
@@ -274,7 +288,7 @@ class OrderCrossValidation:
 
 
 def dead_channel_notes(runs: Sequence[Run], stages: Sequence[StageNumber]) -> list[str]:
-    """Return notes on angles that stay constant for a part of a run, which every fit uses as measured."""
+    """Return texts on angles that are constant in a part of a run, as of a dead sensor; fits use them unchanged."""
     notes = []
     for stage in stages:
         structure = link_structure(stage, both=len(stages) == 2, filtered=False)
@@ -291,38 +305,40 @@ def cross_validate_orders(
     log: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCrossValidation:
-    """Fit every deflection of the arm to each run with integer and fractional orders, and validate it on all others.
+    """Fit models of each deflection to each run with integer and fractional orders, and validate them on other runs.
 
-    A link has equation (15) with the terms that a real arm needs: the measured hub motion, the accelerations of the
-    other stage and the rate of its deflection if both stages were measured, hub angles in the gauge, and an offset of
-    the gauge per run. All structures have the same terms and differ in the orders of the link's elasticity (integer 0)
-    and damping (integer 1). If both stages were measured, everything is repeated without the rate of the other
-    deflection (``Deflection.without_rate``): an order that improves the prediction only there compensates for the
-    missing term.
+    A link obeys eq. (15) of the paper with the terms that a real arm requires. They are the measured motion of its hub,
+    the influence of hub angles on the strain gauge, and an offset of the gauge per run. If both joints were measured,
+    there are also the accelerations of the other joint and the rate of its deflection. All structures have the same
+    terms. They differ in the orders of the link's elasticity (integer 0) and damping (integer 1).
+
+    If both joints were measured, all fits are repeated without the rate of the other deflection
+    (``Deflection.without_rate``). A fractional order that improves the prediction only without this term compensates
+    for it.
 
     Parameters
     ----------
     runs
-        Two or more, with theta11 and theta12 and (or) theta21 and theta22 [rad]. Runs with more than 1250 samples are
-        decimated. Initial terms, initial filter state and gauge offset are separate for each run.
+        Two or more runs with theta11 and theta12 and (or) theta21 and theta22 [rad]. Runs with more than 1250 samples
+        are decimated. Initial terms, initial filter state and gauge offset are estimated for each run.
     filtered
-        Whether both deflections passed the 2 Hz low-pass of the arm's stock model.
+        Whether the measured deflections passed the 2 Hz low-pass of the arm's stock real-time model.
     threads, progress
-        See :func:`ftlm.search_orders`.
+        Number of threads and progress callback; see :func:`ftlm.search_orders`.
     log
-        Called with a line about the next step.
+        Callback with a line of text at the start of each fit.
 
     Returns
     -------
     OrderCrossValidation
-        Fits, intervals and verdicts.
+        Fits, intervals and verdicts for each deflection.
 
     Raises
     ------
     DataError
-        Fewer than two runs, two of one name, or runs without both angles of a stage.
+        If there are fewer than two runs, two runs have the same name, or no joint has both angles in all runs.
     ModelError
-        No fit with integer orders.
+        If a fit with integer orders fails.
     """
     runs = [run if run.name else replace(run, name=f"run {k}") for k, run in enumerate(runs, 1)]
     if len(runs) < 2:
@@ -347,7 +363,7 @@ def cross_validate_orders(
         progress.expect("all of it", *duration_bounds(estimate_duration(fits, check_threads(threads))))
 
     def cross_validate(structure: Structure, suffix: str = "") -> Deflection:
-        """Fit every kind of structure to every run."""
+        """Fit a structure with each set of free orders to every run; return the cross-validation of its output."""
         output, own = structure.outputs[0], [run.select(list(structure.signals)) for run in runs_used]
         fits: dict[str, dict[str, RunFit]] = {kind: {} for kind in FREE_ORDERS_BY_KIND}
         failed = {}
@@ -376,12 +392,12 @@ def cross_validate_orders(
 
 
 def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
-    """Return the stages of which all runs contain both angles.
+    """Return the numbers of the joints (stages) both of whose angles all runs contain.
 
     Raises
     ------
     DataError
-        There is none.
+        If there is no such joint.
     """
     stages = [n for n in STAGE_NUMBERS if all(f"theta{n}{k}" in run.signals for run in runs for k in (1, 2))]
     if not stages:
@@ -395,13 +411,13 @@ def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
 
 
 def verdict_sentence(output: str, verdict: Verdict) -> str:
-    """Return a verdict as a sentence."""
+    """Return a verdict on a deflection as a sentence that begins with the symbol of the deflection."""
     sentence: str = read_texts("page")["order_verdicts"][verdict.kind][VERDICT_CELLS[verdict.improves]]
     return f"{symbol(output)}: {sentence}"
 
 
 def _structures(result: OrderCrossValidation) -> list[tuple[str, Deflection]]:
-    """Return (heading, deflection) of every structure, with and then without the rate of the other deflection."""
+    """Return (heading, cross-validation) pairs: for each deflection with, then without the other deflection's rate."""
     both = [(o, suffix, d) for o, full in result.deflections.items() for suffix, d in _with_and_without(full)]
     return [(f"{symbol(o)}{suffix}", d) for o, suffix, d in both]
 
@@ -416,7 +432,10 @@ def _verdict(output: str, verdict: Verdict) -> Markup:
 
 
 def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> list[LineChart]:
-    """Charts of a deflection and its simulations by both structures on the run after the estimation run."""
+    """Return one chart per estimation run: the measured deflection and its simulations on the next run in the list.
+
+    The simulations are by the structures with integer orders and with both orders fractional.
+    """
     charts, output = [], deflection.output
     names = [run.name or "" for run in result.runs]
     for run, other_run in zip(names, names[1:] + names[:1], strict=True):
@@ -439,7 +458,10 @@ def validation_charts(result: OrderCrossValidation, deflection: Deflection) -> l
 
 
 def rate_effect_table(result: OrderCrossValidation) -> Table | None:
-    """Table of the verdicts without and with the rate of the other deflection."""
+    """Return a table of the verdicts without and with the term in the other deflection's rate.
+
+    None if only one joint was measured.
+    """
     rows = {
         symbol(output): [
             [kind, *(VERDICT_CELLS[d.verdict(kind).improves] for d in (full.without_rate, full))]
@@ -452,7 +474,7 @@ def rate_effect_table(result: OrderCrossValidation) -> Table | None:
 
 
 def fits_table(result: OrderCrossValidation) -> Table:
-    """Table of the fits of every structure on all runs, with its orders."""
+    """Return a table of fits [%] with one row per structure and one column per (estimation run, validation run)."""
     pairs = [(run.name, other.name) for run in result.runs for other in result.runs]
     rows: dict[str, list[list[Cell]]] = {}
     for heading, deflection in _structures(result):
@@ -470,7 +492,7 @@ def fits_table(result: OrderCrossValidation) -> Table:
 
 
 def estimates_table(deflection: Deflection, suffix: str = "") -> Table:
-    """Table of the estimates with 95 % intervals of every fit, one line per parameter."""
+    """Return a table of the estimates and 95 % intervals of every fit to a deflection, one row per parameter."""
     rows: dict[str, list[list[Cell]]] = {
         f"{kind}, fitted to {run}": [
             [symbol_html(name), value, *(v if math.isfinite(v) else format_bound(v) for v in ends)]
@@ -510,14 +532,21 @@ def _method_section(result: OrderCrossValidation) -> Section:
 
 
 def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write charts, verdicts and numbers as one HTML page.
+    """Write charts, verdicts and numbers of a cross-validation as one HTML page, and return its path.
 
     Parameters
     ----------
     result
-        From :func:`cross_validate_orders`.
-    path, force
-        See :meth:`ftlm.Identification.report`.
+        Result of :func:`cross_validate_orders`.
+    path
+        File to write.
+    force
+        Whether to overwrite an existing file.
+
+    Raises
+    ------
+    DataError
+        If the file exists and `force` is False, or it cannot be written.
     """
     check_free(path, force=force)
     each = {kind: [_verdict(o, d.verdict(kind)) for o, d in result.deflections.items()] for kind in FRACTIONAL_KINDS}
@@ -537,7 +566,7 @@ def cross_validation_page(result: OrderCrossValidation, path: str | os.PathLike[
 
 
 def cross_validation_text(result: OrderCrossValidation) -> str:
-    """Summary of verdicts and fits for a terminal."""
+    """Return a summary for a terminal: verdicts, verdicts without the other deflection's rate, fits, and notes."""
     lines: list[str] = []
     for output, full in result.deflections.items():
         for verdict in full.verdicts:

@@ -1,4 +1,4 @@
-"""Demonstration: simulation and identification of an arm, a short reproduction on a coarse order grid."""
+"""Demonstration: simulation and identification of a flexible arm, as a short reproduction on a coarse order grid."""
 
 from __future__ import annotations
 
@@ -44,20 +44,23 @@ from ftlm.svg.html_page import Section, Table, write_page
 from ftlm.utils.files import check_folder
 from ftlm.utils.formatting import Cell, json_value, symbol, wrap_text
 
-#: Candidates that the result of an order search keeps.
+#: Number of candidates in the result table of an order search.
 TOP_CANDIDATES = 20
-#: Steps between two points of a convergence curve; 128 points are more than a page shows.
+#: Number of recursion steps between two points of a convergence curve, which then has 128 points.
 TRACE_EVERY = 16
-#: Models that are saved, by the suffix of their file name.
+#: Labels of the models that are saved, by the suffix of their file name.
 SAVED_MODELS = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
-#: Models in the terminal summary, with the paper's names of the methods.
+#: Labels of the models in the terminal summary. "p = 7" is multi-innovation with innovation length 7.
 SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
-#: Column widths of the tables of parameters and errors, and of estimates, in the text.
+#: Widths [characters] of the columns after the first one, in text tables of models and of estimates.
 PAPER_TABLE_WIDTHS, ESTIMATES_WIDTHS = (5,) * 4 + (9,) * 4 + (8, 8, 7, 8, 8, 8), (12, 16, 12, 12, 12)
 
 
 def paper_table(models: Mapping[str, Candidate], *, title: str = "Identified models") -> Table:
-    """Return a table in the form of the paper's Tables 4 and 5, with both errors, of models with the same outputs."""
+    """Return a table in the form of the paper's Tables 4 and 5, for models by label that have the same outputs.
+
+    Each row has the orders, coefficients, equation errors and output errors of one angle by one model.
+    """
 
     def cells(label: str, candidate: Candidate, output: str) -> list[Cell]:
         both = (candidate.estimation.equation_error[output], candidate.estimation.output_error[output])
@@ -75,11 +78,11 @@ class Demo:
     Parameters
     ----------
     square, sine
-        The runs.
+        Estimation run and validation run of the simulated arm.
     stages
-        Results by stage, without a comparison of optimizers and a weak prior.
+        Results by joint number (stage), without a comparison of optimizers and without a weak prior.
     files
-        Written files.
+        Paths of the written files.
     """
 
     square: Run
@@ -89,7 +92,7 @@ class Demo:
 
     @property
     def results(self) -> dict[int, dict[str, Identification]]:
-        """Identifications by stage and label."""
+        """Identifications by joint number and label; models that were not identified are omitted."""
         return {
             n: {label: c.result for label, c in stage.candidates.items() if c.result is not None}
             for n, stage in self.stages.items()
@@ -97,16 +100,16 @@ class Demo:
 
     @cached_property
     def validations(self) -> dict[int, Validation]:
-        """Validation of the output-error models on the sine run, by stage."""
+        """Validation on the sine run of the model that was fitted by output error, by joint number."""
         return {stage: results["output error"].validate(self.sine) for stage, results in self.results.items()}
 
     @property
     def truth(self) -> dict[int, dict[str, float]]:
-        """Orders and free coefficients of the simulated arm, by stage."""
+        """True free orders and coefficients of the simulated arm, by joint number and name."""
         return {stage: truth_of(stage) for stage in STAGE_NUMBERS}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return models and their errors for JSON."""
+        """Return models, their errors and the paths of the files as a dictionary for JSON."""
         return {"stages": json_value(self.stages), "files": [str(f) for f in self.files]}
 
 
@@ -121,35 +124,36 @@ def run_demo(
     log: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demo:
-    """Simulate two runs, and identify every equation by p = 1, 3, 5, 7, least squares and output error.
+    """Simulate two runs of an arm, identify its models by several methods, and write runs and models to files.
 
-    Output error uses the equations of the simulated arm, (14)-(15). The other methods use the paper's (22)-(25), whose
-    deflections have the wrong sign.
+    The methods are multi-innovation with innovation lengths 1, 3, 5 and 7, least squares, and output error. Output
+    error uses the equations of the simulated arm, eqs. (14)-(15) of the paper. The other methods use its eqs.
+    (22)-(25), whose deflections have the wrong sign.
 
     Parameters
     ----------
     folder
         Folder of runs and models; created if absent.
     increment
-        Increment of the order grid; the paper's is 0.05, which takes minutes.
+        Increment of the order grid. With the paper's 0.05 the demonstration takes minutes.
     noise, seed
-        See :func:`demo_run`.
+        Standard deviation [rad] and seed of the noise on the angles; see :func:`demo_run`.
     threads, progress
-        See :func:`ftlm.search_orders`.
+        Number of threads and progress callback; see :func:`ftlm.search_orders`.
     force
-        Whether to overwrite.
+        Whether to overwrite existing files.
     log
-        Called with a line about the next step.
+        Callback with a line of text at the start of each step.
 
     Returns
     -------
     Demo
-        Tables and files.
+        Runs, results of both joints, and paths of the files.
 
     Raises
     ------
     DataError
-        A file exists and ``force`` is not set, or the folder cannot be written.
+        If a file exists and `force` is False, or the folder cannot be written.
     """
     names = [f"stage{n}-{stem}.json" for n in STAGE_NUMBERS for stem in SAVED_MODELS]
     check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)
@@ -181,7 +185,7 @@ def run_demo(
 
 
 def demo_text(demo: Demo) -> str:
-    """Summary for a terminal: verdicts, models, fits on the validation run, three warnings."""
+    """Return a summary for a terminal: verdicts and equations of output-error models, fits on both runs, findings."""
     lines = [f"A simulated flexible arm: {demo.square.length} rows of a square current, checked on a sine.", ""]
     for stage, results in demo.results.items():
         best = results["output error"]
@@ -206,7 +210,7 @@ def demo_text(demo: Demo) -> str:
 
 
 def demo_details(demo: Demo) -> str:
-    """All tables for a terminal of 120 columns, followed by the warnings."""
+    """Return all tables as text for a terminal of 120 columns, followed by all warnings."""
     lines = []
     for number, stage in demo.stages.items():
         lines += [f"Stage {number}, square current (the shape of the paper's Table {3 + number})"]
@@ -223,7 +227,11 @@ def demo_details(demo: Demo) -> str:
 
 
 def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the demonstration as one HTML page: verdicts, the validation run, fits, then the tables of each stage."""
+    """Write the demonstration as one HTML page, and return its path.
+
+    The page has verdicts, charts of the validation run and of fits, and a section with the tables of each joint. Raise
+    DataError if the file exists and `force` is False, or it cannot be written.
+    """
     boxes = Markup("").join(
         verdict_box(checked.verdict, f"Stage {stage}, output error: ")
         for stage, checked in demo.validations.items()
@@ -255,7 +263,7 @@ def demo_page(demo: Demo, path: str | os.PathLike[str], *, force: bool = False) 
 
 
 def _stage_section(demo: Demo, stage: int) -> Section:
-    """Section of a joint; findings on the recommended model come first."""
+    """Return the section on one joint, in which findings on the output-error model precede those on other models."""
     results = demo.results[stage]
     best = results["output error"]
     compared = {

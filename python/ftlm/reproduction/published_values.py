@@ -1,6 +1,8 @@
 """Values printed in the paper's Tables 3 to 7, with recomputed tables and simulations of the printed models.
 
-Wang, Li, Li, Liang, Gao, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072. All printed digits are included.
+Paper: Wang, Li, Li, Liang, Gao, Symmetry 2025, 17, 1072, doi:10.3390/sym17071072. All printed digits are included. In
+this module, p is the innovation length and K0 the prior covariance of multi-innovation. Equation and table numbers are
+those of the paper.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ from ftlm.utils.formatting import SUPERSCRIPT_DIGITS, Exact, attributes, finite
 from ftlm.utils.validation import Floats
 from ftlm.validation.comparison import Metrics, compare_means, metrics
 
-#: The paper's p, its number of block pulses, and its four angles in the order n = 1 … 4.
+#: Innovation lengths p of the paper, its number of block pulses, and its angles in the order of the indices n = 1 … 4.
 INNOVATION_LENGTHS = COMPARED_INNOVATION_LENGTHS
 PULSE_COUNT = 2048
 ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
@@ -47,17 +49,21 @@ ANGLE_NAMES = ("theta11", "theta12", "theta21", "theta22")
 ORDER_LETTERS, COEFFICIENT_LETTERS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
 #: Order of each coefficient's term in the paper's equations (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
-#: Prior covariance so large that the data alone decide.
+#: Prior covariance that is so large that only the data determine the estimates.
 WEAK_PRIOR = 1e10
-#: Both values of K0: the paper's identity, and a weak prior.
+#: Prior covariances K0 that are compared: that of the paper (identity matrix), and a weak prior.
 PRIOR_COVARIANCES = (1.0, WEAK_PRIOR)
-#: Options of every order search, named so that no default changes a table.
+#: Options of every order search. They are given explicitly, so that new defaults would not change a table.
 SEARCH_OPTIONS = {"criterion": "output-error", "norm": "l1", "row_basis": "haar"}
 
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """Row of a table of the paper: parameters by letter and its criteria (45), (46), (47), NaN if absent."""
+    """Row of one of the paper's Tables 4 to 7.
+
+    Orders are named alpha, beta, gamma and mu, and coefficients a, b, d and g. The criteria are the sum of absolute
+    errors, RMSE and NR, eqs. (45)-(47). They are NaN if the table does not contain them.
+    """
 
     orders: Mapping[str, float]
     coefficients: Mapping[str, float]
@@ -67,30 +73,30 @@ class PublishedRow:
 
     @property
     def criteria(self) -> tuple[float, float, float]:
-        """Criteria (45), (46) and (47) of the paper."""
+        """Sum of absolute errors, RMSE and normalized residual NR: eqs. (45), (46) and (47) of the paper."""
         return self.error, self.rmse, self.nr
 
 
 def read_paper_table(name: str) -> list[dict[str, str]]:
-    """Return the rows of a csv file beside this module, by column."""
+    """Return the rows of the csv file `name` in the folder of this module, each as texts by column name."""
     with Path(__file__).with_name(name).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
 @cache
 def read_texts(name: str) -> dict[str, Any]:
-    """Return the texts of a toml file beside this module."""
+    """Return the contents of the file `name`.toml in the folder of this module, by key."""
     return tomllib.loads(Path(__file__).with_name(f"{name}.toml").read_text(encoding="utf-8"))
 
 
 def page_text(key: str, **values: Any) -> str:
-    """Return a text of page.toml with these values in the place of its placeholders."""
+    """Return the text of page.toml with this key, in which `values` replace the placeholders."""
     text: str = read_texts("page")["texts"][key]
     return text.format(**values)
 
 
 def _read_rows() -> dict[tuple[str, str, str], PublishedRow]:
-    """Return the rows of Tables 4 to 7 by table, angle and model."""
+    """Return the rows of the paper's Tables 4 to 7 by (table number, angle, model)."""
 
     def values(record: Mapping[str, str], names: Sequence[str]) -> dict[str, float]:
         return {name: Exact(record[name]) for name in names if record[name]}
@@ -106,20 +112,20 @@ def _read_rows() -> dict[tuple[str, str, str], PublishedRow]:
 
 
 _ROWS_BY_PLACE = _read_rows()
-#: Integer-order rows of Tables 4 and 5.
+#: Rows of the integer-order models in Tables 4 and 5, by angle.
 INTEGER_ROWS = {o: row for (_, o, model), row in _ROWS_BY_PLACE.items() if model == "integer"}
-#: Fractional rows of Tables 4 and 5, by angle and innovation length.
+#: Rows of the fractional models in Tables 4 and 5, by angle and innovation length.
 FRACTIONAL_ROWS = {
     o: {int(model): row for (_, angle, model), row in _ROWS_BY_PLACE.items() if angle == o and model.isdigit()}
     for o in ANGLE_NAMES
 }
-#: Table 6: the genetic algorithm.
+#: Rows of Table 6 (models from the genetic algorithm), by angle.
 GENETIC_ROWS = {o: _ROWS_BY_PLACE["6", o, "genetic"] for o in ANGLE_NAMES}
-#: Table 7: criteria of the genetic algorithm and of multi-innovation.
+#: Table 7: criteria (45)-(47) of the genetic algorithm and of multi-innovation, by angle.
 TABLE_7_CRITERIA = {
     o: tuple(_ROWS_BY_PLACE["7", o, model].criteria for model in ("genetic", "multi-innovation")) for o in ANGLE_NAMES
 }
-#: Table 3: value, printed unit, stage and field of `LinkParameters`, with the paper's names.
+#: Table 3 by the paper's names of the parameters: value, printed unit, joint, and field of `LinkParameters`.
 TABLE_3 = {
     each["parameter"]: (float(each["value"]), each["unit"], int(each["stage"]), each["field"])
     for each in read_paper_table("published_parameters.csv")
@@ -127,27 +133,32 @@ TABLE_3 = {
 
 
 def parameter_name(letter: str, output: str) -> str:
-    """Return the name of an angle's order or coefficient, such as alpha1."""
+    """Return an order's or coefficient's name with the index of the angle: alpha and theta11 give alpha1."""
     return f"{letter}{1 + ANGLE_NAMES.index(output)}"
 
 
 def stage_of(output: str) -> StageNumber:
-    """Return the stage of an angle."""
+    """Return the number of the joint (stage) to which an angle belongs: 1 for theta11 and theta12, else 2."""
     return 1 if output[-2] == "1" else 2
 
 
 def last_orders(output: str) -> dict[str, float]:
-    """Orders of an angle's row of p = 7 by name, such as alpha1."""
+    """Return the orders that the paper prints for an angle and innovation length 7, by name, such as alpha1."""
     return {parameter_name(n, output): v for n, v in FRACTIONAL_ROWS[output][INNOVATION_LENGTHS[-1]].orders.items()}
 
 
 def printed_saturation(output: str) -> tuple[float, float, float]:
-    """Fit x·p / (p + c) to the printed a of p = 1 and 7; return x, c and the largest error at p = 3 and 5.
+    """Fit the curve x·p / (p + c) to the printed coefficient a of an angle at innovation lengths p = 1 and 7.
 
     Parameters
     ----------
     output
-        An angle of the paper, such as ``"theta11"``.
+        Name of the angle, such as ``"theta11"``.
+
+    Returns
+    -------
+    tuple of float
+        x, c, and the largest relative error of the curve at p = 3 and 5.
     """
     first, *between, last = ((p, row.coefficients["a"]) for p, row in FRACTIONAL_ROWS[output].items())
     # 1/a = 1/x + (c/x)/p is a line in 1/p.
@@ -158,23 +169,26 @@ def printed_saturation(output: str) -> tuple[float, float, float]:
 
 
 def neighboring_values(value: float, increment: float, steps: int) -> list[float]:
-    """Return the values of an order grid around one of them."""
+    """Return the 2 steps + 1 values from value - steps·increment to value + steps·increment."""
     return [round(value + k * increment, 9) for k in range(-steps, steps + 1)]
 
 
 def best_orders(run: Run, single: Structure, grid: OrderGrid, p: int, prior: float, **work: Any) -> SearchResult:
-    """Return the best candidate of multi-innovation on an order grid."""
+    """Return the result of an order search by multi-innovation, whose table has only the best candidate.
+
+    `p` is the innovation length, `prior` the prior covariance K0, and `work` are further options.
+    """
     options: dict[str, Any] = {"innovation_length": p, "prior_covariance": prior, **SEARCH_OPTIONS, **work}
     return rank_orders(run, single, grid, top=1, coefficients="multi-innovation", **options)
 
 
 def prior_text(prior: float) -> str:
-    """Format K0 as 1 or 10¹⁰."""
+    """Return a prior covariance as text: 1, or a power of ten such as 10¹⁰."""
     return "1" if prior == PRIOR_COVARIANCES[0] else f"10{str(round(math.log10(prior))).translate(SUPERSCRIPT_DIGITS)}"
 
 
-#: Interpretations of the terms a, b, d and g: description, and the signal in each term of a hub and of a deflection,
-#: which is the angle itself, the other one of its stage, or the current.
+#: Interpretations of the terms with coefficients a, b, d and g. Each has a description, and the signal in every term of
+#: the equation of a hub angle and of a deflection: the angle itself, the other angle of its joint, or the current u.
 TERM_INTERPRETATIONS = {
     "(22)–(25)": ("as printed there", "other own other u", "own other own u"),
     "(26), one angle": ("every term has the angle itself", "own own own u", "own own own u"),
@@ -185,29 +199,29 @@ TERM_INTERPRETATIONS = {
         "other own own u",
     ),
 }
-#: Values of K0: eight per decade.
+#: Prior covariances K0 that are tried to match the printed tables: eight per decade.
 PRIOR_GRID = tuple(float(v) for v in np.logspace(-3, 5, 65))
-#: Grid of orders around the printed ones, in the paper's increments, for the rank of the printed orders.
+#: Limits and increment (the paper's) of the grid on which the printed orders are ranked.
 MIN_GRID_ORDER, MAX_GRID_ORDER, GRID_INCREMENT = 1.6, 1.95, 0.05
-#: Maximum ratio to a printed coefficient that counts as agreement, with equal signs.
+#: Maximum ratio between a recomputed and a printed coefficient of equal sign, in either direction, for agreement.
 MAX_COEFFICIENT_RATIO = 1.25
 
 
 @dataclass(frozen=True)
 class Interpretation:
-    """Interpretation of the unstated settings of the paper.
+    """Interpretation of the settings that the paper does not state.
 
     Parameters
     ----------
     terms
-        A key of `TERM_INTERPRETATIONS`.
+        Signals in the terms of an equation, as a key of `TERM_INTERPRETATIONS`.
     filtered
-        Whether the deflections passed the stock 2 Hz filter.
+        Whether the deflections passed the stock 2 Hz low-pass.
     reversed
-        Whether terms of the angle itself are on the left-hand side, as in a transfer function, which reverses their
+        Whether terms in the angle itself are on the left-hand side, as in a transfer function. This reverses their
         sign.
     prior
-        K0.
+        Prior covariance K0.
     """
 
     terms: str
@@ -222,7 +236,7 @@ class Interpretation:
 
 @dataclass(frozen=True)
 class Row:
-    """Coefficients and errors of one interpretation with one p, at the printed orders."""
+    """Coefficients and metrics of the equation error, recomputed at the printed orders for one innovation length."""
 
     coefficients: dict[str, float]
     equation: Metrics
@@ -230,26 +244,27 @@ class Row:
 
 @dataclass(frozen=True)
 class AsPrinted:
-    """Columns of one angle in the paper's Tables 4 and 5, recomputed by the closest interpretation.
+    """Part of the paper's Table 4 or 5 on one angle, recomputed by the closest interpretation of unstated settings.
 
     Parameters
     ----------
     output
-        The angle.
+        Name of the angle.
     reading
-        Closest interpretation.
+        Interpretation whose values are closest to the printed ones.
     rows
-        Rows by p, with the signs of that interpretation.
+        Recomputed rows by innovation length p.
     ratio
-        Geometric mean of the ratios of a and NR to the printed values, over four rows.
+        Geometric mean factor between recomputed and printed values of coefficient a and normalized residual NR, over
+        all four rows; at least 1.
     ratio_at_unit_prior
-        The same ratio with K0 = 1 and the best of the other settings.
+        Smallest such factor among interpretations with prior covariance K0 = 1.
     rank, among
-        Rank of the printed orders by the equation error (45) among neighboring orders, at p = 7.
+        Rank of the printed orders by equation error among neighboring orders, and number of these, at p = 7.
     best
-        Orders of the first rank.
+        Orders with rank 1, by name.
     scale
-        Scale factor of the simulated angle.
+        Factor by which the simulated angle was multiplied to give the standard deviation that the paper implies.
     """
 
     output: str
@@ -264,7 +279,7 @@ class AsPrinted:
 
     @property
     def matching_trends(self) -> list[str]:
-        """Coefficients that rise and fall with p as the printed ones do."""
+        """Letters of the coefficients that rise or fall from each innovation length to the next as in the print."""
         table = FRACTIONAL_ROWS[self.output]
 
         def course(rows: Mapping[int, Any], letter: str) -> list[float]:
@@ -274,7 +289,10 @@ class AsPrinted:
 
     @property
     def ratios(self) -> dict[str, list[float]]:
-        """Ratio to the printed value by p, for every coefficient and NR."""
+        """Ratios of recomputed to printed values of coefficients a, b, d and g and of the normalized residual NR.
+
+        Each list has one ratio per innovation length.
+        """
         table = FRACTIONAL_ROWS[self.output]
         columns = {
             c: [r.coefficients[c] / table[p].coefficients[c] for p, r in self.rows.items()] for c in COEFFICIENT_LETTERS
@@ -283,19 +301,26 @@ class AsPrinted:
 
     @property
     def is_close(self) -> bool:
-        """Whether coefficients have the printed sign, and coefficients and NR are within 25 % of the printed values."""
+        """Whether coefficients and NR have the printed signs and are within a factor of 1.25 of the printed values.
+
+        NR is the normalized residual.
+        """
         return all(
             1.0 / MAX_COEFFICIENT_RATIO <= q <= MAX_COEFFICIENT_RATIO for column in self.ratios.values() for q in column
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the comparison for JSON."""
+        """Return the comparison as a dictionary for JSON."""
         fit = ("reading", "ratio", "ratio_at_unit_prior", "scale", "matching_trends", "ratios", "rows")
         return {"closest settings": str(self.reading)} | attributes(self, (*fit, "rank", "among", "best"))
 
 
 class _Angle:
-    """Regressors of one angle at any orders in Haar coordinates, and the closed form of the paper's recursion (44)."""
+    """Regressors of one angle at any orders, and coefficients by the closed form of eq. (44) of the paper.
+
+    `angles` are the block-pulse means of both angles of the joint, `current` those of the motor current, and `step` is
+    the width of a block pulse [s].
+    """
 
     def __init__(self, angles: Mapping[str, Floats], current: Floats, output: str, step: float) -> None:
         other = output[:-1] + ("2" if output.endswith("1") else "1")
@@ -310,7 +335,7 @@ class _Angle:
         self._transforms: dict[tuple[str, float], tuple[Floats, Floats]] = {}
 
     def integral(self, signal: str, order: float) -> tuple[Floats, Floats]:
-        """Return the fractional integral I^order of a signal, in time and in Haar coordinates."""
+        """Return the fractional integral of the signal "own", "other" or "u", in time and as Haar transform (m,)."""
         key = signal, round(order, 6)
         if key not in self._transforms:
             kernel = block_pulse_kernel(order, self.m, step=self.step)
@@ -319,12 +344,12 @@ class _Angle:
         return self._transforms[key]
 
     def places(self, terms: str) -> list[str]:
-        """Return the signal of each of the terms a, b, d, g."""
+        """Return the signal ("own", "other" or "u") in each of the terms with coefficients a, b, d and g."""
         _, hub, deflection = TERM_INTERPRETATIONS[terms]
         return (hub if self.output.endswith("1") else deflection).split()
 
     def regressors(self, terms: str, orders: Mapping[str, float]) -> tuple[Floats, Floats]:
-        """Return the regressor columns a, b, d, g of the paper's (42), in time and in Haar coordinates."""
+        """Return the regressors of a, b, d and g, eq. (42) of the paper, in time and as Haar transform, each (m, 4)."""
         names = ("gamma", "beta", "mu") if terms == "a and b exchanged" else ("beta", "gamma", "mu")
         etas = [*(orders["alpha"] - orders[n] for n in names), orders["alpha"]]
         parts = [self.integral(s, eta) for s, eta in zip(self.places(terms), etas, strict=True)]
@@ -332,7 +357,11 @@ class _Angle:
         return np.stack(time, axis=1), np.stack(haar, axis=1)
 
     def solve_coefficients(self, haar: Floats, priors: Sequence[float], p: int) -> list[Floats]:
-        """Return the paper's (44): least squares with a prior, and weight min(p, M - i + 1) for row i."""
+        """Return the coefficients by eq. (44) of the paper, one array (4,) for each prior covariance.
+
+        They are weighted least-squares estimates with a prior, from the regressors `haar` in M Haar rows. Row i = 1 … M
+        has the weight min(p, M - i + 1) with the innovation length p.
+        """
         weights = np.minimum(p, self.m - np.arange(self.m)).astype(np.float64)
         weighted = haar * weights[:, None]
         gram, right = weighted.T @ haar, weighted.T @ self.haar_y
@@ -342,12 +371,18 @@ class _Angle:
 
 
 def implied_spreads() -> dict[str, tuple[float, float]]:
-    """Standard deviations that Table 7 implies by RMSE / NR, for the genetic algorithm and for multi-innovation."""
+    """Return the standard deviations [rad] of each angle that its rows in the paper's Table 7 imply by RMSE / NR.
+
+    The first is from the row of the genetic algorithm, the second from that of multi-innovation.
+    """
     return {o: (g[1] / g[2], m[1] / m[2]) for o, (g, m) in TABLE_7_CRITERIA.items()}
 
 
 def papers_record() -> tuple[Run, dict[str, float]]:
-    """Run of the arm under the paper's square current, every angle scaled to the implied standard deviation."""
+    """Return a simulated run under the paper's square current, and the scale factor of each angle.
+
+    Every angle is scaled to the standard deviation that the paper's Table 7 implies for multi-innovation.
+    """
     run = demo_run("square", parameters=PAPERS_ARM)
     scales = {o: implied[1] / float(np.std(run[o])) for o, implied in implied_spreads().items()}
     outputs = {o: run[o] * scales[o] for o in scales}
@@ -356,12 +391,17 @@ def papers_record() -> tuple[Run, dict[str, float]]:
 
 
 def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
-    """Recompute Tables 4 and 5 by the closest interpretation, angle by angle.
+    """Recompute the paper's Tables 4 and 5 by the interpretation of unstated settings that is closest to the print.
 
     Parameters
     ----------
     outputs
-        Angles; by default all four.
+        Names of the angles; by default all four.
+
+    Returns
+    -------
+    dict of AsPrinted
+        Recomputed table of each angle, by name.
     """
     run, scales = papers_record()
     readings = {}
@@ -375,7 +415,7 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
         filter_series = sensor_series(structure, PULSE_COUNT, own.step)
         if filter_series is not None:
             behind = _core.series_multiply(filter_series, behind, PULSE_COUNT)
-        # The implied deviation is that of the angle as it was logged.
+        # The standard deviation that the paper implies is that of the recorded angle, which has passed the filter.
         behind = behind * float(np.std(plain_angles[deflection])) / float(np.std(behind))
         angles_by_filter = {False: plain_angles, True: {hub: plain_angles[hub], deflection: behind}}
         current = own.of(f"I{stage}")
@@ -385,9 +425,9 @@ def as_printed(outputs: Sequence[str] = ANGLE_NAMES) -> dict[str, AsPrinted]:
 
 
 def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrinted:
-    """Return the recomputed table closest to the printed one, over all interpretations of the unstated settings.
+    """Return the recomputed table of an angle that is closest to the printed one, over all interpretations.
 
-    Interpretations with the sensor filter apply to deflections only.
+    `angles` has the regressors without and with the sensor filter. The filter is tried for deflections only.
     """
     table, orders = FRACTIONAL_ROWS[output], FRACTIONAL_ROWS[output][1].orders
     candidates: list[tuple[float, Interpretation, dict[int, Row]]] = []
@@ -412,9 +452,10 @@ def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrin
 
 
 def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) -> float:
-    """Return the mean absolute logarithm of the ratios of a and NR to the printed values.
+    """Return the mean absolute logarithm of the ratios of recomputed to printed values, over all rows.
 
-    A reversed sign of a adds ln 10.
+    The values are coefficient a and normalized residual NR. Each row in which a has the wrong sign adds ln 10 to the
+    sum.
     """
     logs = []
     for p, row in rows.items():
@@ -427,10 +468,10 @@ def _log_distance(rows: Mapping[int, Row], table: Mapping[int, PublishedRow]) ->
 def _rank_orders(
     angle: _Angle, reading: Interpretation, orders: Mapping[str, float]
 ) -> tuple[int, int, dict[str, float]]:
-    """Rank the printed orders on the grid of orders by the sum of absolute residuals.
+    """Rank the printed orders beta, gamma and mu among all orders of a grid, by the sum of absolute equation errors.
 
-    Return the rank of the printed orders, the number of grid points, and the orders with the lowest sum. The innovation
-    length p is the largest of the paper.
+    Return the rank of the printed orders, the number of grid points, and the orders with the smallest sum. The
+    coefficients of each point are those of the largest innovation length p.
     """
     count = round((MAX_GRID_ORDER - MIN_GRID_ORDER) / GRID_INCREMENT) + 1
     values = [round(MIN_GRID_ORDER + k * GRID_INCREMENT, 9) for k in range(count)]
@@ -446,32 +487,34 @@ def _rank_orders(
     return 1 + sum(e < own for e in errors.values()), len(errors), first
 
 
-#: Increment and radius [increments] of the order grid around the printed orders.
+#: Increment and radius [increments] of the order grid around the printed orders, in fits to simulated printed models.
 SEARCH_INCREMENT, SEARCH_RADIUS_STEPS = 0.05, 2
 
 
 @dataclass(frozen=True)
 class PrintedModelRun:
-    """Simulation of one printed model of one angle under the paper's current from rest.
+    """Simulation of a model printed in the paper, for one angle, under the paper's current from rest.
 
     Parameters
     ----------
     output, p
-        Row of Tables 4 and 5.
+        Angle and innovation length of the row in the paper's Table 4 or 5.
     stability
-        Stability of the stage's two coupled printed equations.
+        Stability of the two coupled printed equations of the joint.
     angle_deviation, single_equation_deviation
-        Standard deviation of the angle [rad], by both coupled equations and by (26) with one angle alone.
+        Standard deviation of the simulated angle [rad], by both coupled equations, and by eq. (26) of the paper, which
+        contains only this angle.
     implied_deviation
-        Standard deviation of the measured angle that the paper's RMSE / NR implies [rad].
+        Standard deviation of the measured angle that the paper implies by RMSE / NR [rad].
     time, response
-        Middle of every block pulse [s], and the angle by both equations [rad].
+        Middle of every block pulse [s], and mean of the angle over the pulse [rad], simulated by both equations.
     arm
-        Angle of the simulated arm, scaled to the implied standard deviation [rad].
+        Angle of the simulated arm, scaled to the implied standard deviation, as means over the pulses [rad].
     returned_coefficients
-        Coefficients that multi-innovation identifies from that response at the printed orders, by K0.
+        Coefficients by prior covariance K0 and name that multi-innovation identifies from the simulated angles at the
+        printed orders.
     orders
-        Orders identified by K0 on a grid around the printed ones; empty unless p is the largest.
+        Orders by K0 and name that are identified on a grid around the printed ones; empty unless p is the largest.
     """
 
     output: str
@@ -488,25 +531,28 @@ class PrintedModelRun:
 
     @property
     def deviation_ratio(self) -> float:
-        """Ratio of the implied to the simulated standard deviation."""
+        """Ratio of the implied to the simulated standard deviation; infinite if the simulated angle is constant."""
         return self.implied_deviation / self.angle_deviation if self.angle_deviation else np.inf
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the simulation for JSON."""
+        """Return stability, deviations, coefficients and orders as a dictionary for JSON, without the samples."""
         own = {"stability": str(self.stability), "unstable_poles": finite(self.stability.unstable_poles)}
         deviations = ("angle_deviation", "single_equation_deviation", "implied_deviation", "deviation_ratio")
         return own | attributes(self, ("output", "p", *deviations, "returned_coefficients", "orders"))
 
 
 def printed_numbers(stage: StageNumber, p: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Return orders and coefficients of the two printed equations of a joint, by the names in the paper's (22)-(25)."""
+    """Return (orders, coefficients) that the paper prints for a joint and innovation length p, by name.
+
+    Names are those in its eqs. (22)-(25).
+    """
     rows = {o: FRACTIONAL_ROWS[o][p] for o in ANGLE_NAMES if stage_of(o) == stage}
     orders = {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.orders.items()}
     return orders, {parameter_name(n, o): float(v) for o, row in rows.items() for n, v in row.coefficients.items()}
 
 
 def printed_model(stage: StageNumber, p: int) -> Model:
-    """Model of both printed equations of a stage with the current as input."""
+    """Return the model of both printed equations of a joint, which are coupled and have the current as input."""
     orders, coefficients = printed_numbers(stage, p)
     structure = flexible_link(stage=stage, form="published", coupling="simulated", laws=())
     identified = structure.with_orders(orders).with_coefficients(coefficients)
@@ -514,7 +560,7 @@ def printed_model(stage: StageNumber, p: int) -> Model:
 
 
 def one_angle(output: str, p: int) -> Model:
-    """Return the model of a printed row by the paper's (26): all terms but the current contain the angle itself."""
+    """Return the model of a printed row by eq. (26) of the paper: terms in the angle itself and in the current."""
     row = FRACTIONAL_ROWS[output][p]
     terms = [Term(output, Order(float(row.orders[o])), float(row.coefficients[c])) for c, o in ORDER_OF.items()]
     terms.append(Term(f"I{stage_of(output)}", Order(), float(row.coefficients["g"])))
@@ -522,12 +568,15 @@ def one_angle(output: str, p: int) -> Model:
 
 
 def papers_current(stage: StageNumber) -> Run:
-    """Run with the paper's square current of one stage; the simulated angles are not used."""
+    """Return a run whose input is the paper's square current of one joint; its simulated angles are not used."""
     return demo_run("square", noise=0.0).select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
 
 
 def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[PrintedModelRun]:
-    """Simulate every printed fractional model of a stage, and identify each model from its simulated response."""
+    """Simulate every printed fractional model of a joint, and identify each model from its own simulated response.
+
+    Return one result per innovation length and angle.
+    """
     drive, runs = papers_current(stage), []
     scaled, _ = papers_record()
     structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
@@ -557,7 +606,12 @@ def run_printed_models(stage: StageNumber, threads: int | None = None) -> list[P
 def _reidentify(
     run: Run, single: Structure, orders: dict[str, float], p: int, threads: int | None
 ) -> tuple[dict[float, dict[str, float]], dict[float, dict[str, float]]]:
-    """Return coefficients at the orders of the model, and for the largest p the best neighboring orders, by K0."""
+    """Identify one equation of a printed model from the run that this model simulates.
+
+    Return the coefficients at the printed `orders`, and the best orders on a grid around them, both by prior covariance
+    K0 and name. The second is empty unless the innovation length p is the largest. A K0 without a finite simulation
+    error is omitted.
+    """
     own = {n: [orders[n]] for n in single.order_names}
     near = {n: neighboring_values(v, SEARCH_INCREMENT, SEARCH_RADIUS_STEPS) for n, (v,) in own.items()}
     wide = {n: v if n.startswith("alpha") else [w for w in near[n] if w < 2.0] for n, v in own.items()}

@@ -1,6 +1,7 @@
 """HTML page and terminal summary of the reproduction: sections, and tables of computed and printed values.
 
-The texts are in page.toml.
+Printed values are those in the paper. Texts, headings and columns are in page.toml. In this module, p is the innovation
+length and K0 the prior covariance of multi-innovation. Equation and table numbers are those of the paper.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ if TYPE_CHECKING:
 
 OPTIMIZER_LABELS = {"genetic": "genetic algorithm", "differential evolution": "differential evolution"}
 _STRONG_PRIOR, _WEAK_PRIOR = (Markup("<i>K</i><sub>0</sub> = {}").format(prior_text(k)) for k in PRIOR_COVARIANCES)
-#: Heads of columns that page.toml names by @.
+#: Column headings that replace the names beginning with @ in page.toml.
 COLUMN_HEADS: Mapping[str, Sequence[str]] = {
     "@numbers": tuple(map(symbol_html, (*ORDER_LETTERS, *COEFFICIENT_LETTERS))),
     "@coefficients": tuple(map(symbol_html, COEFFICIENT_LETTERS)),
@@ -82,32 +83,32 @@ COLUMN_HEADS: Mapping[str, Sequence[str]] = {
     "@weak_prior": (_WEAK_PRIOR,),
     "@curve": (Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)"),),
 }
-#: Points per line: some fifty charts keep the page below 2 MB.
+#: Maximum number of points per line of a chart, with which a page of some fifty charts stays below 2 MB.
 LINE_POINTS = 500
-#: Maximum drawn excursion relative to the reference line, and largest drawn error of the recursion relative to its last
-#: value. Diverging lines would hide all others.
+#: Limits of drawn values, because diverging lines would hide all others: excursion relative to that of the reference
+#: line, and error of the recursion relative to the largest final error.
 MAX_EXCURSION_RATIO, MAX_ERROR_RATIO = 4.0, 1000.0
 
 
 def angle_chart(
     time: Floats, lines: Sequence[tuple[str, Floats]], output: str, title: str, caption: str, **options: Any
 ) -> LineChart:
-    """Return the chart of an angle over time by several models, with the options of a line chart."""
+    """Return a chart of lines (label, values) of one angle [rad] over time [s]; `options` are those of LineChart."""
     options = {"points": LINE_POINTS, "caption": caption.replace(" -", " −"), **options}
     return LineChart(time, lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]", **options)
 
 
 def reference_label(*, simulated: bool) -> str:
-    """Label of the line that models are compared with."""
+    """Return the label of the reference line in charts: the simulated arm or the measurement."""
     return "simulated arm" if simulated else "measured"
 
 
 def fit_chart(
     models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
 ) -> LineChart:
-    """Return a chart of an angle and its simulations by some models.
+    """Return a chart of a measured (or reference) angle and its simulations by the models (label, comparison).
 
-    Simulations are cut far outside the range of the angle.
+    Simulated values far outside the range of the reference are omitted, and the caption reports this.
     """
     first = models[0][1]
     reference, time = first.measured[output][0], pulse_times(first)
@@ -128,9 +129,9 @@ def fit_chart(
 
 
 def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
-    """Return charts of the printed hub models under the paper's current.
+    """Return one chart per hub angle: simulations of the models printed in the paper, under the paper's current.
 
-    Each chart also has an angle of the implied standard deviation.
+    Each chart also has the angle of the simulated arm, scaled to the standard deviation that the paper implies.
     """
     charts: list[Figure] = []
     for output in dict.fromkeys(r.output for r in reproduction.ran if r.output.endswith("1")):
@@ -144,7 +145,7 @@ def printed_model_charts(reproduction: Reproduction) -> list[Figure]:
 
 
 def share_picture(ruling: ClaimVerdict) -> Markup:
-    """Return a bar chart: share of cases in which a claim holds, by level of the deciding factor."""
+    """Return a bar chart as SVG: fraction of cases in which a claim holds, per level of the first factor."""
     levels = ruling.levels or (("", ruling.cases, ruling.holding_cases),)
     height = 10 * len(levels) - 2
     words = "; ".join(f"{level + ': ' if level else ''}{holding} of {count}" for level, count, holding in levels)
@@ -157,7 +158,7 @@ def share_picture(ruling: ClaimVerdict) -> Markup:
 
 
 def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *, log_x: bool = True) -> LineChart:
-    """Return the chart of the paper's error (45) over the steps of the recursion, one line per innovation length p."""
+    """Return a chart of the error, eq. (45) of the paper, over the recursion step, one line per innovation length p."""
     end = max(float(t.error[-1]) for t in traces.values())
     labeled_traces, gaps = [], False
     for p, trace in traces.items():
@@ -172,7 +173,7 @@ def convergence_chart(traces: Mapping[int, MultiInnovationTrace], title: str, *,
 
 
 def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> LineChart:
-    """Return the chart of the deflection: measured, by the paper's (14)-(15), and by its published form (22)-(25)."""
+    """Return a chart of the deflection: reference, simulated by eqs. (14)-(15) of the paper, and by eqs. (22)-(25)."""
     own = reference_label(simulated=simulated)
     lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
     nr = metrics(derived.derived, derived.published).nr
@@ -184,7 +185,10 @@ def derivative_chart(derived: DroppedDerivative, *, simulated: bool = True) -> L
 def _fits_chart(
     models: Mapping[str, Candidate], output: str, place: str, *, sine: bool, simulated: bool
 ) -> list[Figure]:
-    """Return charts of the fits of the models on one run; empty without the run."""
+    """Return a list with one chart: simulations of an angle by several models on one run; empty without that run.
+
+    The run is the validation run (`sine`) or the estimation run. `place` is the number of the paper's figure.
+    """
     compared = {label: c.validation if sine else c.estimation for label, c in models.items()}
     present = [(label, c) for label, c in compared.items() if c is not None]
     if not present:
@@ -198,7 +202,11 @@ def _fits_chart(
 
 
 def _beside_integer(stage: Stage) -> dict[str, Candidate]:
-    """Return the models of Figures 6, 9 and 10; Euler's method is included if the run starts at rest."""
+    """Return the models in the paper's Figures 6, 9 and 10, by label.
+
+    They are the integer-order model of the manufacturer's manual, multi-innovation with innovation length 7, and output
+    error. The first is simulated by Euler's method if the run starts at rest, and exactly otherwise.
+    """
     manual = "integer, Euler" if stage.traces else "integer, exact"
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
     labels = {"integer, manual": manual, last: last, "output error": "output error"}
@@ -206,7 +214,7 @@ def _beside_integer(stage: Stage) -> dict[str, Candidate]:
 
 
 def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
-    """Return the charts of Figures 4 to 6, or 7 to 9, of the paper."""
+    """Return the charts of a joint that correspond to Figures 4 to 6 (joint 1) or 7 to 9 (joint 2) of the paper."""
     first = 4 if stage.number == 1 else 7
     errors = [(f"p = {p}", stage.candidates[f"p = {p}"].estimation) for p in printed.INNOVATION_LENGTHS]
     figures: list[Figure] = []
@@ -227,7 +235,7 @@ def _place(figure: int, output: str) -> str:
 
 
 def sine_figures(reproduction: Reproduction) -> list[Figure]:
-    """Return the charts of Figure 10 of the paper."""
+    """Return the charts that correspond to Figure 10 of the paper: simulations of every angle on the sine run."""
     return [
         figure
         for stage, output in reproduction.angles
@@ -238,7 +246,10 @@ def sine_figures(reproduction: Reproduction) -> list[Figure]:
 
 
 def rival_figures(reproduction: Reproduction) -> list[Figure]:
-    """Return the charts of Figure 11 of the paper, on the validation run or else on the estimation run."""
+    """Return the charts that correspond to Figure 11 of the paper: multi-innovation and the genetic algorithm.
+
+    They show the validation run if there is one, otherwise the estimation run.
+    """
     names = dict(zip(MULTI_INNOVATION_LABELS, ("p = 7, K₀ = 1", "p = 7, weak prior"), strict=True))
     figures = []
     for output, rival in reproduction.rivals.items():
@@ -251,7 +262,7 @@ def rival_figures(reproduction: Reproduction) -> list[Figure]:
 
 
 def flow_chart() -> Figure:
-    """Return Figure 2 of the paper, from the physics to the model, as drawings for wide and for narrow screens."""
+    """Return the flow chart of the method (Figure 2 of the paper), with drawings for wide and for narrow screens."""
     files = (Path(__file__).with_name(f"flow_chart_{screen}.svg") for screen in ("wide", "narrow"))
     drawings = (Markup(file.read_text(encoding="utf-8")) for file in files)  # our own files
     return StaticFigure("Figure 2. From the physics to the identified model", *drawings)
@@ -263,18 +274,18 @@ def make_table(
     heads: Mapping[str, Sequence[str]] | None = None,
     **values: Any,
 ) -> Table:
-    """Return a table of page.toml.
+    """Return a table with title, note and columns from page.toml, and with the given rows.
 
     Parameters
     ----------
     key
         Key of the table in page.toml.
     rows
-        Rows, or a mapping to rows from the name of an angle or the heading of another group.
+        Rows, or groups of rows by heading. A heading that is the name of an angle is shown as its symbol.
     heads
-        Heads of columns besides `COLUMN_HEADS`.
+        Column headings by name, in addition to `COLUMN_HEADS`.
     **values
-        Values of the placeholders in its title and note.
+        Values of the placeholders in title and note.
     """
     texts = read_texts("page")["tables"][key]
     heads_by_name = {**COLUMN_HEADS, **(heads or {})}
@@ -292,7 +303,11 @@ def make_table(
 
 
 def make_section(key: str, *paragraphs: str, values: Mapping[str, Any] | None = None, **content: Any) -> Section:
-    """Return a section of page.toml, its placeholders filled with `values`, with further paragraphs and content."""
+    """Return a section of the page with heading and paragraphs from page.toml.
+
+    `values` replace the placeholders in these texts. `paragraphs` are appended, and `content` are other fields of
+    :class:`Section`, such as figures and tables.
+    """
     texts = read_texts("page")["sections"][key]
     templates = (texts["heading"], texts.get("fold", Section.fold), *texts.get("paragraphs", ()))
     heading, fold, *own = (template.format(**values or {}) for template in templates)
@@ -300,12 +315,12 @@ def make_section(key: str, *paragraphs: str, values: Mapping[str, Any] | None = 
 
 
 def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, float]]:
-    """Orders and coefficients of the equation of one angle by letter.
+    """Return (orders, coefficients) of the equation of one angle, by names without index, such as alpha or a.
 
     Raises
     ------
     ModelError
-        No such output.
+        If the model has no such output.
     """
     item = next((e for e in model.equations if e.output == output), None)
     if item is None:
@@ -321,31 +336,34 @@ def letters_of(model: Model, output: str) -> tuple[dict[str, float], dict[str, f
 
 
 def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
-    """Return table cells under `NUMBER_HEADS`: orders with four decimals, as in Table 6, and coefficients."""
+    """Return eight table cells: the four orders, rounded to four decimals as in Table 6 of the paper, and a, b, d, g.
+
+    Cells of absent orders and coefficients are None.
+    """
     cells = [Exact(round(orders[n], 4) + 0.0) if n in orders else None for n in ORDER_LETTERS]
     return [*cells, *map(coefficients.get, COEFFICIENT_LETTERS)]
 
 
 def criteria_cells(figures: Metrics | None) -> list[Cell]:
-    """Return the table cells of the criteria, under `CRITERION_HEADS`."""
+    """Return three table cells: error (45), RMSE (46) and NR (47) of the paper; None in each without metrics."""
     return [None] * 3 if figures is None else [figures.error, figures.rmse, figures.nr]
 
 
 def printed_head(words: str) -> Markup:
-    """Return the head of a row of printed values."""
+    """Return the first cell of a row with values printed in the paper, with the label `words`."""
     return Markup("<em>printed: {}</em>").format(words)
 
 
 def printed_cells(words: str, row: printed.PublishedRow, *, criteria: bool = True) -> list[Cell]:
-    """Cells of a row of the paper."""
+    """Return the cells of a table row with values printed in the paper: label, orders, coefficients and criteria."""
     cells = [printed_head(words), *number_cells(row.orders, row.coefficients)]
     return [*cells, *row.criteria] if criteria else cells
 
 
 def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
-    """Return table cells with the orders of one equation and its significant coefficients.
+    """Return table cells with the orders and coefficients of the equation of one output of a model.
 
-    A coefficient is significant if it is at least as large as its standard error.
+    A coefficient is omitted (None) if its magnitude is below its standard error.
     """
     orders, coefficients = letters_of(candidate.model, output)
     errors = {} if candidate.result is None else candidate.result.standard_errors
@@ -354,7 +372,10 @@ def computed_cells(candidate: Candidate, output: str) -> list[Cell]:
 
 
 def model_table(stage: Stage) -> Table:
-    """Return Table 4 or 5 of the paper, with computed and printed rows."""
+    """Return the table of a joint that corresponds to Table 4 (joint 1) or 5 (joint 2) of the paper.
+
+    It has a computed row per model, each followed by the printed row if the paper has one.
+    """
 
     def rows(output: str) -> Iterator[list[Cell]]:
         beside = {"integer, Euler": printed.INTEGER_ROWS[output]}
@@ -368,7 +389,10 @@ def model_table(stage: Stage) -> Table:
 
 
 def fits_table(stage: Stage) -> Table:
-    """Return a table with both errors of every model, and its fits on both runs."""
+    """Return a table with one row per angle and model of a joint.
+
+    Columns are normalized residuals (NR) of equation error and output error, and fits [%] on both runs.
+    """
 
     def rows(output: str) -> Iterator[list[Cell]]:
         for label, c in stage.candidates.items():
@@ -381,7 +405,7 @@ def fits_table(stage: Stage) -> Table:
 
 
 def description_tables() -> list[Table]:
-    """Return Tables 1 and 2: symbols, and every step of the method with its function."""
+    """Return the tables of the paper's symbols (its Table 1), and of the steps of its method with their functions."""
     steps = [
         [
             f"{k}. {each['step']}",
@@ -395,7 +419,10 @@ def description_tables() -> list[Table]:
 
 
 def parameter_tables() -> list[Table]:
-    """Table 3 beside the manufacturer's effective parameters, and the coefficients that follow from both."""
+    """Return a table of the paper's Table 3 and the manufacturer's effective parameters, and one of the coefficients.
+
+    The second table has the coefficients that follow from both parameter sets, and the printed ones.
+    """
     rows: list[list[Cell]] = []
     for name, (value, unit, stage, field) in printed.TABLE_3.items():
         effective = Exact(getattr(PARAMETER_SETS["effective"][stage], field)) if field else None
@@ -407,7 +434,10 @@ def parameter_tables() -> list[Table]:
 
 
 def saturation_table(reproduction: Reproduction) -> Table:
-    """Return a table of coefficient a by innovation length p, with the paper's prior and with a weak prior."""
+    """Return a table of coefficient a by angle and innovation length p, for the paper's prior and for a weak prior.
+
+    It also has the printed value and the saturation curve that was fitted to the printed values.
+    """
 
     def rows(stage: Stage, output: str) -> Iterator[list[Cell]]:
         name = parameter_name("a", output)
@@ -424,7 +454,10 @@ def saturation_table(reproduction: Reproduction) -> Table:
 
 
 def optimizer_tables(reproduction: Reproduction) -> list[Table]:
-    """Return the paper's Tables 6 and 7 at equal budgets, and its error (45) for each optimizer and seed."""
+    """Return three tables of the optimizer comparison, in which all optimizers have equal numbers of evaluations.
+
+    They correspond to Tables 6 and 7 of the paper. The third has the error, eq. (45), for each optimizer and seed.
+    """
     rivals = reproduction.rivals
     seeds = list(dict.fromkeys(seed for rival in rivals.values() for seed in rival.optimizers["genetic"].errors))
     best: list[list[Cell]] = []
@@ -459,7 +492,10 @@ def optimizer_tables(reproduction: Reproduction) -> list[Table]:
 
 
 def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
-    """Return Table 4 or 5 with the paper's method: recomputed values, printed values, and their ratio."""
+    """Return Table 4 or 5 of the paper for a joint, recomputed by the paper's method.
+
+    Each innovation length has a row of recomputed values, one of printed values, and one of their ratios.
+    """
 
     def rows(output: str) -> Iterator[list[Cell]]:
         for p, row in reproduction.as_printed[output].rows.items():
@@ -485,7 +521,7 @@ def printed_reading_table(reproduction: Reproduction, stage: Stage) -> Table:
 
 
 def printed_runs_table(reproduction: Reproduction) -> Table:
-    """Table of the printed models under the paper's own current."""
+    """Return a table on simulations of the models printed in the paper: unstable poles, standard deviations, refits."""
 
     def rows(output: str) -> Iterator[list[Cell]]:
         for r in reproduction.ran:
@@ -499,7 +535,11 @@ def printed_runs_table(reproduction: Reproduction) -> Table:
 
 
 def case_tables(reproduction: Reproduction) -> list[Table]:
-    """Return tables of error and steps by p, arm, K0 and angle, and of integer and free orders."""
+    """Return two tables of the cases on which verdicts are based.
+
+    The first has errors and convergence steps of multi-innovation by arm, angle, prior covariance and innovation
+    length. The second compares integer and free orders.
+    """
     rows: dict[tuple[str, str, float], list[Cell]] = {}
     for t in reproduction.panel.trials:
         steps = [None if math.isinf(v) else Exact(v) for v in t.convergence_steps.values()]
@@ -514,13 +554,13 @@ def case_tables(reproduction: Reproduction) -> list[Table]:
 
 
 def typeset(words: str) -> str:
-    """Typeset numbers in a text: powers of ten, minus signs, K₀."""
+    """Return a text with typeset powers of ten, minus signs and K₀ in place of e-notation, hyphens and K0."""
     powers = re.sub(r"(?<=\d)e([+-]\d+)\b", lambda e: f"·10{str(int(e[1])).translate(SUPERSCRIPT_DIGITS)}", words)
     return re.sub(r"(?<![\w.])-(?=\d)", "−", powers).replace("K0", "K₀")
 
 
 def joint_equations(model: Model) -> list[str]:
-    """Return the equations of a joint model as paragraphs."""
+    """Return paragraphs with an introduction and with the equations of the model of a joint, as HTML."""
     return [
         page_text("equations"),
         *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations),
@@ -528,7 +568,7 @@ def joint_equations(model: Model) -> list[str]:
 
 
 def _verdict_section(reproduction: Reproduction) -> Section:
-    """Section with one line per check, and the cases in a collapsed part."""
+    """Return the section with one table row per checked claim, and with numbers and cases in a collapsed part."""
     rows: list[list[Cell]] = [
         [
             typeset(c.claim),
@@ -564,7 +604,10 @@ def _stage_section(reproduction: Reproduction, stage: Stage) -> Section:
 
 
 def _sections(reproduction: Reproduction) -> list[Section]:
-    """Return all sections in their order; sections without content are omitted."""
+    """Return all sections of the page in their order.
+
+    The sections on the sine run and on optimizers are omitted without results.
+    """
     simulated, stages = reproduction.simulated, list(reproduction.stages.values())
     near = [
         fit_chart(
@@ -638,7 +681,10 @@ def _runs_section(reproduction: Reproduction) -> Section:
 
 
 def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the reproduction as one HTML page; see :meth:`ftlm.Reproduction.page`."""
+    """Write the reproduction as one HTML page, and return its path.
+
+    Raise DataError if the file exists and `force` is False, or it cannot be written.
+    """
     check_free(path, force=force)
     names = " and ".join(f"“{run.name}”" for run in reproduction.runs)
     origin = page_text("simulated_origin") if reproduction.simulated else f"the runs {names},"
@@ -648,7 +694,7 @@ def reproduction_page(reproduction: Reproduction, path: str | os.PathLike[str], 
 
 
 def table_text(table: Table, label: int, widths: Sequence[int]) -> list[str]:
-    """Return a table as text lines, with given column widths and the first column of width `label`."""
+    """Return a table as text lines; widths are in characters, `label` for the first column, `widths` for the others."""
     plain, all_widths, at, head = [Markup(head).striptags() for head in table.columns], (label, *widths), 0, ""
     for words, count in table.groups:
         width = sum(all_widths[at : at + count])
@@ -669,7 +715,7 @@ def table_text(table: Table, label: int, widths: Sequence[int]) -> list[str]:
 
 
 def _fit_to_width(value: Cell, width: int) -> str:
-    """Format a number with as many of its five digits as fit."""
+    """Return a cell as text; a number has as many of its five significant digits as fit into `width` characters."""
     if value is None or isinstance(value, str):
         return value or NOT_IN_MODEL
     if not math.isfinite(value):
@@ -679,7 +725,7 @@ def _fit_to_width(value: Cell, width: int) -> str:
 
 
 def fits_text(models: Mapping[str, Candidate]) -> list[str]:
-    """Return a table of the fits of the simulations in percent as text, one line per model."""
+    """Return text lines of a table with one row per model: fits of its simulations [%] on the square and sine runs."""
     outputs = next(iter(models.values())).estimation.output_error
     heads = ["", *(f"{o} {run}" for o in outputs for run in ("square", "sine"))]
     rows = [[n, *("–" if math.isnan(v) else f"{v:.2f}" for v in c.fits)] for n, c in models.items()]
@@ -687,7 +733,7 @@ def fits_text(models: Mapping[str, Candidate]) -> list[str]:
 
 
 def reproduction_text(reproduction: Reproduction) -> str:
-    """Summary for a terminal: checks, and fits."""
+    """Return a summary for a terminal: verdict on each claim, then fits and equations of each joint, then notes."""
     lines = []
     for check in reproduction.checks:
         lines += [f"{check.verdict.upper()}: {check.claim}", f"    {check.brief}"]

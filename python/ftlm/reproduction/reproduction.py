@@ -1,4 +1,4 @@
-"""Reproduction of the paper's section 5: computed and printed tables and figures, and verdicts."""
+"""Reproduction of the paper's section 5: computed and printed tables and figures, and verdicts on its claims."""
 
 from __future__ import annotations
 
@@ -40,38 +40,38 @@ from ftlm.utils.parameters import Placeholder, parameter, setting
 from ftlm.utils.resources import estimate_duration
 from ftlm.utils.validation import check_integer, check_threads, join_names, nearest, real_number
 
-#: Name of the given runs in verdicts.
+#: Label in verdicts for the arm of measured runs.
 MEASURED_LABEL = "as measured"
-#: Files of runs and tables, which are always saved.
+#: Names of the files of runs and tables, which are written besides the model files.
 ALWAYS_SAVED = ("square.csv", "sine.csv", "tables.json")
-#: Polling interval for Ctrl-C [s].
+#: Duration of each wait for the workers, after which Ctrl-C can take effect [s].
 INTERRUPT_POLL_S = 0.1
-#: Maximum number of records of an arm.
+#: Maximum number of simulated records of one arm.
 MAX_RECORDS = 1000
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """Reproduction of section 5 of the paper.
+    """Result of :func:`ftlm.reproduce`: reproduction of section 5 of the paper.
 
     Parameters
     ----------
     square, sine
-        Estimation run and validation run (None if not given).
+        Estimation run (square current) and validation run (sine current); the latter is None if there is none.
     simulated
         Whether the runs come from the virtual rig, whose parameters are known.
     stages
-        Stage results by number.
+        Results of each joint (stage) by its number.
     order_grid
         Order grid of the searches.
     notes
-        Omitted parts with reasons.
+        Texts on omitted or modified results, with reasons.
     panel
-        Cases behind the verdicts: all arms, records and both values of K0.
+        Cases on which verdicts are based, for all arms and records and both prior covariances.
     ran
-        Simulations of the paper's printed models under its own current.
+        Simulations of the models printed in the paper, under the paper's current.
     as_printed
-        Tables 4 and 5 as the paper computed them, by angle.
+        Tables 4 and 5 of the paper, recomputed by its method, by angle.
     """
 
     square: Run
@@ -86,52 +86,68 @@ class Reproduction:
 
     @property
     def checks(self) -> list[Check]:
-        """Claims of the paper with computed numbers and verdicts."""
+        """Claims of the paper, each with computed and printed numbers and a verdict."""
         return checks(self)
 
     @property
     def truth(self) -> dict[int, dict[str, float]]:
-        """Orders and coefficients of the simulated arm by stage; empty for measured runs."""
+        """True orders and coefficients of the simulated arm, by joint number and name; empty for measured runs."""
         return {n: truth_of(n) for n in self.stages} if self.simulated else {}
 
     @property
     def runs(self) -> list[Run]:
-        """The square run, and the sine run if there is one."""
+        """Estimation run (square current), and validation run (sine current) if there is one."""
         return [self.square] if self.sine is None else [self.square, self.sine]
 
     @property
     def angles(self) -> list[tuple[Stage, str]]:
-        """Every stage with each of its outputs."""
+        """Pairs (results of a joint, name of one of its angles) for all angles."""
         return [(stage, output) for stage in self.stages.values() for output in stage.outputs]
 
     @property
     def rivals(self) -> dict[str, Rival]:
-        """Optimizer comparisons of all stages by output."""
+        """Optimizer comparisons of all joints, by output."""
         return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
 
     def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the reproduction as one HTML file; arguments and errors as in :meth:`ftlm.Identification.report`."""
-        return reproduction_page(self, path, force=force)
-
-    def save(self, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
-        """Write runs, models and the numbers of all tables, from which each table can be recomputed.
+        """Write the reproduction as one HTML file, and return its path.
 
         Parameters
         ----------
-        folder
-            Created if absent: ``square.csv``, ``sine.csv``, a model file for every row, ``tables.json``.
+        path
+            File to write.
         force
-            Overwrite.
-
-        Returns
-        -------
-        list of pathlib.Path
-            The files.
+            Whether to overwrite an existing file.
 
         Raises
         ------
         DataError
-            A file exists, or the folder cannot be written.
+            If the file exists and `force` is False, or it cannot be written.
+        """
+        return reproduction_page(self, path, force=force)
+
+    def save(self, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
+        """Write runs, models and the numbers of all tables to a folder.
+
+        Each table can be recomputed from these files: ``square.csv``, ``sine.csv``, one model file per table row, and
+        ``tables.json``.
+
+        Parameters
+        ----------
+        folder
+            Folder of the files; created if absent.
+        force
+            Whether to overwrite existing files.
+
+        Returns
+        -------
+        list of pathlib.Path
+            Paths of the files.
+
+        Raises
+        ------
+        DataError
+            If a file exists and `force` is False, or the folder cannot be written.
         """
         where = Path(folder)
         models = {
@@ -149,7 +165,7 @@ class Reproduction:
         return [where / name for name in (*runs, *models, ALWAYS_SAVED[-1])]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all numbers of the tables and the verdicts for JSON."""
+        """Return the numbers of all tables, and the verdicts, as a dictionary for JSON."""
         return {
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
@@ -159,7 +175,7 @@ class Reproduction:
 
 
 def slug(label: str) -> str:
-    """Return a label as part of a file name."""
+    """Return a label as part of a file name: letters and digits, with hyphens in place of other characters."""
     return "-".join("".join(c if c.isalnum() else " " for c in label).split())
 
 
@@ -183,45 +199,48 @@ def reproduce(
     Parameters
     ----------
     square
-        Estimation run: I1, theta11, theta12 and (or) I2, theta21, theta22, in A and rad. By default both stages of the
-        virtual rig under a square current of 0.3 A, period 2 s, for 10 s.
+        Estimation run with I1 [A], theta11, theta12 [rad] and (or) I2, theta21, theta22. By default a run of both
+        joints of the virtual rig under a square current of 0.3 A with a period of 2 s, for 10 s.
     sine
-        Validation run. By default, with the default ``square`` only, 0.6 A at 6.3 rad/s.
+        Validation run with the same signals. By default a run of the virtual rig under a sine current of 0.6 A at
+        6.3 rad/s if `square` is not given, otherwise none.
     increment
         Increment of the order grid; the paper's is 0.05.
     noise, seed
-        Noise of the virtual rig's angles, see :func:`ftlm.reproduction.demo_run`.
+        Standard deviation [rad] and seed of the noise on the angles of the virtual rig; see
+        :func:`ftlm.reproduction.demo_run`.
     genetic
-        Seeds and evaluations of the genetic algorithm and of differential evolution. By default there are ten seeds, or
-        as many as 20 000 evaluations per angle allow. Each seed has as many evaluations as the compared order grid has
-        candidates. The order grid and the norm come from the comparison and must not be given.
+        Settings of the genetic algorithm, whose seeds and evaluations also apply to differential evolution. By default
+        each seed has as many evaluations as the compared order grid has candidates, and there are ten seeds, or fewer
+        on a fine grid. `order_grid` and `norm` must not be set, because the comparison determines them.
     rivals_increment
         Minimum increment of the order grid on which multi-innovation, the genetic algorithm and differential
         evolution are compared. The paper's 0.05 takes sixteen times as long as the default.
     arms
-        Simulated arms for verdicts besides the first: keys of `ARM_VARIANTS`, by default all. For a measured run there
-        are none.
+        Simulated arms on which claims are tested in addition to the main one: keys of `ARM_VARIANTS`, by default all.
+        Not used with measured runs.
     records
-        Records of each arm with different noise.
+        Number of records per simulated arm, which differ in their noise.
     threads
-        Threads of each stage; two stages or arms are computed in parallel unless this is 1.
+        Number of threads per joint. Two joints or arms are computed in parallel unless this is 1.
     log
-        Called with a line about the next step, from the thread of a stage.
+        Callback with a line of text at the start of each step, called from the thread of a joint.
     progress
-        Called with (parts done, all parts) of the whole, from the thread of a stage; the parts have equal duration.
+        Callback with (parts done, total parts) of all work, called from the thread of a joint. Parts have equal
+        expected duration.
 
     Returns
     -------
     Reproduction
-        With ``page`` and ``save``. Equal arguments give equal results.
+        Results, with the methods ``page`` and ``save``. Equal arguments give equal results.
 
     Raises
     ------
     DataError
-        Runs without the signals of any stage, or a sine run without some of them.
+        If the runs do not have all signals of a joint, or the sine run lacks a signal of the square run.
     ModelError
-        A sine run without a square run, unknown arms, an invalid step or number of records, a genetic algorithm with an
-        order grid or another norm.
+        If a sine run is given without a square run, an arm is unknown, or an increment or `records` is out of range.
+        Also if `genetic` has an order grid or another norm.
     """
     if genetic is not None and (genetic.order_grid is not None or genetic.norm != "l1"):
         raise ModelError(
@@ -285,7 +304,11 @@ def reproduce(
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """Cases of one arm and stage, with all results of the stage for the estimation run."""
+    """Result of one job: cases for verdicts on one arm and joint.
+
+    For the estimation run it also has all results of the joint, simulations of the printed models, recomputed tables
+    by angle, and notes.
+    """
 
     panel: Panel
     stage: Stage | None = None
@@ -294,12 +317,15 @@ class StageOutcome:
     notes: Sequence[str] = ()
 
 
-#: Job of a worker, called with its progress.
+#: Job of a worker thread, a function of the progress to which it reports.
 Job = Callable[[WorkerProgress], StageOutcome]
 
 
 def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
-    """Return the arms besides the first."""
+    """Return the names of the simulated arms other than the main one, by default all.
+
+    Raise ModelError if a name is unknown or `records` is out of range.
+    """
     if isinstance(arms, str):
         raise ModelError(f"{setting('arms')} {arms!r} is a text; give a list of names, such as [{arms!r}]")
     for name in arms or ():
@@ -312,7 +338,11 @@ def _other_arms(arms: Sequence[str] | None, records: int) -> list[str]:
 def run_jobs(
     jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
 ) -> list[StageOutcome]:
-    """Run all jobs in parallel and return their results."""
+    """Run all jobs on a number of worker threads, and return their results in the order of the jobs.
+
+    `seconds` is the expected processor time of all jobs. If a job fails, the others are stopped, and its exception is
+    raised.
+    """
     stop, whole = threading.Event(), TotalProgress(seconds, progress)
 
     def done_by(job: Job) -> StageOutcome:
@@ -328,26 +358,26 @@ def run_jobs(
             under_way = [pool.submit(done_by, job) for job in jobs]
             try:
                 finished: set[Future[StageOutcome]] = set()
-                # A wait without an end would not be interrupted by Ctrl-C everywhere.
+                # On some systems Ctrl-C does not interrupt a wait without a timeout.
                 while len(finished) < len(jobs) and not any(f.exception() for f in finished):
                     finished, _ = wait(under_way, timeout=INTERRUPT_POLL_S, return_when=FIRST_EXCEPTION)
             finally:
                 stop.set()
                 for future in under_way:
                     future.cancel()
-            # After a failure the other jobs end in KeyboardInterrupt, which is not the cause.
+            # After a failure the other jobs raise KeyboardInterrupt, so only finished jobs are read.
             ended = [f.result() for f in under_way if f in finished]
     whole.end()
     return ended
 
 
 def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
-    """Return the stages whose signals a run contains.
+    """Return the numbers of the joints (stages) all of whose signals the square run contains.
 
     Raises
     ------
     DataError
-        No complete stage, or a sine run without a signal of one.
+        If there is no such joint, or the sine run lacks a signal of one.
     """
     signals_by_stage = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGE_NUMBERS}
     stages = [n for n, names in signals_by_stage.items() if all(s in square.signals for s in names)]

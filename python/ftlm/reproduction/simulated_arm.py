@@ -17,22 +17,22 @@ from ftlm.utils.parameters import setting
 
 StageNumber = Literal[1, 2]
 STAGE_NUMBERS: tuple[StageNumber, StageNumber] = (1, 2)
-#: Input shapes of the paper with their current amplitudes [A].
+#: Amplitudes [A] of the paper's motor currents, by shape of the signal.
 CURRENT_AMPLITUDES_A = {"square": 0.3, "sine": 0.6}
-#: Arm of the demonstration: effective coefficients, fractional damping of the links, linear.
+#: Parameters of the demonstration's arm: the manufacturer's effective coefficients, fractional damping, no friction.
 DEMO_PARAMETERS = ArmParameters.of("linear")
-#: Default seed of the noise.
+#: Default seed of the noise on the angles.
 DEFAULT_SEED = 1
 
 
 def _with_integer_orders(stage: StageParameters, *, friction: bool) -> StageParameters:
-    """Return a stage with the manufacturer's integer orders, with or without Coulomb friction."""
+    """Return the parameters of a joint with the manufacturer's integer orders, with or without its Coulomb friction."""
     return replace(stage, gamma=1.0, beta=0.0, mu=1.0, coulomb=stage.coulomb if friction else 0.0)
 
 
 def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
     rubbing = PARAMETER_SETS["effective"]
-    # Stage 1 of the manufacturer's file has no link damping.
+    # In the manufacturer's parameters, link 1 has no damping.
     first = replace(_with_integer_orders(rubbing.stage1, friction=friction), d=0.0)
     return replace(
         DEMO_PARAMETERS,
@@ -43,8 +43,8 @@ def _integer_order_arm(*, friction: bool, coupling: float) -> ArmParameters:
     )
 
 
-#: Arms for verdicts: that of the demonstration, one with Coulomb friction and stage coupling, and both with the integer
-#: orders of the manufacturer. All gauges are exact; every angle has the same noise.
+#: Simulated arms on which claims of the paper are tested: the arm of the demonstration, one with Coulomb friction and
+#: coupled joints, and both with integer orders. Strain gauges are exact, and the noise is equal on all angles.
 ARM_VARIANTS: dict[str, ArmParameters] = {
     "fractional": DEMO_PARAMETERS,
     "fractional, friction": replace(
@@ -56,14 +56,14 @@ ARM_VARIANTS: dict[str, ArmParameters] = {
     "whole orders": _integer_order_arm(friction=False, coupling=0.0),
     "whole orders, friction": _integer_order_arm(friction=True, coupling=1.0),
 }
-#: Key of the demonstration's arm.
+#: Key of the demonstration's arm in `ARM_VARIANTS`.
 MAIN_ARM = "fractional"
-#: Guess of the paper's arm: integer orders, friction, uncoupled stages as in its equations.
+#: Assumed parameters of the paper's arm: integer orders, friction, and uncoupled joints as in its equations.
 PAPERS_ARM = _integer_order_arm(friction=True, coupling=0.0)
 
 
 def letter_of(name: str) -> str:
-    """Return a name without its index: alpha1 becomes alpha."""
+    """Return the name of an order or coefficient without its index, such as alpha for alpha1."""
     return name.rstrip("0123456789")
 
 
@@ -73,15 +73,15 @@ def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
     Parameters
     ----------
     stage
-        1 or 2.
+        Number of the joint, 1 or 2.
     form
         ``"lagrange"``: the arm as simulated by :func:`demo_run`. ``"published"``: the same parameters in the paper's
-        printed equations (22)-(25), whose deflections have the wrong sign, see :func:`ftlm.flexible_link`.
+        printed equations (22)-(25), whose deflections have the wrong sign; see :func:`ftlm.flexible_link`.
 
     Returns
     -------
     Model
-        Both angles from the current alone.
+        Model from the motor current to both angles of the joint.
     """
     arm = parameters_of(stage)
     orders = {n: v for n, v in arm.orders(stage).items() if form == "published" or n != f"alpha{2 * stage}"}
@@ -91,12 +91,15 @@ def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
 
 
 def parameters_of(stage: int) -> StageParameters:
-    """Parameters of one stage of the demonstration's arm."""
+    """Return the parameters of joint 1 or 2 (stage) of the demonstration's arm."""
     return DEMO_PARAMETERS.stage1 if stage == 1 else DEMO_PARAMETERS.stage2
 
 
 def truth_of(stage: int) -> dict[str, float]:
-    """Orders and free coefficients of the simulated arm; the deflection's highest order is fixed at 2."""
+    """Return the true free orders and coefficients of one joint of the demonstration's arm, by name.
+
+    The highest order of the deflection is not among them, because it is fixed at 2.
+    """
     arm = parameters_of(stage)
     orders = {n: v for n, v in arm.orders(stage).items() if n != f"alpha{2 * stage}"}
     hub = {f"{c}{2 * stage - 1}": float(getattr(arm, c)) for c in "abdg"}
@@ -112,33 +115,34 @@ def demo_run(
     seed: int = DEFAULT_SEED,
     parameters: ArmParameters = DEMO_PARAMETERS,
 ) -> Run:
-    """Return a run of a simulated linear arm under the paper's inputs, with encoders and noise on every angle.
+    """Return a run of a simulated arm under an input of the paper, with encoder quantization and noise on all angles.
 
-    The links move with their hubs, (14)-(15), as in a real arm, unlike the paper's equations (22)-(25).
+    The arm is simulated by the Euler-Lagrange equations (14)-(15) of the paper, in which links move with their hubs as
+    on a real arm. This is not so in its equations (22)-(25).
 
     Parameters
     ----------
     shape
-        ``"square"``: 0.3 A, period 2 s, duty 50 %. ``"sine"``: 0.6 A at 6.3 rad/s. Both currents are equal and have a
-        zero-order hold.
+        Signal of both motor currents. ``"square"``: 0.3 A, period 2 s, duty cycle 50 %. ``"sine"``: 0.6 A at
+        6.3 rad/s. Currents have a zero-order hold.
     duration, step
-        Length and sampling step [s].
+        Duration and sampling interval [s].
     noise
         Standard deviation of the noise on every angle [rad].
     seed
         Seed of the noise.
     parameters
-        Parameters of another arm.
+        Parameters of the simulated arm; by default that of the demonstration.
 
     Returns
     -------
     Run
-        I1, I2 [A]; theta11, theta12, theta21, theta22 [rad], point samples.
+        Run with inputs I1, I2 [A] and outputs theta11, theta12, theta21, theta22 [rad], sampled at points in time.
 
     Raises
     ------
     ModelError
-        Another shape, or negative noise.
+        If the shape is unknown, or the noise is negative or not finite.
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ModelError(f"{setting('noise')} {noise} rad is not a standard deviation; give a number of at least 0")
@@ -165,7 +169,10 @@ def demo_run(
 
 
 def decimate_run(run: Run, every: int) -> Run:
-    """Decimate a run; zero-order-hold inputs are averaged over each interval, which preserves their effect."""
+    """Return a run with every `every`-th sample of each signal.
+
+    Zero-order-hold inputs are averaged over each new sampling interval, which preserves their integral.
+    """
     rows = run.length // every
     data = {}
     for name in run.signals:

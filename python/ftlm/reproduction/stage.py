@@ -1,4 +1,8 @@
-"""Results of one joint: models by every method of section 5, optimizer comparisons, and the cases for verdicts."""
+"""Results of one joint (stage) of the arm: models by every method of the paper's section 5, and cases for verdicts.
+
+A case is the outcome of one test of a claim of the paper, on one simulated or measured record. In this module, p is the
+innovation length and K0 the prior covariance of multi-innovation. Equation numbers are those of the paper.
+"""
 
 from __future__ import annotations
 
@@ -48,36 +52,36 @@ from ftlm.utils.formatting import attributes, json_value, symbol
 from ftlm.utils.validation import Floats, check_threads
 from ftlm.validation.comparison import Comparison, Metrics, compare_means, metrics
 
-#: Steps between two points of a convergence curve; the effect of p is limited to the first steps.
+#: Number of recursion steps between two points of a convergence curve; p has an effect only in the first steps.
 TRACE_EVERY = 2
-#: Labels of multi-innovation in the optimizer comparison, by K0.
+#: Labels of multi-innovation in the optimizer comparison, for the prior covariances K0 = 1 and 1e10.
 MULTI_INNOVATION_LABELS = ("p = 7", "p = 7, weak prior")
-#: Highest orders of the paper's grid, and those of the optimizer comparison, which contain the orders printed for both
-#: methods and leave so few candidates that all can be evaluated.
+#: Interval of alpha in the paper's order grid, and in the optimizer comparison. The latter contains the orders printed
+#: for both methods, and is so short that all candidates can be evaluated.
 GRID_ALPHA, RIVAL_ALPHA = (1.05, 2.0), (1.95, 2.0)
-#: An error has converged if it stays below the final error of p = 1 plus this share.
+#: An error has converged once it stays below the final error of p = 1 times 1 plus this margin.
 CONVERGENCE_MARGIN = 0.02
-#: Joint fits use every fourth sample: 8 ms on the virtual rig, a fifteenth of the fastest link mode's period.
+#: Decimation factor of joint fits: 8 ms on the virtual rig, a fifteenth of the period of the fastest link mode.
 ROW_STRIDE = 4
-#: Joint fits by output error.
+#: Method of joint fits (of both equations of a joint): output error with squared residuals and white noise.
 JOINT_METHOD = OutputError(loss="squares", intervals="auto", noise="white")
-#: Increment of the order grids of trials.
+#: Increment of the order grids with which claims on the innovation length are tested (:class:`Trial`).
 PANEL_STEP = 0.25
-#: Radius [increments] of the search by instrumental variables around the orders of least squares; every candidate needs
-#: several simulations.
+#: Radius [increments] of the search by instrumental variables around the orders of least squares. It is small because
+#: every candidate takes several simulations.
 INSTRUMENTAL_RADIUS_STEPS = 2
-#: Runs with more samples than the first number are decimated to at most the second for joint fits, whose cost grows
-#: with the samples. The arm's modes are two decades below the reduced rate.
+#: Number of samples above which a run is decimated for joint fits, and maximum number of samples after decimation. The
+#: modes of the arm are two decades below the reduced sampling rate.
 MAX_FULL_SAMPLES, DECIMATED_SAMPLES = 6000, 2500
-#: Increment of a first search on finer grids, among orders of multi-innovation that no bound excludes, and number of
-#: the best candidates around which the grid's own increment follows.
+#: Increment of a first, coarse search by multi-innovation whose candidates no bound excludes, and number of its best
+#: candidates around which the full order grid is then searched.
 COARSE_INCREMENT, REFINED_CANDIDATES = 0.1, 10
-#: Samples of fits with integer orders, whose systematic residuals do not shrink with more samples.
+#: Number of samples of fits with integer orders, whose systematic residuals do not shrink with more samples.
 INTEGER_FIT_SAMPLES = 1250
 
 
 def published_structure(stage: StageNumber, **changes: Any) -> Structure:
-    """Return the paper's equations (22)-(25) of a joint, uncoupled and with zero initial conditions."""
+    """Return the structure of a joint by eqs. (22)-(25) of the paper, uncoupled and from rest; `changes` set fields."""
     structure = flexible_link(
         stage=stage, form="published", coupling="measured", laws=(), parameters="effective", offset="none"
     )
@@ -85,31 +89,32 @@ def published_structure(stage: StageNumber, **changes: Any) -> Structure:
 
 
 def integer_orders(structure: Structure) -> Structure:
-    """Return a structure of the arm with integer orders."""
+    """Return a structure of the arm whose free orders are fixed at the integer values of the manufacturer's manual."""
     return structure.with_orders({n: integer_order(n) for n in structure.order_names})
 
 
 def are_usable(*candidates: Candidate) -> bool:
-    """Whether all fits may be used; otherwise comparisons with them are meaningless."""
+    """Whether no identified model has the verdict "do not use", with which comparisons would be meaningless."""
     return not any(c.result is not None and is_degenerate(c.result) for c in candidates)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Model of a joint with its errors on both runs.
+    """Model of one joint of the arm, with its errors on the estimation run and on the validation run.
 
     Parameters
     ----------
     label
-        Label, such as "p = 7".
+        Label in tables, such as "p = 7" for multi-innovation with innovation length 7.
     model
-        The model.
+        Model of both angles of the joint, or of one of them.
     estimation, validation
-        Both errors on the estimation run, with the inputs that the method uses, and on the other run, if there is one.
+        Equation error and output error on the estimation run and on the validation run, with the coupling of the model.
+        `validation` is None without a validation run.
     input_driven
-        Output error from the currents alone, by run and output.
+        Output error of the simulation from the currents alone, by run name and output; empty for a single equation.
     result
-        The identification; None for a model that was not identified.
+        Identification of the model; None for a model that was not identified.
     """
 
     label: str
@@ -121,12 +126,12 @@ class Candidate:
 
     @property
     def fits(self) -> list[float]:
-        """Fit of the simulation in percent, for each output on both runs; NaN without a run."""
+        """Fit of the simulation [%]: for each output on the estimation and on the validation run; NaN without a run."""
         runs = self.estimation, self.validation
         return [math.nan if c is None else c.output_error[o].fit for o in self.estimation.output_error for c in runs]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the model and its errors for JSON."""
+        """Return orders, coefficients and errors of the model as a dictionary for JSON."""
         result = {} if self.result is None else attributes(self.result, ("intervals", "settings", "warnings"))
         errors = attributes(self, ("estimation", "validation", "input_driven"))
         return attributes(self.model, ("orders", "coefficients")) | errors | result
@@ -134,20 +139,22 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Rival:
-    """Multi-innovation, genetic algorithm and differential evolution on one equation, with equal budgets.
+    """Comparison of multi-innovation, genetic algorithm and differential evolution on one equation.
 
     Parameters
     ----------
     candidates, increment
-        Candidates of the order grid, which are also the default evaluations per seed, and its increment.
+        Number of candidates of the order grid, and its increment. The number is also the default number of evaluations
+        per seed.
     population
         Population size of the genetic algorithm.
     order_grid
-        Searches by multi-innovation with p = 7, by K0.
+        Order searches by multi-innovation with innovation length 7, by prior covariance K0.
     optimizers
-        Results of the genetic algorithm and of differential evolution by seed, with their bounds.
+        Results of the genetic algorithm and of differential evolution, by name.
     models
-        Best model of each by label: genetic, differential evolution, p = 7 with K0 = 1 and with a weak prior.
+        Best model of each method by label: genetic, differential evolution, "p = 7" (K0 = 1) and "p = 7, weak prior".
+        Empty if the models were not computed.
     """
 
     candidates: int
@@ -158,28 +165,31 @@ class Rival:
     models: dict[str, Candidate] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the comparison for JSON."""
+        """Return the comparison as a dictionary for JSON."""
         runs = {n: attributes(run, ("errors", "evaluations", "bounds")) for n, run in self.optimizers.items()}
         return attributes(self, ("candidates", "increment", "population", "models")) | {"optimizers": runs}
 
 
 @dataclass(frozen=True)
 class DroppedDerivative:
-    """Deflection simulated with and without the derivative of the current that the paper's (19) drops."""
+    """Deflection simulated with and without the derivative of the motor current that eq. (19) of the paper drops.
+
+    All arrays have one value per block pulse; deflections [rad] and current [A] are means over the pulse.
+    """
 
     output: str
-    order: float  # of the current's derivative; 0 as published
-    time: Floats  # middle of every pulse [s]
-    current: Floats  # pulse means
+    order: float  # order of the dropped derivative of the current; the published equations have 0
+    time: Floats  # middle of every block pulse [s]
+    current: Floats
     measured: Floats
-    published: Floats  # by (22)-(25)
-    derived: Floats  # by (14)-(15)
+    published: Floats  # simulated by eqs. (22)-(25), without the derivative
+    derived: Floats  # simulated by eqs. (14)-(15), without elimination
 
     @property
     def correlations(self) -> dict[str, float]:
-        """Return the correlation of the current with each deflection by name; NaN at rest.
+        """Correlation coefficient of the current with each deflection; NaN for a constant signal.
 
-        The deflections are measured, derived by the paper's (14)-(15), and published by its (22)-(25).
+        Keys are "measured", "derived" (simulated by eqs. (14)-(15) of the paper) and "published" (by its (22)-(25)).
         """
         names = ("measured", "derived", "published")
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -194,19 +204,21 @@ class Stage:
     Parameters
     ----------
     number
-        1 or 2.
+        Number of the joint, 1 or 2.
     candidates
         Models by label, in the order of the tables.
     traces, weak_traces
-        Convergence by output and p: each p at its own orders and K0 = 1; with a weak prior, at the orders of p = 7.
+        Convergence of the multi-innovation recursion by output and innovation length p. `traces` have K0 = 1 and the
+        best orders of each p. `weak_traces` have a weak prior and the orders of p = 7. Empty for a run that does not
+        start at rest.
     rivals
-        Optimizer comparisons by output; empty without PyGAD or for a run that does not start at rest.
+        Optimizer comparisons by output; empty without PyGAD or SciPy, or for a run that does not start at rest.
     printed_orders
-        Model with the printed orders and least-squares coefficients on this run.
+        Model with the orders printed in the paper and least-squares coefficients on the estimation run.
     derived
-        Effect of the dropped derivative of the current.
+        Simulations of the deflection with and without the derivative of the current that the paper drops.
     landscape
-        Cost around the joint fit over its two most correlated orders; None without them.
+        Cost around the output-error fit over its two most correlated orders; None if there are none.
     """
 
     number: StageNumber
@@ -220,19 +232,19 @@ class Stage:
 
     @property
     def outputs(self) -> tuple[str, str]:
-        """Names of the hub angle and the deflection."""
+        """Names of the hub angle and of the link deflection of this joint."""
         return f"theta{self.number}1", f"theta{self.number}2"
 
     @property
     def weak(self) -> dict[str, dict[int, dict[str, float]]]:
-        """Coefficients by output and p with a weak prior, at the orders of p = 7."""
+        """Final coefficients with a weak prior at the orders of p = 7, by output, innovation length p and name."""
         return {
             o: {p: {n: float(c[-1]) for n, c in trace.coefficients.items()} for p, trace in each.items()}
             for o, each in self.weak_traces.items()
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the stage results for JSON."""
+        """Return the results of the joint as a dictionary for JSON."""
         return {
             "models": json_value(self.candidates),
             "derived input order": attributes(self.derived, ("output", "order", "correlations")),
@@ -240,7 +252,7 @@ class Stage:
 
 
 def rivals_order_grid(increment: float, smallest: float = CONTEST_STEP) -> OrderGrid:
-    """Return the order grid of the comparison, given the increment of the main grid."""
+    """Return the order grid of the optimizer comparison, whose increment is at least `smallest`."""
     return OrderGrid(increment=max(increment, smallest), alpha=RIVAL_ALPHA)
 
 
@@ -253,29 +265,29 @@ def compare_optimizers(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rival:
-    """Compare multi-innovation with a genetic algorithm and differential evolution at equal budgets per seed.
+    """Compare multi-innovation with a genetic algorithm and differential evolution; `models` of the result is empty.
 
-    The result does not contain the models.
+    By default, each seed of an optimizer has as many evaluations as the order grid has candidates.
 
     Parameters
     ----------
     run
-        Record that starts at rest.
+        Estimation run, which starts at rest.
     single
         Structure with one equation.
     order_grid
-        Order grid of multi-innovation; its ends bound the orders of the optimizers.
+        Order grid of multi-innovation; its limits bound the orders of the optimizers.
     optimizer
-        Settings of the genetic algorithm given by the user; the order grid and the number of evaluations are replaced.
+        Settings of the genetic algorithm, whose order grid is replaced.
     threads, progress
         See :func:`ftlm.search_orders`.
 
     Raises
     ------
     ModelError
-        PyGAD or SciPy is not installed, or the record does not start at rest.
+        If PyGAD or SciPy is not installed, or the run does not start at rest.
     """
-    # Reference values of a structure would inform the bounds.
+    # Reference values of a structure would influence the bounds of the optimizers.
     blind = replace(single, reference={})
     work: dict[str, Any] = {"threads": threads, "progress": progress}
     searches = {k: best_orders(run, blind, order_grid, INNOVATION_LENGTHS[-1], k, **work) for k in PRIOR_COVARIANCES}
@@ -293,19 +305,20 @@ def compare_optimizers(
 
 @dataclass(frozen=True)
 class Trial:
-    """Multi-innovation estimates of one angle of one record at one prior covariance K0, for each innovation length p.
+    """Errors of multi-innovation on one angle of one record with one prior covariance K0, for each innovation length p.
 
     Parameters
     ----------
     arm, seed, output, prior
-        Arm and seed of the record, angle, K0.
+        Name of the arm, seed of its noise, name of the angle, and K0.
     errors
-        Output error (45) by p, each at its own best orders.
+        Sum of absolute simulation errors, eq. (45) of the paper, by p, each at the best orders for this p.
     convergence_steps
-        Steps by p until the error stays within 2 % of the final one of p = 1, all at the orders of p = 7; infinite if
-        never.
+        Number of recursion steps, by p, until the error stays within 2 % above the final error of p = 1; infinite if it
+        never does. All p have the best orders of p = 7.
     nr, manual
-        NR of p = 7 and of the manual's integer-order model.
+        Normalized residual NR, eq. (47) of the paper, of the model with p = 7, and of the integer-order model of the
+        manufacturer's manual.
     """
 
     arm: str
@@ -320,18 +333,20 @@ class Trial:
 
 @dataclass(frozen=True)
 class Contest:
-    """Fits of one angle by multi-innovation, genetic algorithm and differential evolution, at equal budgets.
+    """Errors of multi-innovation, genetic algorithm and differential evolution on one angle, at equal evaluations.
+
+    Errors are sums of absolute simulation errors, eq. (45) of the paper.
 
     Parameters
     ----------
     arm, output
-        Arm of the record, angle.
+        Name of the arm and of the angle.
     candidates, increment
-        Candidates of the order grid, which are the evaluations per seed, and its increment.
+        Number of candidates of the order grid, which is also the number of evaluations per seed, and its increment.
     order_grid
-        Error (45) of p = 7 by K0.
+        Error of multi-innovation with innovation length 7, by prior covariance K0.
     optimizers
-        Error (45) by optimizer and seed.
+        Error by optimizer and seed.
     """
 
     arm: str
@@ -343,7 +358,7 @@ class Contest:
 
     @classmethod
     def of(cls, arm: str, output: str, rival: Rival) -> Contest:
-        """Return the errors of a comparison."""
+        """Return the errors of an optimizer comparison on one angle (`output`) of an arm."""
         grid = {k: search.score for k, search in rival.order_grid.items()}
         return cls(
             arm, output, rival.candidates, rival.increment, grid, {n: r.errors for n, r in rival.optimizers.items()}
@@ -352,20 +367,21 @@ class Contest:
 
 @dataclass(frozen=True)
 class OrderComparison:
-    """Fits of the paper's (14)-(15) to one record with integer and with free orders, by joint output error.
+    """Output-error fits of eqs. (14)-(15) of the paper to one run of a joint, with integer and with free orders.
 
     Parameters
     ----------
     arm, stage
-        Arm and stage of the record.
+        Name of the arm, and number of the joint.
     integer_nr, free_nr
-        NR of the output error by angle, with integer and with free orders.
+        Normalized residual NR of the simulation, by angle, with integer and with free orders.
     orders
-        Estimate and 95 % interval of every free order.
+        (estimate, low, high) of every free order by name, with its 95 % interval.
     gains
-        Gain in fit of the free orders on a run that neither was fitted to, by angle [percentage points].
+        Fit with free orders minus fit with integer orders on the validation run, by angle [percentage points]. Angles
+        without a finite gain are omitted.
     is_degenerate
-        Whether one of the two fits must not be used, so that nothing follows from the comparison.
+        Whether one of the two fits has the verdict "do not use". The comparison is then meaningless.
     """
 
     arm: str
@@ -378,7 +394,7 @@ class OrderComparison:
 
     @classmethod
     def of(cls, arm: str, stage: int, integer: Candidate, free: Candidate) -> OrderComparison:
-        """Return the comparison of two identified models."""
+        """Return the comparison of two models; raise ModelError if the model with free orders was not identified."""
         before, after = ({} if c.validation is None else c.validation.fit for c in (integer, free))
         gains = {o: after[o] - before[o] for o in after if math.isfinite(after[o] - before[o])}
         nr, free_nr = ({o: f.nr for o, f in c.estimation.output_error.items()} for c in (integer, free))
@@ -388,7 +404,7 @@ class OrderComparison:
         return cls(arm, stage, nr, free_nr, orders, gains, not are_usable(integer, free))
 
     def improves(self, output: str) -> bool | None:
-        """Whether free orders improve the fit of an angle significantly, as in ``ftlm orders``; None if unknown."""
+        """Whether free orders improve the fit of an angle on the validation run significantly; None if inconclusive."""
         if self.is_degenerate or output not in self.gains:
             return None
         intervals = {n: {self.arm: (low, high)} for n, (_, low, high) in self.orders.items()}
@@ -396,23 +412,23 @@ class OrderComparison:
 
     @property
     def fractional_orders(self) -> list[str]:
-        """Orders whose interval excludes the integer one."""
+        """Names of the orders whose 95 % interval excludes the integer order of the manufacturer's manual."""
         return [n for n, (_, low, high) in self.orders.items() if not low <= integer_order(n) <= high]
 
     @property
     def fractional_text(self) -> str:
-        """Orders whose interval excludes the integer one, as text."""
+        """Orders whose 95 % interval excludes the integer order, with their estimates, as text; "none" without one."""
         return ", ".join(f"{symbol(n)} {self.orders[n][0]:.3g}" for n in self.fractional_orders) or "none"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the comparison for JSON."""
+        """Return the comparison as a dictionary for JSON."""
         names = ("arm", "stage", "integer_nr", "free_nr", "orders", "fractional_orders", "gains", "is_degenerate")
         return attributes(self, names) | {"improves": {n: self.improves(n) for n in self.free_nr}}
 
 
 @dataclass(frozen=True)
 class Panel:
-    """All cases on which the verdicts are based."""
+    """All cases on which verdicts on claims are based: multi-innovation, other optimizers, integer and free orders."""
 
     trials: tuple[Trial, ...] = ()
     contests: tuple[Contest, ...] = ()
@@ -420,12 +436,12 @@ class Panel:
 
     @classmethod
     def union(cls, parts: Sequence[Panel]) -> Panel:
-        """Return all cases of some panels."""
+        """Return a panel with all cases of the given panels, in sequence."""
         return cls(*(tuple(c for part in parts for c in getattr(part, each.name)) for each in fields(cls)))
 
 
 def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
-    """Return the first step from which an error stays close to a final error; infinite if it never does."""
+    """Return the first recursion step from which the error stays at most 2 % above `end`; infinite if it never does."""
     with np.errstate(invalid="ignore"):
         away = np.flatnonzero(~(trace.error <= (1.0 + CONVERGENCE_MARGIN) * end))
     if not away.size:
@@ -434,7 +450,7 @@ def convergence_step(trace: MultiInnovationTrace, end: float) -> float:
 
 
 def euler_means(model: Model, run: Run, m: int) -> dict[str, Floats]:
-    """Pulse means of a model's response by explicit Euler, as in the paper; infinite if it overflows."""
+    """Return block-pulse means (m,) of each output by explicit Euler, as in the paper; infinite if one overflows."""
     means = {}
     for name, samples in explicit_euler(model, run).items():
         with np.errstate(over="ignore", invalid="ignore"):
@@ -443,7 +459,10 @@ def euler_means(model: Model, run: Run, m: int) -> dict[str, Floats]:
 
 
 def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int | None) -> list[Trial]:
-    """Run multi-innovation on both angles of a stage, with all p and both values of K0."""
+    """Run multi-innovation on both angles of a joint for all innovation lengths p.
+
+    Return one trial per angle and prior covariance K0. `square` is the estimation run with noise of this `seed`.
+    """
     structure, grid = published_structure(stage), OrderGrid(increment=PANEL_STEP, alpha=GRID_ALPHA)
     run, trials = square.select(list(structure.signals)), []
     m = default_m([run], power_of_two=True)
@@ -465,7 +484,10 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
 def traces_of(
     run: Run, single: Structure, models: Mapping[int, Model], prior: float, every: int
 ) -> dict[int, MultiInnovationTrace]:
-    """Return the convergence of the recursion for one equation by innovation length p."""
+    """Return the convergence of multi-innovation for one equation, by innovation length p, at the orders of `models`.
+
+    `prior` is the prior covariance, and `every` the number of recursion steps between two stored values.
+    """
     traces = {}
     for p, model in models.items():
         structure = single.with_orders({n: model.orders[n] for n in single.order_names})
@@ -483,19 +505,19 @@ def compare_orders(
     *,
     validation: Run,
 ) -> OrderComparison:
-    """Fit integer orders and free orders of one joint of a simulated arm to a decimated run that starts at rest.
+    """Fit a joint of a simulated arm with integer and with free orders, and compare both fits on a validation run.
 
-    Both fits are compared on a validation run.
+    The estimation run `square` starts at rest and is decimated for the fits.
 
     Raises
     ------
     ConvergenceError
-        No initial guess of one of the fits converged.
+        If no initial guess of one of the fits converges.
     """
     structure = replace(flexible_link(stage=stage, form="lagrange", coupling="simulated"), initial="rest")
     own, other = (run.select(list(structure.signals)) for run in (square, validation))
     run = decimate_run(own, ROW_STRIDE)
-    # Coefficients of integer orders overflow on an arm without them.
+    # Coefficients of fits with integer orders may overflow on an arm with fractional orders.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         fits = [
             identify(run, item, method=JOINT_METHOD, threads=threads, progress=progress)
@@ -509,7 +531,7 @@ def compare_orders(
 
 
 def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None) -> Panel:
-    """Return the cases of one run and the results of its joint; trials only for runs that start at rest."""
+    """Return the cases for verdicts from the results of one joint; trials only for a run that starts at rest."""
     freed = OrderComparison.of(
         arm, stage.number, stage.candidates["integer, identified"], stage.candidates["output error"]
     )
@@ -519,16 +541,16 @@ def panel_of(stage: Stage, square: Run, arm: str, seed: int, threads: int | None
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings that differ between the reproduction and the demonstration."""
+    """Settings in which the full reproduction and the short demonstration differ."""
 
     order_grid: OrderGrid
-    top: int | None  # rows of an order search with the statistics of an identification; None: a search alone
-    trace_every: int  # steps between two points of a convergence curve
-    # Of the order grid of the optimizer comparison; None without PyGAD or SciPy.
+    top: int | None  # rows of each order search, followed by an identification's statistics; None for a search alone
+    trace_every: int  # recursion steps between two points of a convergence curve
+    # Increment of the order grid of the optimizer comparison; None for no comparison.
     rivals_increment: float | None = CONTEST_STEP
 
     def seconds_of(self, step: str) -> float:
-        """Processor time of a step [s]."""
+        """Return the expected processor time [s] of the computation that `step` names."""
         return seconds_of(step, self.order_grid.increment, self.rivals_increment)
 
 
@@ -542,9 +564,10 @@ def simulated_panel(
     genetic: GeneticAlgorithm | None = None,
     steps: WorkerProgress | None = None,
 ) -> Panel:
-    """Return the cases of one stage on one simulated arm; contests and joint fits on the first record only.
+    """Return the cases for verdicts on one joint of one simulated arm, from one record per seed of the noise.
 
-    For the main arm only trials are computed, because :func:`panel_of` returns the other cases of its first record.
+    Contests and order comparisons use the first record only. They are omitted for the main arm, because
+    :func:`panel_of` returns them.
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
@@ -578,7 +601,11 @@ def simulated_panel(
 
 @dataclass
 class StageWork:
-    """Computation for one stage of the arm: runs, settings, progress callbacks, and notes on omitted results."""
+    """Computation of all results of one joint (stage) of the arm.
+
+    `square` is the estimation run and `sine` the validation run, or None. `log` is called with a line of text at each
+    step. `notes` collect texts on omitted or modified results.
+    """
 
     number: StageNumber
     square: Run
@@ -592,7 +619,7 @@ class StageWork:
     simulated: bool = False
 
     def __post_init__(self) -> None:
-        # Structures of the paper, under its laws, and of the simulated arm.
+        # Structures: uncoupled equations of the paper, the same under the paper's laws, and the simulated arm.
         self.measured = published_structure(self.number)
         laws: tuple[Law, ...] = ("orders", "coefficients")
         self.published = flexible_link(stage=self.number, form="published", coupling="simulated", laws=laws)
@@ -603,19 +630,19 @@ class StageWork:
         if self.simulated:
             self.published, self.coupled = (replace(s, initial="rest") for s in (self.published, self.coupled))
         elif not starts_at_rest(self.on, self.measured):
-            # The paper's equation errors have few terms; ten powers of t more would be combinations of them.
+            # With the ten powers of t of other initial terms, the few terms of an equation would be nearly dependent.
             self.measured, self.published, self.coupled = (
                 replace(s, initial="caputo") for s in (self.measured, self.published, self.coupled)
             )
 
     def begin(self, words: str, step: str) -> None:
-        """Report the start of the next step and its processor time."""
+        """Log the description `words` of the next step, and report its expected processor time as progress."""
         self.log(f"stage {self.number}: {words}")
         if isinstance(self.progress, WorkerProgress):
             self.progress.begin(self.preset.seconds_of(step))
 
     def compute_stage(self, genetic: GeneticAlgorithm | None) -> Stage:
-        """Compute all results of section 5 for a stage."""
+        """Compute all results of the paper's section 5 for the joint; `genetic` is None for default settings."""
         exact = self.manual("integer, exact")
         candidates = {"integer, Euler": self.euler_candidate("integer, Euler", exact), "integer, exact": exact}
         whole = integer_orders(self.coupled)
@@ -643,8 +670,8 @@ class StageWork:
         return Stage(self.number, candidates, traces, weak, rivals, self.printed_orders(), derived, landscape)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
-        """Return a model with both errors on both runs, and its simulation from the currents alone."""
-        # Errors are sums over the paper's pulses; over other pulses they would be other numbers.
+        """Return a model with its errors on both runs; a coupled model is also simulated from the currents alone."""
+        # The error of the paper is a sum over its block pulses, so its value depends on their number.
         model = replace(model, m=default_m([self.on], power_of_two=True))
         runs = [run for run in (self.on, self.off) if run is not None]
         on, *off = (compare_means(model, run) for run in runs)
@@ -657,16 +684,16 @@ class StageWork:
     def identify_candidate(
         self, label: str, run: Run, structure: Structure, method: EstimationMethod = JOINT_METHOD
     ) -> Candidate:
-        """Identify a candidate, by default by output error."""
+        """Identify a model from a run, by default by output error, and return it with its errors on both runs."""
         result = identify(run, structure, method=method, threads=self.threads, progress=self.progress)
         return self.candidate(label, result.model, result)
 
     def manual(self, label: str) -> Candidate:
-        """Return the integer-order model of the manufacturer's manual."""
+        """Return the integer-order model of the manufacturer's manual, with its errors on both runs."""
         return self.candidate(label, link_model(stage=self.number, form="published"))
 
     def euler_candidate(self, label: str, exact: Candidate) -> Candidate:
-        """Return the same model simulated by explicit Euler, as in the paper."""
+        """Return the model `exact` with simulation errors of the explicit Euler method, which the paper uses."""
 
         def by_euler(run: Run, comparison: Comparison) -> Comparison:
             means = euler_means(exact.model, run, comparison.m)
@@ -682,7 +709,10 @@ class StageWork:
         return replace(exact, label=label, estimation=on, validation=off, input_driven=alone)
 
     def searches(self) -> dict[str, Candidate]:
-        """Search the whole order grid by multi-innovation with the paper's p, and by least squares."""
+        """Return the best models on the order grid, by label: multi-innovation with each p, and least squares.
+
+        p is the innovation length.
+        """
         kinds: dict[str, tuple[str, dict[str, Any]]] = {
             f"p = {p}": ("multi-innovation", {"innovation_length": p, "prior_covariance": PRIOR_COVARIANCES[0]})
             for p in INNOVATION_LENGTHS
@@ -698,7 +728,10 @@ class StageWork:
         return candidates
 
     def search_candidate(self, label: str, order_grid: OrderGrid, **options: Any) -> Candidate:
-        """Return the model with the best orders of each equation, without the statistics of an identification."""
+        """Return the model with the best orders of each equation on an order grid, without standard errors.
+
+        `options` are options of the order search.
+        """
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = {}
         for output in self.measured.outputs:
@@ -713,16 +746,16 @@ class StageWork:
         return self.candidate(label, Model(structure, orders=orders, units=units, about=about))
 
     def printed_orders(self) -> Candidate:
-        """Return the model with the printed orders and least-squares coefficients."""
+        """Return the model with least-squares coefficients at the orders that the paper prints for p = 7."""
         axes = {n: [v] for output in self.measured.outputs for n, v in last_orders(output).items()}
         grid = replace(self.preset.order_grid, orders=axes)
         return self.search_candidate("printed orders", grid, coefficients="least-squares")
 
     def _best_orders(self, single: Structure, own: OrderGrid, options: Mapping[str, Any]) -> SearchResult:
-        """Return the best candidate of an order grid.
+        """Return the result of an order search of one equation, whose first row is the best candidate.
 
-        With K0 = 1 the simulated deflection is nearly zero. The errors of all candidates are then close to that of a
-        zero output. No bound excludes a candidate, and each would have to be simulated completely.
+        With prior covariance 1 the simulated deflection is nearly zero. All candidates then have errors close to that
+        of a zero output, and no bound excludes one. So the fine grid is searched only around the best of a coarser one.
         """
         work: dict[str, Any] = {"threads": self.threads, "progress": self.progress, **options}
         own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
@@ -739,7 +772,7 @@ class StageWork:
         return min(ends, key=lambda end: end.score)
 
     def instrumental(self, start: Candidate) -> Candidate:
-        """Return the best model of a search by instrumental variables around the orders of another model."""
+        """Return the best model of an order search by instrumental variables around the orders of the model `start`."""
         self.begin("orders by instrumental variables", "instrumental")
         grid = self.preset.order_grid
         axes = {}
@@ -752,7 +785,11 @@ class StageWork:
     def joint(
         self, label: str, structure: Structure, words: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
-        """Return a model fitted by joint output error, to the whole run or to a decimated run."""
+        """Return a model of both equations fitted by output error, with its errors on both runs.
+
+        A long run is decimated first. `words` describe the step in the log, and `step` gives its expected time. `near`
+        is a model by eqs. (14)-(15) of the paper whose parameters give the initial guess for eqs. (22)-(25).
+        """
         self.begin(words, step)
         run = self.on
         if step == "whole orders" and run.length >= 2 * INTEGER_FIT_SAMPLES:
@@ -763,14 +800,14 @@ class StageWork:
             run = decimate_run(run, every)
         if near is None:
             return self.identify_candidate(label, run, structure)
-        # Only standard errors of the published form are used. Its automatic initial guesses end in optima that rounding
-        # chooses between; the parameters of (14)-(15) lead to the one whose residuals are the noise.
+        # Only standard errors of the published form are used. From automatic initial guesses, rounding decides which
+        # optimum is found. The parameters of (14)-(15) lead to the optimum whose residuals are the noise.
         begin = self.published_values(near)
         if not self.simulated:
             try:
                 return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic", start=begin))
             except ModelError:
-                # Outside the bounds of (22)-(25).
+                # The initial guess is outside the parameter bounds of (22)-(25).
                 return self.identify_candidate(label, run, structure, OutputError(intervals="quadratic"))
         task, options = Task((run,), structure), (None, check_threads(self.threads), self.progress)
         result = assess_fit(estimate_output_error(task, *options, intervals="quadratic", begin=begin, alone=True))
@@ -779,9 +816,9 @@ class StageWork:
     def best(
         self, label: str, structure: Structure, what: str, step: str = "output error", near: Model | None = None
     ) -> Candidate:
-        """Return a model fitted by joint output error from the current alone.
+        """Return a model of both equations fitted by output error from the current alone; arguments as in `joint`.
 
-        If that fails, it is fitted with the measured other angle.
+        If no fit converges, the measured other angle is an input of each equation, and a note is added.
         """
         words = f"{what}, by output error"
         try:
@@ -793,12 +830,12 @@ class StageWork:
     def traces(
         self, models: Mapping[int, Model], prior: float = PRIOR_COVARIANCES[0]
     ) -> dict[str, dict[int, MultiInnovationTrace]]:
-        """Return the convergence of the recursion for every equation and innovation length p."""
+        """Return the convergence of multi-innovation by output and innovation length p, at the orders of `models`."""
         parts = {o: self.measured.equation(o) for o in self.measured.outputs}
         return {o: traces_of(self.on, each, models, prior, self.preset.trace_every) for o, each in parts.items()}
 
     def rivals(self, genetic: GeneticAlgorithm | None) -> dict[str, Rival]:
-        """Compare multi-innovation with other optimizers on each equation; empty if these are not installed."""
+        """Return comparisons of multi-innovation with other optimizers, by output; empty if one is impossible."""
         if self.preset.rivals_increment is None:
             return {}
         grid = rivals_order_grid(self.preset.order_grid.increment, self.preset.rivals_increment)
@@ -823,7 +860,7 @@ class StageWork:
         return rivals
 
     def in_published_form(self, model: Model) -> Model:
-        """Insert the parameters of the paper's (14)-(15) into its (22)-(25), which drop a derivative of the current."""
+        """Return eqs. (22)-(25) of the paper, which drop a derivative, with the parameters of a model by (14)-(15)."""
         h, d = self.number * 2 - 1, self.number * 2
         values = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
         values |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
@@ -840,7 +877,7 @@ class StageWork:
         return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
 
     def published_values(self, model: Model) -> dict[str, float]:
-        """Return the free parameters of the paper's (22)-(25) that correspond to a model of its (14)-(15), by name."""
+        """Return the free parameters of eqs. (22)-(25) of the paper, by name, from a model by its eqs. (14)-(15)."""
         other = self.in_published_form(model)
         values = {**other.orders, **other.coefficients}
         h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
@@ -848,7 +885,7 @@ class StageWork:
         return {n: v for n, v in values.items() if n in free} | {f"r{self.number}": -values[d] / values[h]}
 
     def dropped_derivative(self, model: Model) -> DroppedDerivative:
-        """Simulate the deflection by equations (14)-(15) and by (22)-(25) of the paper, with equal parameters."""
+        """Simulate the deflection by eqs. (14)-(15) and (22)-(25) of the paper, with the parameters of `model`."""
         output, other = self.measured.outputs[1], self.in_published_form(model)
         whole, published = (compare_means(m, self.on) for m in (model, other))
         drive = f"I{self.number}"

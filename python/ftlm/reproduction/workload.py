@@ -1,4 +1,4 @@
-"""Processor time expected for the steps of the reproduction, and progress of its workers."""
+"""Processor time that the steps of the reproduction take, and progress of its worker threads."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping
 
 from ftlm.progress import ShareTracker, Stoppable
 
-#: Steps of the work: processor time on one core of the reference machine [s], executions for a stage of the estimation
-#: run, and for a stage of another arm. Searches are those of the paper's increment, optimizers those of theirs. Times
-#: are three quarters of the measured ones, which included other load.
+#: Steps of the reproduction: processor time on one core of the reference machine [s], number of executions for a joint
+#: of the estimation run, and for a joint of another arm. Times hold for the paper's increment of the order grid, and
+#: for the default increment of the optimizer comparison ("rivals"). They are three quarters of the measured times,
+#: because the machine had other load.
 STEP_COSTS: Mapping[str, tuple[float, int, int]] = {
     "whole orders": (1.5, 1, 0),
     "search": (1.4, 5, 0),
@@ -23,22 +24,29 @@ STEP_COSTS: Mapping[str, tuple[float, int, int]] = {
     "trials": (2.0, 1, 0),
     "freed": (4.0, 0, 1),
 }
-#: Candidates of the optimizer comparison at its default increment.
+#: Number of candidates of the order grid in the optimizer comparison at its default increment.
 CONTEST_CANDIDATES = 3800
-#: Default smallest increment of the order grid, on every arm: the paper's grid has 60 000 candidates per angle, as many
-#: evaluations per seed, and takes minutes.
+#: Default minimum increment of the order grid in the optimizer comparison. The paper's grid has 60 000 candidates per
+#: angle. With as many evaluations per seed, a comparison would take minutes.
 CONTEST_STEP = 0.1
-#: Maximum and minimum number of seeds, and most evaluations of one optimizer on one angle over all seeds.
+#: Maximum and minimum number of seeds of an optimizer, and maximum number of evaluations on one angle over all seeds.
 MAX_SEEDS, MIN_SEEDS, MAX_EVALUATIONS = 10, 3, 40_000
 
 
 def seeds_for(candidates: int) -> tuple[int, ...]:
-    """Return ten seeds, or as many as the budget of evaluations allows."""
+    """Return the seeds 0, 1, … of an optimizer that evaluates this number of candidates per seed.
+
+    There are ten, or fewer if all seeds would need more than `MAX_EVALUATIONS` evaluations, but at least three.
+    """
     return tuple(range(min(MAX_SEEDS, max(MIN_SEEDS, MAX_EVALUATIONS // max(candidates, 1)))))
 
 
 def seconds_of(step: str, increment: float, rivals_increment: float | None = CONTEST_STEP) -> float:
-    """Processor time of a step [s]; searches grow with the inverse fourth power of the increment."""
+    """Return the expected processor time [s] of the step with this name.
+
+    The time of an order search is proportional to the inverse fourth power of the increment. `rivals_increment` is the
+    increment of the optimizer comparison; None without one.
+    """
     scale = 1.0
     if step == "search":
         scale = (0.05 / increment) ** 4
@@ -53,21 +61,24 @@ def seconds_of(step: str, increment: float, rivals_increment: float | None = CON
 def seconds_of_all(
     increment: float, stages: int, arms: int = 0, records: int = 1, *, rivals_increment: float | None = CONTEST_STEP
 ) -> float:
-    """Processor time of the whole reproduction [s]."""
+    """Return the expected processor time of the whole reproduction [s].
+
+    `stages` is the number of joints, `arms` that of further simulated arms, and `records` that of records per arm.
+    """
     counts = {step: own + arms * other for step, (_, own, other) in STEP_COSTS.items()}
     counts["trials"] += (arms + 1) * records - 1
     return stages * sum(count * seconds_of(step, increment, rivals_increment) for step, count in counts.items())
 
 
 class TotalProgress:
-    """Share of all completed work, reported by several workers to one receiver.
+    """Progress of all work, to which several worker threads report.
 
     Parameters
     ----------
     seconds
-        Processor time of all work.
+        Expected processor time of all work [s].
     listener
-        See :class:`ftlm.progress.ShareTracker`.
+        Progress callback with (parts done, total parts); see :class:`ftlm.progress.ShareTracker`.
     """
 
     def __init__(self, seconds: float, listener: Callable[[int, int], None] | None) -> None:
@@ -75,25 +86,25 @@ class TotalProgress:
         self._seconds_by_worker: dict[object, float] = {}
 
     def report(self, worker: object, seconds: float) -> None:
-        """Report the processor time of all work that a worker has done [s]."""
+        """Report that a worker has done work with an expected processor time of `seconds` in total."""
         with self._lock:
             self._seconds_by_worker[worker] = seconds
             self._course.advance_to(sum(self._seconds_by_worker.values()) / self._seconds)
 
     def end(self) -> None:
-        """Report that all work is finished, including skipped steps."""
+        """Report that all work is finished, also if steps were skipped."""
         self._course.advance_to(1.0)
 
 
 class WorkerProgress(Stoppable):
-    """Progress of one worker through its steps; searches and fits call it with (done, total).
+    """Progress callback of one worker thread, which searches and fits call with (done, total) of their own work.
 
     Parameters
     ----------
     whole
-        Progress of all work.
+        Progress of the work of all threads.
     stop
-        Event that ends the work with KeyboardInterrupt at its next report.
+        Event that cancels the work: if it is set, the next report raises KeyboardInterrupt.
     """
 
     def __init__(self, whole: TotalProgress, stop: threading.Event) -> None:
@@ -101,13 +112,16 @@ class WorkerProgress(Stoppable):
         self._whole, self._before, self._step, self._within = whole, 0.0, 0.0, 0.0
 
     def begin(self, seconds: float) -> None:
-        """Finish the previous step, and start a step with the given processor time [s]."""
+        """Finish the previous step, and start a step with this expected processor time [s]."""
         super().__call__(0, 0)
         self._before, self._step, self._within = self._before + self._step, seconds, 0.0
         self._whole.report(self, self._before)
 
     def __call__(self, count: int, total: int, pruned: int | None = None) -> None:
-        """Report progress within the step; if the count restarts, it covers half of the remainder."""
+        """Report that `count` of `total` items of the current step are done.
+
+        A step may count several times. Each count that restarts covers half of the remaining time of the step.
+        """
         super().__call__(count, total, pruned)
         share = count / max(total, 1)
         if share < self._within:

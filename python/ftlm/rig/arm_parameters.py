@@ -1,4 +1,4 @@
-"""Parameters of the simulated arm: named sets and TOML files."""
+"""Parameters of the simulated arm and its sensors: named sets, and TOML files."""
 
 from __future__ import annotations
 
@@ -23,37 +23,40 @@ from ftlm.utils.files import read_toml
 from ftlm.utils.parameters import setting
 from ftlm.utils.validation import join_names, nearest, short_repr
 
-#: Signals of the arm, in the order of their indices in the core.
+#: Signals of the arm, in the order of their indices in the Rust core.
 ARM_SIGNALS = ("theta11", "theta12", "theta21", "theta22", "I1", "I2")
-#: Manufacturer's data: length of link 1 0.202 m; inertia of link 1 with everything it carries 0.170434 kg m^2; inertia
-#: of link 2 0.0064387 kg m^2; mass of 0.157 kg at 0.20185 m on link 2. Hub 2 has 0.00301955 kg m^2, of which 0.002575
-#: are the rotor of 1.03e-6 kg m^2 behind a gear of 50; it couples to link 1 with one fiftieth of that.
+#: Ratios from the manufacturer's data. Link 1 has a length of 0.202 m and, with everything it carries, an inertia of
+#: 0.170434 kg m^2. Link 2 has an inertia of 0.0064387 kg m^2, with a mass of 0.157 kg at 0.20185 m. Hub 2 has an
+#: inertia of 0.00301955 kg m^2. Of this, 0.002575 kg m^2 belong to the rotor, 1.03e-6 kg m^2 behind a gear of 50. Only
+#: one fiftieth of the rotor's part couples to link 1.
 INERTIA_RATIO = 0.00301955 / 0.170434
 LINK_COUPLING_RATIO = 0.157 * 0.202 * 0.20185 / 0.0064387
 ROTATING_INERTIA_SHARE = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
-#: Longest simulation step within a sample [s]; the error of deflections is then below 2e-4 of their standard
-#: deviation, for joint 1 below 1e-5.
+#: Maximum step of the simulation within a sampling interval [s]. The error of deflections is then below 2e-4 of their
+#: standard deviation, and for joint 1 below 1e-5.
 MAX_SUBSTEP_S = 1e-4
 
 
 @check_arguments
 @dataclass(frozen=True)
 class StageParameters:
-    """Parameters of one joint of the simulated arm: orders and coefficients of the law, and Coulomb friction.
+    """Parameters of one joint of the simulated arm: coefficients, orders, and Coulomb friction.
 
     Parameters
     ----------
     a, b, d
-        Stiffness, hub friction and link damping per inertia, the coefficients of the hub equation. That of a term of
-        order n has the unit s^(n - 2).
+        Coefficients of the hub equation: link stiffness, hub friction (negative) and link damping, each divided by the
+        hub inertia J_1. The coefficient of a term of order n has the unit s^(n - 2).
     g
-        Motor torque per inertia and current [rad/(s^2 A)].
+        Motor torque per hub inertia and motor current [rad/(s^2 A)].
     r
-        Inertia ratio (J_1 + J_2)/J_2. The link equation follows from it and the coefficients of the hub equation.
+        Inertia ratio (J_1 + J_2)/J_2 of hub J_1 and link J_2, with which the coefficients of the link equation follow
+        from those of the hub equation.
     gamma, beta, mu
-        Free orders. The order law gives all others, which must lie in [0, 3). The order of both equations is 2.
+        Orders of hub friction, link elasticity and link damping. All other orders follow from the order law
+        (:func:`ftlm.arm.flexible_link.order_law`) and must lie in [0, 3). The highest order of both equations is 2.
     coulomb
-        Coulomb friction as an equivalent motor current [A]; 0 for none.
+        Coulomb friction of the hub as an equivalent motor current [A]; 0 for none.
     """
 
     a: float
@@ -68,13 +71,16 @@ class StageParameters:
 
     @check_arguments
     def orders(self, stage: int) -> dict[str, float]:
-        """Return the five free orders by name."""
+        """Return the five free orders of the order law by name, with the indices of joint 1 or 2 (`stage`)."""
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
     @check_arguments
     def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
-        """Return the coefficients of both equations by name."""
+        """Return the coefficients of hub and link equation by name, with the indices of joint 1 or 2 (`stage`).
+
+        `form` is that of the equations; see :class:`ArmParameters`.
+        """
         h, k = 2 * stage - 1, 2 * stage
         hub = {f"a{h}": self.a, f"b{h}": self.b, f"d{h}": self.d, f"g{h}": self.g}
         if form == "lagrange":
@@ -97,24 +103,25 @@ class ArmParameters:
         :func:`ftlm.flexible_link` with ``cross_stage="inertial"``. A value in between scales the motion of link 1 in
         the kinetic energy of joint 2.
     inertia_ratio
-        Inertia ratio J_21/J_12, where J_12 includes everything that link 1 carries.
+        Inertia of hub 2 divided by the inertia of link 1 with everything that it carries, J_21/J_12.
     reach
-        Coupling ratio H/J_22, where H is the length of link 1 times the first moment of mass of link 2. It is 1 for
-        equally long links with the mass at the tip.
+        Coupling ratio H/J_22. H is the length of link 1 times the first moment of mass of link 2, and J_22 the inertia
+        of link 2. It is 1 for equally long links with the mass at the tip.
     rotating_share
-        Fraction of J_21 that rotates with link 1. A rotor behind a gear contributes only the inverse of its gear ratio.
+        Fraction of the hub inertia J_21 that rotates with link 1. A rotor behind a gear contributes only its inertia
+        divided by the gear ratio.
     current_offset
-        Current offset of each motor while the amplifiers are enabled [A]. It differs from run to run on the real arm.
+        Current offset of each motor while the amplifiers are enabled [A]. On the real arm it differs from run to run.
     strain_noise, current_noise
-        Standard deviation of the noise on the gauges and on the current sense [V].
+        Standard deviation of the noise on the strain-gauge and current-sense voltages [V], for joints 1 and 2.
     strain_bias, current_bias
-        Offsets of gauges and current sense [V].
+        Offsets of the strain-gauge and current-sense voltages [V], for joints 1 and 2.
     bits
-        Resolution of the converters over ±10 V [bit]; 0 for no quantization.
+        Resolution of the analog-to-digital converters over ±10 V [bit]; 0 for no quantization.
     encoder_scale
-        Hub angle per count [rad].
+        Hub angle per encoder count [rad], for joints 1 and 2.
     travel
-        Hub angle at which a limit switch opens [rad].
+        Magnitude of the hub angle at which a limit switch opens [rad], for joints 1 and 2.
     form
         ``"lagrange"``: Euler-Lagrange equations (14)-(15) of the paper. ``"published"``: its equations (22)-(25), whose
         deflections have the wrong sign, for comparison with the paper; only without coupling of the joints.
@@ -190,7 +197,7 @@ class ArmParameters:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def coupling_coefficients(self) -> dict[str, float]:
-        """Return the coefficients of the accelerations of the other joint's angles, by name.
+        """Return the coefficients of the terms in accelerations of the other joint, by name.
 
         Raises
         ------
@@ -221,7 +228,9 @@ class ArmParameters:
 
     @check_arguments
     def model(self, *, friction: bool = False) -> Model:
-        """Return the model of the arm from currents to angles; with friction it equals the simulation of :meth:`arm`.
+        """Return the model of the arm from motor currents to angles.
+
+        With friction, it describes the same motion as the simulation of :meth:`arm`.
 
         Parameters
         ----------
@@ -281,7 +290,10 @@ class ArmParameters:
 
 
 def _optional(kind: type[Any], **replaced: Any) -> list[tuple[str, Any, Any]]:
-    """Return the fields of a dataclass as optional keys of a file."""
+    """Return the fields of a dataclass, except `name`, as (name, type, default) of optional keys of a TOML file.
+
+    `replaced` are other types for some keys, and types of additional keys.
+    """
     hints = {**get_type_hints(kind), **replaced}
     return [(name, hint | UnsetType, UNSET) for name, hint in hints.items() if name != "name"]
 
@@ -293,12 +305,15 @@ _ArmFile = msgspec.defstruct(
 
 
 def _values_of(file: msgspec.Struct) -> dict[str, Any]:
-    """Return the keys that are set in a file, with their values."""
+    """Return the values that are set in a decoded TOML file, by key."""
     return {key: value for key, value in msgspec.structs.asdict(file).items() if value is not UNSET}
 
 
 def _check_values(path: Path, where: str, table: Mapping[str, Any]) -> None:
-    """Raise DataError if a number in a file is out of range."""
+    """Raise DataError if a number in a table of a TOML file is not finite or out of range.
+
+    `where` is the name of the table in the message.
+    """
     for key, value in table.items():
         values = [v for v in (value if isinstance(value, tuple) else (value,)) if not isinstance(v, str)]
         if not all(map(math.isfinite, values)):
@@ -323,16 +338,18 @@ _STAGE2 = StageParameters(
     mu=0.8,
     coulomb=0.1,
 )
-#: Links of both units of the real arm, fitted with integer orders to one run each: -K_s/J_2 = -164 and -418, -B_2/J_2 =
-#: -0.365 and -2.09, coupling -0.170 from joint 2 to link 1 and -2.36 back; J_1/J_2 is the manufacturer's. The order of
-#: the stiffness term of link 1, if free, is estimated as 0 within 0.01. benches/virtual_arm.py repeats these fits.
+#: Parameters of the real arm, whose links were fitted with integer orders to one run of each of two units. For links 1
+#: and 2, stiffness -K_s/J_2 is -164 and -418, and damping -B_2/J_2 is -0.365 and -2.09. The coupling coefficient is
+#: -0.170 from joint 2 to link 1, and -2.36 from joint 1 to link 2. J_1/J_2 is the manufacturer's value. The free order
+#: of the stiffness term of link 1 is estimated as 0 within 0.01. benches/virtual_arm.py repeats these fits.
 _SOFT1 = StageParameters(a=439.9, b=-17.4, d=0.979, g=112.6, r=_STAGE1.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.179)
 _SOFT2 = StageParameters(a=891.0, b=-142.0, d=4.46, g=288.0, r=_STAGE2.r, gamma=1.0, beta=0.0, mu=1.0, coulomb=0.228)
 _MEASURED_ARM = ArmParameters(_SOFT1, _SOFT2, inertia_ratio=0.0327, reach=1.36, name="measured")
-#: "effective": manufacturer's effective parameters with fractional damping, friction, coupling and noise. "linear": the
-#: same joints without coupling, friction, noise and quantization of the gauges. "measured": real arm, unit under
-#: partial-state feedback; "measured-lqr": unit under LQR. Torque constant, viscous and Coulomb friction of each hub are
-#: fitted to its own run; for hub 2 of the first unit they are identifiable only at the manufacturer's torque.
+#: Named parameter sets. "effective" has the manufacturer's effective parameters with fractional damping, friction,
+#: coupling and noise. "linear" has the same joints without coupling, friction, noise and quantization of the gauges.
+#: "measured" and "measured-lqr" are two units of the real arm, under partial-state feedback and under LQR. Torque
+#: constant, viscous and Coulomb friction of each hub were fitted to the run of its unit. For hub 2 of the first unit,
+#: they are identifiable only if the manufacturer's torque constant is used.
 PARAMETER_SETS: dict[str, ArmParameters] = {
     "effective": ArmParameters(_STAGE1, _STAGE2),
     "linear": ArmParameters(

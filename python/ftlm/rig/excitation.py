@@ -1,4 +1,4 @@
-"""Motor-current signals (excitations) of experiments."""
+"""Motor-current signals (excitations) for experiments on a rig."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from ftlm.utils.validation import Floats, real_number, short_repr
 
 SIGNAL_SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
 CURRENT_SIGNALS = ("I1", "I2")
-#: The paper's sine [rad/s].
+#: Frequency of the paper's sine current [rad/s].
 _PAPER_SINE_RAD_S = 6.3
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Excitation:
-    """Motor-current signal of an experiment.
+    """Motor-current signal of an experiment, for both motors.
 
     Parameters
     ----------
     shape
-        Shape of the signal. ``"square"``: duty cycle one half. ``"sine"``. ``"chirp"``: exponential frequency sweep
-        over the band. ``"multisine"``: all multiples of 1/period in the band, with equal amplitudes and random phases.
-        ``"prbs"``: random sign in every `period`. ``"doublet"``: half a period positive, half negative, then zero.
-        ``"csv"``: columns I1 and I2 [A] of a file, with zero-order hold.
+        Shape of the signal. ``"square"``: square wave with a duty cycle of 50 %. ``"sine"``: sine wave. ``"chirp"``:
+        exponential frequency sweep over `band`. ``"multisine"``: sum of all multiples of 1/`period` in `band`, with
+        equal amplitudes and random phases. ``"prbs"``: random sign that may change after every `period`. ``"doublet"``:
+        positive for half a period, negative for the other half, then zero. ``"csv"``: columns I1 and I2 [A] of `file`,
+        with zero-order hold.
     amplitude
         Maximum current [A] of both motors, or (motor 1, motor 2).
     period
@@ -44,9 +45,9 @@ class Excitation:
     ramp
         Duration of the linear ramp of the amplitude from zero [s].
     seed
-        Random seed of prbs and multisine; the two motors get different signals.
+        Random seed of prbs and multisine, in which the two motors have different signals.
     file
-        File with the currents for ``"csv"``.
+        File with the currents for the shape ``"csv"``.
     """
 
     shape: str = "square"
@@ -61,12 +62,20 @@ class Excitation:
     def commands(self, rate: float, duration: float) -> Floats:
         """Return the currents [A] of both motors, shape (round(duration·rate) + 1, 2); the last row is zero.
 
+        Parameters
+        ----------
+        rate
+            Sampling rate [Hz].
+        duration
+            Duration [s].
+
         Raises
         ------
         ModelError
-            If shape, amplitude, period or band is invalid, or a current exceeds the amplifier limit.
+            If shape, amplitude, period, band, ramp, rate or duration is invalid, or a current exceeds the limit of the
+            amplifiers.
         DataError
-            If the file cannot be read or has other columns.
+            If the file cannot be read, or has neither column I1 nor I2.
         """
         samples, length = finite_number(rate), finite_number(duration)
         if samples is None or length is None or not 0 <= length <= MAX_RUN_DURATION_S:
@@ -183,7 +192,7 @@ class Excitation:
             raise ModelError(f"{setting('input')} 'csv' needs a file; give it as {parameter('file')}")
         names = column_names(self.file)
         names_present = [name for name in CURRENT_SIGNALS if names is not None and name in names]
-        # A run written by ftlm is loaded whole; from any other file only the currents are read.
+        # A run that was written by ftlm is loaded with all signals; from any other file only the currents are read.
         run = load(self.file) if names is None else load(self.file, outputs=names_present) if names_present else None
         if run is None or not any(name in run for name in CURRENT_SIGNALS):
             raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
@@ -196,7 +205,7 @@ class Excitation:
         return currents
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the signal as a dictionary for JSON."""
+        """Return the parameters of the signal as a dictionary for JSON, without those that are None."""
         values = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
         return {k: _to_json_value(v) for k, v in values.items() if v is not None}
 
@@ -211,7 +220,7 @@ def finite_number(value: object) -> float | None:
 
 
 def _to_json_value(value: object) -> object:
-    """Return a value in which tuples and NumPy scalars are replaced by JSON types."""
+    """Return a value with tuples replaced by lists and NumPy scalars by Python scalars, as JSON requires."""
     if isinstance(value, (tuple, list)):
         return [_to_json_value(v) for v in value]
     return value.item() if isinstance(value, np.generic) else value

@@ -1,4 +1,4 @@
-"""Feedback control on a rig, with a user's controller that is called once per sample."""
+"""Feedback control on a rig by a controller function that is called once per sample."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from ftlm.utils.validation import Floats, as_array, check_seed, error_text
 
 #: Controller: function of time [s], measured angles [rad] and reference [rad] that returns two currents [A].
 Controller: TypeAlias = Callable[[float, Floats, Floats], Sequence[float] | Floats]
-#: Signal names of the references of joints 1 and 2 in a run.
+#: Names in a run of the reference angles of joints 1 and 2.
 REFERENCE_SIGNALS = ("reference1", "reference2")
-#: Bound on the JSON description of a controller in the metadata of a run.
+#: Maximum length of the JSON description of a controller in the metadata of a run.
 MAX_CONTROLLER_JSON_CHARACTERS = 100_000
 DEFAULT_RATE_HZ = 500.0
-#: Default joint angle at which a limit switch opens [rad], if the board states none.
+#: Default magnitude of the joint angles at which a limit switch opens [rad], for a board that does not specify them.
 DEFAULT_TRAVEL_RAD = (math.pi / 2, math.pi / 2)
 
 
@@ -63,23 +63,24 @@ def control(
     live: Streaming | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Run:
-    """Run a feedback controller on a rig, once per sample, and record the run.
+    """Run a feedback controller on a rig, and record the run.
 
-    Limits, watchdog and shutdown are those of :func:`ftlm.rig.record`. The command computed from the sample at t is
-    applied at the next sample, a constant delay of one sample. The first and the last command are 0 A.
+    The controller is called once per sample. Limits, watchdog and shutdown are those of :func:`ftlm.rig.record`. The
+    command computed from a sample is applied at the next sample, so the loop has a constant delay of one sample. The
+    first and the last command are 0 A.
 
     Parameters
     ----------
     controller : callable
         ``controller(time, angles, reference)`` with the time [s], an array of theta11, theta12, theta21, theta22 [rad]
-        as recorded, and the reference of both joints [rad] at that time. It returns both currents [A], within 0.94 and
-        1.2. A ``reset()`` method is called before the run; the result of a ``to_dict()`` method is stored in the run's
-        `metadata`. A controller with an attribute `rate` [Hz] runs at this rate only. An :class:`ftlm.control.Lqg`
-        drives the motor of its input; a :class:`ftlm.control.DiscretePid` belongs into a
-        :class:`ftlm.control.JointControllers`.
+        as recorded, and the reference of both joints [rad] at that time. It returns the currents of motors 1 and 2 [A],
+        at most 0.94 and 1.2 in magnitude. If the controller has a method ``reset()``, it is called before the run. The
+        result of a method ``to_dict()`` is stored in the `metadata` of the run. If the controller has an attribute
+        `rate` [Hz], this is the only permitted rate. An :class:`ftlm.control.Lqg` commands the motor that is its input.
+        A :class:`ftlm.control.DiscretePid` must be passed in an :class:`ftlm.control.JointControllers`.
     reference : array_like
-        Reference of the joint angles [rad]: shape (rows, 2), one row per sample; or a pair that is constant during
-        `duration`.
+        Reference of the joint angles [rad]: an array of shape (rows, 2) with one row per sample, or a pair of constant
+        angles, which requires `duration`.
     rig : {"virtual", "q8"} or Board, default "virtual"
         The simulated arm, the arm on a Q8-USB board, or a user-defined board.
     duration : float, optional
@@ -87,7 +88,7 @@ def control(
     rate : float, optional
         Sampling rate [Hz]; by default that of the controller, or 500.
     limit, seed, parameters, offset, real_time, sensor_filter, watchdog, arm, board, out, force, live, progress
-        See :func:`ftlm.rig.record`.
+        As for :func:`ftlm.rig.record`.
     name : str
         Name of the run.
 
@@ -106,13 +107,14 @@ def control(
     RigFault
         If the rig stopped the run, or the controller raised an exception, returned invalid or excessive currents, or
         was too late. 0 V was written immediately, or by the watchdog if the controller did not return. The message
-        states the cause, ``__cause__`` is the exception of the controller, and `run` and the file have the recorded
-        samples.
+        states the cause, and ``__cause__`` is the exception of the controller. The recorded samples are in the
+        attribute `run` of the exception and in the file.
 
     Notes
     -----
-    In real time a computation longer than one sample is a missed deadline. The run stops after 21 consecutive missed
-    deadlines, or when a write is 50 ms late. Without real time only the watchdog applies, with a timeout of 2 s.
+    In real time, a computation longer than one sampling interval is a missed deadline. The run stops after 21
+    consecutive missed deadlines, or when a write is 50 ms late. Without real time, only the watchdog applies, with a
+    timeout of 2 s.
     """
     if not callable(controller):
         hint = "; a design is run by its controller" if isinstance(controller, LoopDesign) else ""
@@ -148,7 +150,11 @@ def control(
 
 
 def _of_both_joints(controller: Controller) -> Controller:
-    """Return a controller that takes time, angles and reference; raise ModelError for a PID of one joint."""
+    """Return a controller of both joints, called with (time, angles, reference).
+
+    An LQG controller of one motor is wrapped in :class:`ftlm.control.JointControllers`. Raise ModelError for a PID
+    controller, and for an LQG controller whose input is not a motor current.
+    """
     if isinstance(controller, Lqg) and controller.observer.realization.input in MOTOR_INPUTS:
         second = controller.observer.realization.input == MOTOR_INPUTS[1]
         return JointControllers(None, controller) if second else JointControllers(controller)
@@ -161,7 +167,10 @@ def _of_both_joints(controller: Controller) -> Controller:
 
 
 def _rate_of(controller: Controller, rate: float | None) -> float:
-    """Return the sampling rate [Hz]; raise ModelError if it differs from the controller's sampling rate."""
+    """Return the sampling rate [Hz]: `rate`, or that of the controller, or the default.
+
+    Raise ModelError if it is out of range or differs from the rate of the controller.
+    """
     own = finite_number(getattr(controller, "rate", None))
     _, _, checked = check_times(
         MAX_RUN_DURATION_S, MAX_RUN_DURATION_S, (own or DEFAULT_RATE_HZ) if rate is None else rate
@@ -175,18 +184,18 @@ def _rate_of(controller: Controller, rate: float | None) -> float:
 
 
 class ControllerSource:
-    """Command source whose commands are computed by a controller, once per sample.
+    """Command source that calls a controller once per sample.
 
     Parameters
     ----------
     controller
-        Controller function.
+        Function of time, measured angles and reference that returns both currents [A]; see :func:`control`.
     reference
         Reference of both joints, shape (rows, 2) [rad].
     rate
         Sampling rate [Hz].
     clock
-        Function that returns the time [s], with which the computing time of the controller is measured.
+        Function that returns the time [s]. It measures the computing time of the controller.
     """
 
     def __init__(self, controller: Controller, reference: Floats, rate: float, clock: Callable[[], float]) -> None:
@@ -199,12 +208,16 @@ class ControllerSource:
         self._took = 0.0
 
     def first_commands(self, rig: Rig, block: int) -> Floats:
-        """Return a command of 0 A, because no measurement exists yet."""
+        """Return one command of 0 A, shape (1, 2), because no sample is measured yet."""
         self._rig, self._at = rig, -1
         return np.zeros((1, 2))
 
     def next_commands(self, rows: Floats) -> Floats:
-        """Return the command of the controller for the last measured row; 0 A at the end of the run."""
+        """Return the controller's command [A], shape (1, 2), for the last of the measured samples `rows`.
+
+        The last command of a run is 0 A, and after it the result is empty. Raise RigFault if the controller fails or
+        returns invalid currents, and ModelError if the board recorded no sample.
+        """
         if self._rig is None or not len(rows):
             raise ModelError("the take() method of the board returned no row for a sample; correct it")
         self._at += 1
@@ -233,7 +246,7 @@ class ControllerSource:
         return currents
 
     def explain_fault(self, fault: str) -> str:
-        """Return a fault message, extended by the computing time of the controller if it exceeded one sample."""
+        """Return a fault message, with the computing time of the controller added if it exceeded one sample."""
         where = f"the sample at {max(self._at, 0) / self.rate:.6g} s"
         if self._since is not None and fault.startswith("stopped by"):
             return f"{fault}: the controller had not answered to {where} for {self.clock() - self._since:.3g} s"
@@ -243,7 +256,10 @@ class ControllerSource:
 
 
 def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]:
-    """Return the currents [A] of a controller output, shape (1, 2), and an error text ("" if they are valid)."""
+    """Return the currents [A] in a controller's result, shape (1, 2), and an error text ("" if they are valid).
+
+    `limits` are the maximum magnitudes of both currents. Invalid currents are returned as 0.
+    """
     nothing = np.zeros((1, 2))
     if answer is None:
         return nothing, "returned nothing; return both currents [A], such as (0.1, 0.0)"
@@ -275,7 +291,7 @@ def _currents(answer: object, limits: tuple[float, float]) -> tuple[Floats, str]
 
 
 def _numbers(reference: ArrayLike) -> Floats:
-    """Return a validated reference array of shape (rows, 2) or (2,); raise DataError for another one."""
+    """Return the reference as an array of shape (rows, 2) or (2,); raise DataError for any other shape or type."""
     raw = as_array("reference", reference)
     if raw.dtype.kind not in "fiu" or raw.ndim not in (1, 2) or raw.shape[-1] != 2:
         raise DataError(
@@ -286,7 +302,11 @@ def _numbers(reference: ArrayLike) -> Floats:
 
 
 def _rows(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -> Floats:
-    """Return the reference with one row per sample; raise ModelError if it exceeds the arm's travel."""
+    """Return the reference [rad] with one row per sample, shape (rows, 2); a pair of angles is repeated.
+
+    Raise DataError for another number of rows or a value that is not finite. Raise ModelError if an angle exceeds the
+    travel of its joint [rad].
+    """
     reference = np.tile(values, (rows, 1)) if values.ndim == 1 else values
     if len(reference) != rows:
         raise DataError(
@@ -312,7 +332,10 @@ def _rows(values: Floats, rows: int, rate: float, travel: tuple[float, float]) -
 
 
 def _describe_controller(controller: Controller) -> dict[str, Any]:
-    """Return the description of a controller for the metadata of a run."""
+    """Return name and settings of a controller for the metadata of a run.
+
+    Settings are the result of its method ``to_dict()``, if any. Raise ModelError if they are invalid JSON or too long.
+    """
     name = getattr(controller, "__name__", type(controller).__name__)
     description: dict[str, Any] = {"name": str(name)[:100]}
     describe = getattr(controller, "to_dict", None)

@@ -1,7 +1,7 @@
-"""Q8-USB board, accessed through the vendor's Python package; its blocking read sets the sampling times.
+"""Q8-USB board, accessed through the vendor's Python package, whose blocking read determines the sampling times.
 
-No board was available during development. The module is tested with a substitute for the package with the same names,
-types, error codes and rules. See docs/rig.md before the first run on hardware.
+No board was available during development. The module is tested with a substitute for the vendor's package that has the
+same names, types, error codes and rules. See docs/rig.md before the first run on hardware.
 """
 
 from __future__ import annotations
@@ -30,30 +30,31 @@ from ftlm.rig.rig import (
 )
 from ftlm.utils.validation import Floats
 
-#: Highest rate of the board's normal update mode [Hz]; above it the fast mode is used.
+#: Maximum sampling rate of the board's normal update mode [Hz]; for a higher rate the fast mode is used.
 MAX_NORMAL_RATE_HZ = 1000.0
 
 
 def _channels(*numbers: int) -> tuple[NDArray[np.uint32], int]:
-    """Return channel numbers and their count, in the form in which the vendor's functions take them."""
+    """Return (array of channel numbers, their count), two consecutive arguments of the vendor's functions."""
     return np.array(numbers, dtype=np.uint32), len(numbers)
 
 
 ANALOG_IN, ANALOG_OUT = _channels(0, 1, 2, 3), _channels(0, 1)
 ENCODER_CHANNELS, SWITCH_CHANNELS = _channels(0, 1), _channels(0, 1, 2, 3)
-#: Amplifier enable of both stages (active low) and master enable (active high).
+#: Digital lines that enable the amplifiers of joints 1 and 2 (active low), and master enable line (active high).
 ENABLE_CHANNELS = _channels(0, 1, 4)
 ENABLE_STATES_ON, ENABLE_STATES_OFF = np.array([0, 0, 1], dtype=np.int8), np.array([1, 1, 0], dtype=np.int8)
-#: All digital outputs of the board; the watchdog requires an expiration state for each of them.
+#: All digital outputs of the board. Each of them needs an expiration state for the watchdog.
 DIGITAL_OUT = _channels(*range(8))
 DIGITAL_STATE_TRISTATE = 2
 QUADRATURE_MODE_X4 = 4
 OVERFLOW_IS_AN_ERROR = 0
 UNLIMITED_SAMPLES = 0x7FFFFFFF
 OPTIONS_SIZE = 256
-#: Error code of `watchdog_clear` when the watchdog has not expired.
+#: Error code of the vendor's `watchdog_clear` if the watchdog has not expired.
 NOTHING_TO_CLEAR = -599
-#: Bound on the relative drift between board and computer clocks; the reference of the delays follows at this rate.
+#: Maximum relative drift between the clocks of board and computer. The reference time from which delays are measured is
+#: adapted at this rate.
 CLOCK_DRIFT_RATIO = 1e-3
 ERROR_MESSAGES = {
     -108: "no Q8-USB board was found; plug it in, switch it on, and check --board",
@@ -93,7 +94,7 @@ def _no_library(error: OSError) -> RigFault:
 
 
 def driver_state() -> str:
-    """Return text on whether a board is usable: vendor package, library, and a test that opens the board."""
+    """Return text on whether vendor package, library and board were found; the board is opened and closed for this."""
     try:
         _driver()
     except RigFault as fault:
@@ -114,11 +115,11 @@ class QuanserBoard:
     Parameters
     ----------
     card
-        Identifier, such as ``"0"`` or ``"0@tcpip://host:port"``.
+        Identifier of the board, such as ``"0"`` or ``"0@tcpip://host:port"``.
     clock
-        Function that returns the time [s], with which delays are measured.
+        Function that returns the time [s]. It measures the delays of samples.
     sleep
-        Function that waits a number of seconds, for the watchdog.
+        Function that waits for a number of seconds, used to wait for the watchdog.
     """
 
     name = "Q8-USB"
@@ -154,7 +155,7 @@ class QuanserBoard:
         self._origin = math.inf
 
     def open(self) -> None:
-        """Open the board."""
+        """Open the connection to the board; raise RigFault if driver, library or board is not found or is in use."""
         module = _driver()
         self._module, self._error = module, module.HILError
         try:
@@ -170,7 +171,10 @@ class QuanserBoard:
             raise RigFault(f"Q8-USB: {ERROR_MESSAGES[-108]}")
 
     def configure(self, rate: float) -> None:
-        """Set ranges, directions and encoders, set outputs to zero, and create a reader for simultaneous sampling."""
+        """Configure channels and encoders, set outputs to zero, and create a task that samples all inputs at once.
+
+        `rate` is the sampling rate [Hz].
+        """
         check_rate(rate)
         self._rate, self._samples, self._origin, self._rows = rate, 0, math.inf, []
         speed = "normal" if rate <= MAX_NORMAL_RATE_HZ else "fast"
@@ -201,9 +205,9 @@ class QuanserBoard:
             hil.task_set_buffer_overflow_mode(self._task, OVERFLOW_IS_AN_ERROR)
 
     def set_expiration(self) -> None:
-        """Set the outputs after a watchdog expiration to 0 V and tristate.
+        """Set the outputs that the board applies when its watchdog expires: 0 V, and tristate digital lines.
 
-        Without tristate digital lines, the board would keep its analog outputs.
+        If the digital lines were not tristate, the board would not change its analog outputs on expiry.
         """
         with self._translate_errors("setting the watchdog's expiration states") as hil:
             hil.watchdog_set_analog_expiration_state(*ANALOG_OUT, np.zeros(ANALOG_OUT[1]))
@@ -213,11 +217,14 @@ class QuanserBoard:
             self._digital_safe = True
 
     def unsafe(self) -> str | None:
-        """Return a message if the outputs after a watchdog expiration are not set; None if all are set."""
+        """Return an error message if an output has no safe state for a watchdog expiration; None if all have one."""
         return missing_expiration_state(analog=self._analog_safe, digital=self._digital_safe)
 
     def start_watchdog(self, seconds: float) -> None:
-        """Start the watchdog of the board with a timeout [s]."""
+        """Start the watchdog of the board with a timeout of `seconds`.
+
+        Raise RigFault if expiration states are not set, and ModelError if the timeout is shorter than two samples.
+        """
         missing = self.unsafe()
         if missing is not None:
             raise RigFault(f"Q8-USB: {missing}")
@@ -228,13 +235,13 @@ class QuanserBoard:
             self._watched = True
 
     def start(self, rate: float) -> None:
-        """Start the sampling task at a rate [Hz] on the clock of the board."""
+        """Start the sampling task at a rate [Hz], which the hardware clock of the board determines."""
         with self._translate_errors("starting the task") as hil:
             clocks = getattr(self._module, "Clock", None)
             hil.task_start(self._task, getattr(clocks, "HARDWARE_CLOCK_0", 0), float(rate), UNLIMITED_SAMPLES)
 
     def enable(self, on: bool) -> None:
-        """Enable or disable the amplifiers."""
+        """Enable (`on`) or disable the amplifiers; do nothing if the board is not open."""
         if self._hil is None:
             return
         with self.gate.lock, self._translate_errors("switching the amplifiers") as hil:
@@ -246,14 +253,17 @@ class QuanserBoard:
             )
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Write output voltages [V]; 0 V is accepted even if the watchdog has locked the board."""
+        """Write the command voltages of both motors [V]; do nothing if the board is not open.
+
+        Writing 0 V raises no error if the expired watchdog has locked the board at 0 V.
+        """
         if self._hil is None:
             return
         with self.gate.lock, self._translate_errors("writing"):
             self._run_unless_expired(lambda: self._write(volts), is_end=volts == (0.0, 0.0))
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Record a number of samples with outputs at 0 V."""
+        """Read a number of samples with outputs at 0 V, over which `guard` averages the bias of the strain gauges."""
         for _ in range(samples):
             if self._read(guard) is None:
                 return
@@ -263,7 +273,11 @@ class QuanserBoard:
                 return
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Apply commands [A] and record a sample for each; a read blocks until the board has the sample."""
+        """Apply current commands [A], shape (n, 2), and record one sample per command.
+
+        Each read blocks until the board has the next sample. The method returns early if `guard`, which enforces the
+        safety limits, latches a fault.
+        """
         for command in commands:
             late = self._read(guard)
             if late is None:
@@ -278,7 +292,7 @@ class QuanserBoard:
                 return
 
     def take(self) -> Floats:
-        """Return the rows recorded since the last call."""
+        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
         rows, self._rows = self._rows, []
         return np.array(rows, dtype=np.float64).reshape(-1, len(RIG_COLUMNS) + 1)
 
@@ -293,7 +307,7 @@ class QuanserBoard:
                     hil.task_delete(task)
 
     def let_expire(self) -> bool:
-        """Wait 1.5 watchdog timeouts, and return whether the watchdog has expired."""
+        """Wait for 1.5 watchdog timeouts without a heartbeat, and return whether the watchdog has expired."""
         if self._hil is None or self._is_expired:
             return True
         if not self._watched:
@@ -302,14 +316,14 @@ class QuanserBoard:
         return self._has_expired()
 
     def stop_watchdog(self) -> None:
-        """Stop the watchdog unless it has expired, because its safe outputs must then remain."""
+        """Stop the watchdog. An expired watchdog is not stopped, so that its safe outputs remain."""
         if self._hil is not None and self._watched and not self._is_expired:
             self._watched = False
             with self._translate_errors("stopping the watchdog") as hil:
                 hil.watchdog_stop()
 
     def close(self) -> None:
-        """Close the board."""
+        """Close the connection to the board."""
         with self.gate.lock:
             hil, self._hil = self._hil, None
         if hil is not None:
@@ -317,7 +331,7 @@ class QuanserBoard:
                 hil.close()
 
     def describe(self) -> str:
-        """Return the product name of the board in parentheses; empty if it cannot be read."""
+        """Return the product name of the board in parentheses, after a space; "" if it cannot be read."""
         try:
             codes = getattr(import_module("quanser.hardware.enumerations"), "StringProperty", None)
             text = string_property(self._hil, getattr(codes, "PRODUCT_NAME", 1))
@@ -326,7 +340,10 @@ class QuanserBoard:
         return f" ({text})" if text else ""
 
     def _read(self, guard: _core.Guard) -> float | None:
-        """Read one sample into the buffers, and return its delay [s]; None if sampling has stopped."""
+        """Read one sample into the buffers of this object, and return its delay [s].
+
+        If the sampling task has stopped, latch a fault, write 0 V and return None.
+        """
         with self._translate_errors("reading", guard=guard) as hil:
             count = hil.task_read(self._task, 1, self._analog, self._counts, self._digital, None)
             if count < 1:
@@ -340,7 +357,7 @@ class QuanserBoard:
 
     def _reload_and_write(self, guard: _core.Guard, volts: tuple[float, float]) -> None:
         with self.gate.lock, self._translate_errors("writing", guard=guard) as hil:
-            # A run that goes on in another thread after shutdown must not feed the watchdog either.
+            # After shutdown, a run that continues in another thread must not reload the watchdog either.
             self.gate.check()
             if not hil.watchdog_reload():
                 self._is_expired = True
@@ -357,11 +374,11 @@ class QuanserBoard:
                 self._hil.write_analog(*ANALOG_OUT, self._volts)
 
     def _run_unless_expired(self, act: Callable[[], None], *, is_end: bool) -> None:
-        """Perform an action, and ignore its error if the watchdog has expired.
+        """Perform an action on the board.
 
-        `is_end` states that the expired watchdog has already achieved the purpose of the action.
-
-        The board stays locked, because clearing the watchdog would restore the previous outputs.
+        An error of the action is ignored if `is_end` is True and the watchdog has expired. `is_end` states that an
+        expired watchdog has the same effect as the action (0 V or disabled amplifiers). The expired watchdog is not
+        cleared, because that would restore the previous outputs.
         """
         try:
             act()
@@ -370,7 +387,7 @@ class QuanserBoard:
                 raise
 
     def _has_expired(self) -> bool:
-        """Whether the watchdog has expired; False if the board does not answer."""
+        """Whether the watchdog has expired; False if the board reports an error instead."""
         if not self._watched or self._hil is None:
             return self._is_expired
         try:
@@ -381,9 +398,10 @@ class QuanserBoard:
 
     @contextlib.contextmanager
     def _translate_errors(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> Iterator[Any]:
-        """Convert vendor errors in a ``with`` block to `RigFault`, and latch them with the guard of a run.
+        """Convert errors of the vendor's package in a ``with`` block to RigFault, and latch them in `guard`, if given.
 
-        `what` is the name of the operation, and `hil` the vendor handle, by default that of the board.
+        `what` is the name of the operation in the message. The block gets the vendor's board object, by default that of
+        this board. Raise RigFault if the board is not open.
         """
         handle = self._hil if hil is None else hil
         if handle is None:
@@ -393,7 +411,7 @@ class QuanserBoard:
         except self._error as error:
             fault = self._fault(what, error)
             if guard is not None:
-                # A locked board rejects every further call with its own error; report the expiry as the cause.
+                # A board that is locked by its expired watchdog rejects every call, so the expiry is the cause.
                 if self._has_expired():
                     fault = RigFault(f"{WATCHDOG_EXPIRED_MESSAGE} (Q8-USB, {what})")
                 guard.fail(str(fault))
@@ -416,7 +434,10 @@ MAX_PROPERTY_CHARACTERS = 64
 
 
 def string_property(hil: Any, code: Any) -> str:
-    """Return a string property of the board; "" for the 2022 package, whose call overflows its buffer."""
+    """Return the string property with this code of the vendor's board object.
+
+    Return "" with the vendor's package of 2022, whose function overflows its buffer.
+    """
     if len(signature(hil.get_string_property).parameters) != 2:
         return ""
     return str(hil.get_string_property(code, MAX_PROPERTY_CHARACTERS))

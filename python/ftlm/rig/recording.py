@@ -1,4 +1,4 @@
-"""Recording of experiments on a rig: command sources, recording loop and partial files."""
+"""Recording of experiments on a rig: command sources, recording loop, and files that are written during a run."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ COLUMN_UNITS = {name: "A" if name.startswith("I") else "rad" for name in RIG_COL
 
 
 def units_of(extra_columns: tuple[str, ...] = ()) -> dict[str, str]:
-    """Return the units of the columns of a run; additional columns are angles [rad]."""
+    """Return the unit of each column of a recorded run by name; `extra_columns` are angles [rad]."""
     return COLUMN_UNITS | dict.fromkeys(extra_columns, "rad")
 
 
 def partial_path(target: Path) -> Path:
-    """Return the path of the partial file that is written during a run."""
+    """Return the path of the temporary csv file that is written during a run, next to the final file `target`."""
     return target.with_name(target.stem + ".csv.partial")
 
 
 class PartialRecording:
-    """Csv file that is written during an experiment, and can be loaded if the program terminates unexpectedly.
+    """Csv file that is written during an experiment, so that data are not lost if the program terminates unexpectedly.
 
     Parameters
     ----------
     target
-        Path of the final file; with None nothing is written to disk.
+        Path of the final file, from which the path of this file is derived. With None nothing is written to disk.
     name, step, about
         Name, sampling interval [s] and metadata of the run.
     extra_columns
-        Names of additional inputs, appended to the rig's columns in every row.
+        Names of additional inputs, which follow the columns of the rig.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class PartialRecording:
         self.path = None if target is None else partial_path(target)
         self._step, self._rows = step, 0
         self._columns = (*RIG_COLUMNS, *extra_columns)
-        #: Number of complete rows on disk.
+        #: Number of complete rows in the file.
         self.kept = 0
         self._descriptor: int | None = None
         self._opened = False
@@ -79,19 +79,19 @@ class PartialRecording:
         )
 
     def open(self) -> None:
-        """Create the file.
+        """Create the file and write its header.
 
         Raises
         ------
         DataError
-            If the file cannot be written; it is then removed.
+            If the file cannot be written. The file is then removed.
         """
         if self.path is None:
             return
         lines = f"{self._header.line()}{','.join([CSV_TIME, *self._columns])}\n"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         try:
-            # Replace a symbolic link itself, not its target.
+            # If the path is a symbolic link, the link is replaced and its target is kept.
             self.path.unlink(missing_ok=True)
             self._opened = True
             self._descriptor = os.open(self.path, flags, 0o666)
@@ -104,12 +104,12 @@ class PartialRecording:
             ) from None
 
     def write(self, rows: Floats) -> None:
-        """Append rows, shape (n, columns).
+        """Append samples to the file, shape (n, number of columns).
 
         Raises
         ------
         RigFault
-            If the rows cannot be written. Complete rows remain in the file.
+            If the samples cannot be written. Rows written earlier remain in the file.
         """
         if self._descriptor is None or len(rows) == 0:
             self._rows += len(rows)
@@ -137,13 +137,13 @@ class PartialRecording:
             raise
 
     def close(self) -> None:
-        """Close the file, and delete it if it has no rows, because it would prevent the next recording."""
+        """Close the file. A file without rows is deleted, because it would prevent the next recording."""
         if self.kept == 0:
             self.remove()
         self._close_descriptor()
 
     def remove(self) -> None:
-        """Close and delete the file, after the run has been written to its final file."""
+        """Close and delete the file, which is no longer needed once the run is in its final file."""
         self._close_descriptor()
         if self.path is not None and self._opened:
             with contextlib.suppress(OSError):
@@ -165,7 +165,30 @@ def save_run(
     ended: BaseException | None,
     faults: list[str],
 ) -> Run:
-    """Write the run to its final file and return it, or raise the exception that ended the run."""
+    """Write a recorded run to its final file, and return the run or raise the exception of its early end.
+
+    Parameters
+    ----------
+    run
+        Recorded run; None if too few samples were recorded.
+    target
+        Path of the final file; None for no file.
+    partial
+        File that was written during the run. It is removed once the final file is complete.
+    force
+        Whether to overwrite the final file.
+    ended
+        Exception that ended the run early, or None.
+    faults
+        Fault messages of the run.
+
+    Raises
+    ------
+    RigFault
+        If there is a fault, no run, or the final file cannot be written. Its `run` is the recorded run.
+    BaseException
+        The exception `ended`, if it is not a RigFault, with a note on where the samples are.
+    """
     place = "nothing was recorded until then"
     if run is not None:
         place = f"{run.length} rows were recorded until then"
@@ -198,9 +221,10 @@ def save_run(
     return run
 
 
-#: The stock low-pass of the deflections: natural frequency [rad/s] and damping.
+#: Low-pass filter of the deflections in the arm's stock real-time model: natural frequency [rad/s] and damping ratio.
 STOCK_FILTER = (math.sqrt(157.9137), 22.6195 / (2.0 * math.sqrt(157.9137)))
-#: Rows per block on disk; in real time few, so that writing a block takes less than a sample.
+#: Number of samples that are written to disk together. In real time it is small, so that writing takes less than one
+#: sampling interval.
 _BLOCK_ROWS_REAL_TIME, _BLOCK_ROWS_FAST = 32, 500
 
 
@@ -231,67 +255,69 @@ def record(
     live: Streaming | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Run:
-    """Apply a current signal to both motors of a rig and record currents and angles.
+    """Apply a current signal to both motors of a rig, and record currents and angles.
 
-    Every command is limited in amplitude, slew rate and thermal load, and every sample is checked. However the
-    recording ends, 0 V is written, the amplifiers are disabled, and the samples recorded so far are kept.
+    Every command is limited in amplitude, slew rate and thermal load, and every sample is checked. Also after a fault
+    or an interruption, 0 V is written, the amplifiers are disabled, and the recorded samples are kept.
 
     Parameters
     ----------
     rig : {"virtual", "q8"} or Board, default "virtual"
         The simulated arm, the arm on a Q8-USB board, or a user-defined board.
     input : str
-        Shape of the current, see `Excitation`: square, sine, chirp, multisine, prbs, doublet or csv.
+        Shape of the current: square, sine, chirp, multisine, prbs, doublet or csv; see :class:`Excitation`.
     amplitude : float or pair of float
-        Maximum current [A] of both motors or of each; at most 0.94 for motor 1 and 1.2 for motor 2.
+        Maximum current [A] of both motors, or (motor 1, motor 2); at most 0.94 for motor 1 and 1.2 for motor 2.
     period : float, optional
-        Period [s]; for prbs the switching interval.
+        Period [s]; for prbs the switching interval. The default depends on the shape; see :class:`Excitation`.
     band : pair of float
         Frequency band of chirp and multisine [Hz].
     ramp : float
         Duration of the linear ramp of the amplitude from zero [s].
     file : path, optional
-        Currents for ``input="csv"``, columns I1 and I2 [A].
+        File with the currents for ``input="csv"``, in the columns I1 and I2 [A].
     duration : float
         Duration [s], above 0 and at most `limit`.
     limit : float
-        Longest permitted duration [s], at most 600.
+        Maximum permitted duration [s], at most 600.
     rate : float
-        Sampling rate [Hz]; at most 8000 on the board.
+        Sampling rate [Hz], 1 to 8000.
     seed : int
         Seed of the simulated noise and of random inputs. Equal seeds give equal runs.
     parameters : str, path or ArmParameters
-        Parameters of the simulated arm: ``"effective"``, ``"measured"``, ``"linear"`` (no friction, coupling or noise)
-        or a TOML file.
+        Parameters of the simulated arm: ``"effective"``, ``"measured"``, ``"measured-lqr"``, ``"linear"`` (no friction,
+        coupling or noise), or a TOML file.
     offset : pair of float, optional
-        Current offset of each motor of the simulated arm while the amplifiers are enabled [A]; default that of its
-        parameters, 0. On hardware the offset differs from run to run.
+        Current offset of each motor of the simulated arm while the amplifiers are enabled [A]. The default is that of
+        `parameters`, which is 0 in the named sets. On hardware the offset differs from run to run.
     real_time : bool
         Whether the virtual rig runs in real time.
     sensor_filter : {"stock"}, optional
-        Record deflections behind the stock 2 Hz low-pass.
+        ``"stock"`` applies the 2 Hz low-pass of the arm's stock real-time model to the recorded deflections.
     watchdog : float
-        Timeout after which the watchdog stops the motors [s], 0.01 to 1.
+        Time without a write after which the watchdog stops the motors [s], 0.01 to 1.
     arm : bool
-        Must be True for hardware, as confirmation that the arm may move.
+        Confirmation that the real arm may move. It must be True for hardware.
     board : str
         Identifier of the Q8-USB, such as ``"0"`` or ``"0@tcpip://host:port"``.
     name : str, optional
-        Name of the run; default the shape of the input.
+        Name of the run; by default the shape of the input.
     out : path, optional
-        File to write, .csv or .parquet.
+        File to write, with the suffix .csv or .parquet.
     force : bool
         Whether to overwrite an existing file.
     live : Streaming, optional
-        Recursive identification of every recorded sample; the run's `metadata` holds the last estimate.
+        Recursive identification that is updated with every recorded sample. Its last estimate is stored in the
+        `metadata` of the run.
     progress : callable, optional
-        Called with the recorded and the total number of rows, after the update of `live`.
+        Callback with (recorded samples, total samples), called after the update of `live`.
 
     Returns
     -------
     Run
-        Inputs I1, I2 [A] as commanded (zero-order hold); outputs theta11, theta12, theta21, theta22 [rad] and
-        I1_measured, I2_measured [A]. `metadata` holds rig, seed, input, parameters, missed deadlines and faults.
+        Run with the inputs I1, I2 [A] as commanded (zero-order hold), and the outputs theta11, theta12, theta21,
+        theta22 [rad] and I1_measured, I2_measured [A]. Its `metadata` has rig, seed, input, parameters, missed
+        deadlines and faults.
 
     Raises
     ------
@@ -300,10 +326,12 @@ def record(
     DataError
         If a file cannot be read or already exists. The arm has not moved.
     RigFault
-        If the rig stopped the run. The message states the cause; `run` and the file have the recorded samples.
+        If the rig stopped the run. The message states the cause. The recorded samples are in the attribute `run` of the
+        exception and in the file.
     BaseException
-        On Ctrl-C, SIGTERM, or an exception of `progress`, after shutdown and after the file is written. Its notes list
-        errors during shutdown, and where the rows are. In a thread other than the main one, Ctrl-C raises RigFault.
+        On Ctrl-C, SIGTERM, or an exception of `progress`, after shutdown and after the file is written. Notes of the
+        exception list errors of the shutdown, and where the samples are. In a thread other than the main one, Ctrl-C
+        raises RigFault.
     """
     seed = check_seed(seed)
     duration, limit, rate = check_times(duration, limit, rate)
@@ -316,25 +344,25 @@ def record(
 
 
 class CommandSource(Protocol):
-    """Protocol of an object that supplies the commands of a run."""
+    """Protocol of an object that supplies the current commands of a run; `rows` is their number."""
 
     rows: int
-    #: Additional signals of the run by name, one value per sample.
+    #: Additional input signals of the run by name, one value per sample.
     extra_signals: dict[str, Floats]
 
     def first_commands(self, rig: Rig, block: int) -> Floats:
-        """Return the first commands [A], shape (n, 2) with n at most `block`."""
+        """Return the first current commands [A], shape (n, 2) with n at most `block`."""
 
     def next_commands(self, rows: Floats) -> Floats:
-        """Return the commands [A] that follow the measured rows; empty at the end of the run."""
+        """Return the current commands [A] after the last measured samples `rows`; empty at the end of the run."""
 
     def explain_fault(self, fault: str) -> str:
-        """Return a fault message, extended by the contribution of this source to the fault."""
+        """Return a fault message, with an added explanation if this source contributed to the fault."""
 
 
 @dataclass(frozen=True)
 class RigSetup:
-    """Arguments that select a board and define how it is run; see :func:`record`."""
+    """Arguments of :func:`record` that select a board and define its operation."""
 
     rig: str | Board
     seed: int
@@ -347,7 +375,10 @@ class RigSetup:
     board: str
 
     def select_board(self, limit: float) -> tuple[Board, dict[str, Any]]:
-        """Return the selected board for runs of at most `limit` seconds, and its metadata for the run."""
+        """Return the selected board for runs of at most `limit` seconds, and metadata on the board.
+
+        Raise ModelError or DataError if rig, offset or parameters are invalid.
+        """
         virtual = isinstance(self.rig, str) and self.rig == "virtual"
         if self.offset is not None and not virtual:
             raise ModelError("offset applies only to the virtual arm; leave it out for a board")
@@ -377,7 +408,7 @@ class RigSetup:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Arguments of an experiment, validated; see :func:`record`."""
+    """Arguments of an experiment after validation; see :func:`record`."""
 
     setup: RigSetup
     duration: float
@@ -390,9 +421,13 @@ class Experiment:
     progress: Callable[[int, int], None] | None
 
     def record_run(self, source_on: Callable[[Board], CommandSource], more_details: dict[str, Any]) -> Run:
-        """Run the experiment with a command source and return the recorded run."""
+        """Run the experiment and return the recorded run.
+
+        `source_on` returns the command source for the selected board, and `more_details` are added to the metadata.
+        Raise ModelError or DataError for invalid arguments, and RigFault if the rig stops the run.
+        """
         setup = self.setup
-        # Flags that let an arm move must be bool; truthy values are rejected.
+        # Flags that permit an arm to move must be bool; other values that count as true are rejected.
         for name, flag in (("real_time", setup.real_time), ("arm", setup.arm), ("force", self.force)):
             if not isinstance(flag, bool):
                 raise ModelError(f"{setting(name)} {short_repr(flag)} is neither True nor False; use one of them")
@@ -471,7 +506,7 @@ class Experiment:
 
 
 class FixedCommands:
-    """Command source of precomputed commands [A], shape (rows, 2)."""
+    """Command source with precomputed current commands [A], shape (rows, 2)."""
 
     def __init__(self, commands: Floats) -> None:
         self.commands, self.rows = commands, len(commands)
@@ -479,12 +514,12 @@ class FixedCommands:
         self._at = self._block = 0
 
     def first_commands(self, rig: Rig, block: int) -> Floats:
-        """Return the first block of commands."""
+        """Return the first commands [A], shape (n, 2) with n at most `block`; later blocks have the same size."""
         self._at, self._block = block, block
         return self.commands[:block]
 
     def next_commands(self, rows: Floats) -> Floats:
-        """Return the next block of commands; measurements are ignored."""
+        """Return the next block of commands [A]; the measured samples are ignored."""
         start, self._at = self._at, self._at + self._block
         return self.commands[start : start + self._block]
 
@@ -494,7 +529,10 @@ class FixedCommands:
 
 
 def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None, list[str]]:
-    """Run all commands, and return the exception that ended the run early (or None) and all fault messages."""
+    """Run all commands of the recorder's source on a rig.
+
+    Return the exception that ended the run early, or None, and all fault messages.
+    """
     faults: list[str] = []
     ended: BaseException | None = None
     try:
@@ -507,7 +545,7 @@ def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None,
         ended = error
         faults.append(recorder.source.explain_fault(describe_interruption(error)))
     except BaseException as error:
-        # Error of the program, such as in `progress`; raised again after the recorded samples are written.
+        # An error of the program, such as in `progress`, is raised again after the recorded samples are written.
         ended = error
         faults.append(f"stopped by an error of the program ({type(error).__name__}: {error})")
     if ended is not None and not isinstance(ended, RigFault):
@@ -517,7 +555,7 @@ def _run_commands(link: Rig, recorder: _Recorder) -> tuple[BaseException | None,
 
 
 def describe_interruption(ended: KeyboardInterrupt | SystemExit) -> str:
-    """Return text on the interruption of a run by a signal or an exit."""
+    """Return the text "stopped by …" for a run that Ctrl-C, another signal or an exit of the program has ended."""
     if isinstance(ended, KeyboardInterrupt):
         return describe_signal(signal.SIGINT)
     return describe_signal(ended.code - 128 if isinstance(ended.code, int) else 0)
@@ -525,7 +563,11 @@ def describe_interruption(ended: KeyboardInterrupt | SystemExit) -> str:
 
 @dataclass
 class _Recorder:
-    """Recorder that stores the rows of a rig in memory and in a partial file."""
+    """Recorder that runs the commands of a source on a rig, and stores the samples in memory and in a file.
+
+    `columns` are the indices of the rig's columns for the signals of `live`. `block` is the number of samples that are
+    written to the file together. `taken` are all recorded samples, and `live_error` is the error of a failed `live`.
+    """
 
     partial: PartialRecording
     source: CommandSource
@@ -535,12 +577,12 @@ class _Recorder:
     block: int
     live_error: str | None = None
     taken: list[Floats] = field(default_factory=list)
-    #: Number of blocks passed on, and of their rows.
+    #: Number of entries of `taken` that were written to the file, and number of their samples.
     blocks: int = 0
     done: int = 0
 
     def follow(self, rig: Rig) -> None:
-        """Run the commands of the source, and store the measured rows in blocks."""
+        """Run all commands of the source on a rig, and store the measured samples."""
         try:
             commands = self.source.first_commands(rig, self.block)
             while len(commands):
@@ -556,15 +598,15 @@ class _Recorder:
             self.flush()
 
     def collect(self, rig: Rig) -> Floats:
-        """Store and return the rows recorded since the last call.
+        """Fetch the samples that the rig recorded since the last call, store and return them.
 
-        Signals are deferred during the call, so that no row is lost.
+        Signals are deferred during the call, so that no sample is lost.
         """
         self.taken.append(rig.take())
         return self.taken[-1]
 
     def flush(self) -> None:
-        """Pass pending rows to the partial file, the live estimate and the progress callback."""
+        """Pass stored samples that are not in the file yet to the file, to `live`, and to the progress callback."""
         pending, self.blocks = self.taken[self.blocks :], len(self.taken)
         rows = self._columns(pending, self.done)
         if not len(rows):
@@ -581,13 +623,16 @@ class _Recorder:
             self.progress(self.done, self.source.rows)
 
     def _columns(self, blocks: list[Floats], start: int) -> Floats:
-        """Return the columns of the run for blocks of rows that begin at row `start`."""
+        """Return samples from consecutive blocks without their delay, with the extra signals of the source appended.
+
+        `start` is the index of the first sample in the run.
+        """
         rows = np.concatenate([np.empty((0, len(RIG_COLUMNS) + 1)), *blocks])[:, : len(RIG_COLUMNS)]
         extra_values = [values[start : start + len(rows), None] for values in self.source.extra_signals.values()]
         return np.hstack([rows, *extra_values])
 
     def finish(self, name: str, about: dict[str, Any], faults: list[str], step: float) -> Run | None:
-        """Return the recorded run; None if it has fewer than three rows."""
+        """Return the recorded run with name, metadata (`about`) and faults; None if it has fewer than three samples."""
         extra_names = tuple(self.source.extra_signals)
         rows = self._columns(self.taken, 0)
         if len(rows) < 3:
@@ -608,7 +653,7 @@ def _check_target(target: Path, *, force: bool) -> None:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
     check_free(target, force=force)
     partial = partial_path(target)
-    # Rows would be written to the target of a dangling link.
+    # The path is also occupied if it is a symbolic link to a missing file.
     if os.path.lexists(partial) and not force:
         raise DataError(
             f"{str(partial)!r} contains the recording of a program that was interrupted; load it, rename or remove "
@@ -617,7 +662,10 @@ def _check_target(target: Path, *, force: bool) -> None:
 
 
 def check_times(duration: float, limit: float, rate: float) -> tuple[float, float, float]:
-    """Return duration [s], limit [s] and rate [Hz] as floats; raise ModelError if one is invalid."""
+    """Return (duration [s], limit [s], rate [Hz]) as floats.
+
+    Raise ModelError if one is out of range, the duration exceeds the limit, or the run has fewer than three samples.
+    """
     longest, length, samples = finite_number(limit), finite_number(duration), finite_number(rate)
     if longest is None or not 0 < longest <= MAX_RUN_DURATION_S:
         raise ModelError(
@@ -646,7 +694,7 @@ def check_times(duration: float, limit: float, rate: float) -> tuple[float, floa
 
 
 def _column_of(name: str) -> int:
-    """Return the index of the rig's column that contains a signal of the structure identified live."""
+    """Return the index of a signal among the columns of the rig; raise ModelError if the rig does not record it."""
     if name not in RIG_COLUMNS:
         raise ModelError(
             f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(RIG_COLUMNS)}"

@@ -24,58 +24,58 @@ from ftlm.utils.validation import Floats, as_floats, error_text, real_number
 
 #: Termination signals, including those of a closed terminal.
 _TERMINATION_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-#: Longest time for which a new signal handler of the program stays unnoticed [ms].
+#: Interval at which the thread looks for new signal handlers of the program [ms].
 _HANDLER_CHECK_INTERVAL_MS = 20.0
 
 
 class OutputGate:
-    """Lock for writes to a board. After it is closed, no thread can write anything but 0 V.
+    """Lock for writes to a board. After the gate is closed, no thread can write anything but 0 V.
 
-    :class:`Rig` assigns a gate to its board for each session. A user-defined board must write while it holds `lock`.
+    :class:`Rig` assigns a gate to its board for each session. A user-defined board must acquire `lock` for every write.
     Before it writes another voltage than 0 V or enables the amplifiers, it must call :meth:`check`.
     """
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        #: Why the gate is closed; None while it is open.
+        #: Reason why the gate was closed; None while it is open.
         self.reason: str | None = None
-        #: Whether a thread is within :meth:`Board.run`.
+        #: Whether a thread is executing :meth:`Board.run`.
         self.running = False
 
     def close(self, reason: str) -> None:
-        """Close the gate permanently, with a reason; the reason of the first call is kept."""
+        """Close the gate permanently for a reason; further calls do not change the reason."""
         with self.lock:
             self.reason = self.reason or reason
 
     def check(self) -> None:
-        """Raise RigFault if the gate is closed."""
+        """Raise RigFault with the reason if the gate is closed."""
         if self.reason is not None:
             raise RigFault(self.reason)
 
 
 class InterruptWatch:
-    """Thread that stops the motors on a termination signal if their run is not in the main thread.
+    """Thread that stops the motors on a termination signal if the rig runs in a thread other than the main one.
 
-    Python calls signal handlers only in the main thread, which may be waiting for the run. :mod:`faulthandler` instead
-    writes to a pipe within the signal itself, and then passes the signal to Python. The thread reads the pipe.
+    Python calls signal handlers only in the main thread, which may be waiting for the run. The C-level handler of
+    :mod:`faulthandler` writes to a pipe immediately, and then passes the signal to Python. The thread reads the pipe.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._boards: list[Board] = []
-        #: Ends of the pipe of each signal, and the system's handler while it is that of faulthandler.
+        #: Read end and write end of the pipe of each signal, and address of the installed handler of faulthandler.
         self._pipes: dict[int, tuple[int, int]] = {}
         self._handlers: dict[int, bytes] = {}
 
     @property
     def available(self) -> bool:
-        """Whether the platform can report signals to the thread."""
+        """Whether this platform can report signals to the thread; false on Windows."""
         return hasattr(faulthandler, "register")
 
     def add(self, board: Board) -> None:
-        """Register a board whose motors are stopped at the next termination signal that Python handles.
+        """Register a board whose motors are stopped at the next termination signal with a Python handler.
 
-        Other signals end the program.
+        A termination signal without a Python handler ends the program.
         """
         with self._lock:
             self._boards.append(board)
@@ -90,19 +90,19 @@ class InterruptWatch:
             threading.Thread(target=self._watch, name="ftlm signals", daemon=True).start()
 
     def remove(self, board: Board) -> None:
-        """Unregister a board."""
+        """Unregister a board, whose motors a signal then no longer stops."""
         with self._lock, contextlib.suppress(ValueError):
             self._boards.remove(board)
 
     def reset(self) -> None:
-        """Clear the state in a forked child process, which has neither the thread nor access to the motors."""
+        """Unregister all boards and handlers in a forked child process, which does not have the thread."""
         self._lock = threading.Lock()
         self._boards = []
         self._stop()
 
     def _stop(self) -> None:
         for number, ends in self._pipes.items():
-            # A handler that is not a function of Python has replaced that of faulthandler already.
+            # If the current handler is not a Python function, the handler of faulthandler is already replaced.
             if number in self._handlers and callable(signal.getsignal(number)):
                 faulthandler.unregister(number)
             for end in ends:
@@ -110,9 +110,9 @@ class InterruptWatch:
         self._handlers, self._pipes = {}, {}
 
     def _register(self) -> None:
-        """Register each signal whose handler the program has set since the last call.
+        """Register faulthandler again for each signal whose handler the program has set since the last call.
 
-        Setting a handler replaces that of faulthandler.
+        Setting a Python handler replaces the handler of faulthandler.
         """
         for number, (_, write_end) in self._pipes.items():
             if callable(signal.getsignal(number)) and _system_handler(number) != self._handlers.get(number):
@@ -140,7 +140,7 @@ class InterruptWatch:
 
 
 def _system_handler(number: int) -> bytes:
-    """Return the address of the function that handles a signal, the first member of the system's structure."""
+    """Return the bytes of the address of the C function that handles a signal: the first member of struct sigaction."""
     action = ctypes.create_string_buffer(1024)
     ctypes.CDLL(None).sigaction(number, None, action)
     return action.raw[: ctypes.sizeof(ctypes.c_void_p)]
@@ -152,7 +152,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def check_thread(board: Board) -> None:
-    """Raise ModelError if hardware would run in a thread in which Ctrl-C cannot stop the motors."""
+    """Raise ModelError if a hardware board would run in a thread in which Ctrl-C cannot stop its motors."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     if board.hardware and not in_main_thread and not INTERRUPT_WATCH.available:
         raise ModelError(
@@ -162,7 +162,7 @@ def check_thread(board: Board) -> None:
 
 
 def describe_signal(number: int) -> str:
-    """Return text on the end of a run by a signal."""
+    """Return the text "stopped by …" with the name of a signal, or with "an exit" for an unknown signal number."""
     if number == signal.SIGINT:
         return "stopped by Ctrl-C"
     names = {int(s): s.name for s in signal.Signals}
@@ -170,7 +170,7 @@ def describe_signal(number: int) -> str:
 
 
 def _stop_motors(board: Board, reason: str) -> None:
-    """Close the gate of a board, write 0 V and disable the amplifiers."""
+    """Close the output gate of a board for a reason, write 0 V and disable the amplifiers; errors are ignored."""
     board.gate.close(reason)
     with contextlib.suppress(Exception):
         board.write((0.0, 0.0))
@@ -181,14 +181,14 @@ def _stop_motors(board: Board, reason: str) -> None:
 class SignalHandlers:
     """Handlers of termination signals that are active from start-up to shutdown of a rig.
 
-    In the main thread, a signal closes the gate of the board, so that nothing but 0 V can be written, and raises an
-    exception. In other threads, `INTERRUPT_WATCH` stops the motors. The object has no reference to a rig, so that the
-    handler table does not keep a rig alive.
+    If the rig runs in the main thread, a signal closes the output gate of the board and raises an exception. Nothing
+    but 0 V can then be written. If the rig runs in another thread, `INTERRUPT_WATCH` stops the motors. The object has
+    no reference to the rig, because installed handlers would otherwise prevent its garbage collection.
 
     Parameters
     ----------
     deaf
-        Code of functions that no signal may interrupt. A signal during such a function is deferred to its end.
+        Code objects of functions that no signal may interrupt. A signal during such a function is deferred.
     board
         Board whose motors a signal stops, or None.
     """
@@ -201,7 +201,7 @@ class SignalHandlers:
         self._watched = self._is_persistent = self._deferring = False
 
     def install(self) -> None:
-        """Replace the current handlers, except that a Ctrl-C that the program ignores remains ignored."""
+        """Replace the current signal handlers; if the program ignores Ctrl-C (SIGINT), it remains ignored."""
         if self._before or self._watched:
             return
         if threading.current_thread() is not threading.main_thread():
@@ -213,36 +213,39 @@ class SignalHandlers:
             number = getattr(signal, name, None)
             if number is None or (name == "SIGINT" and signal.getsignal(number) in (signal.SIG_IGN, None)):
                 continue
-            # Store the old handler first, so that a signal between the two statements loses nothing.
+            # Store the old handler first, so that a signal between the two statements can be handled.
             self._before[number] = signal.getsignal(number)
             signal.signal(number, self._handle)
 
     def keep(self) -> None:
-        """Install the handlers until :meth:`release`; signals after the first one or after shutdown are deferred."""
+        """Install the handlers until :meth:`release` is called.
+
+        After the first signal, or after shutdown of the rig, further signals are deferred.
+        """
         self._is_persistent = True
         self.install()
 
     def restore(self) -> None:
-        """Restore all previous handlers, or defer further signals until :meth:`release`."""
+        """Restore all previous handlers; after :meth:`keep`, defer signals until :meth:`release` instead."""
         if self._is_persistent:
             self._deferring = True
         else:
             self._restore()
 
     def release(self) -> None:
-        """Restore all previous handlers; :meth:`deliver` then raises the exceptions of deferred signals."""
+        """Restore all previous handlers; :meth:`deliver` can then raise the exception of a deferred signal."""
         self._is_persistent, self._deferring = False, True
         self._restore()
         self._deferring = False
 
     def ignore(self) -> None:
-        """Ignore further signals, because the process is about to exit."""
+        """Ignore further termination signals, because the process is about to exit."""
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)
         self._before = {}
 
     def deliver(self) -> None:
-        """Raise the exception of a deferred signal, unless it must wait for :meth:`release`."""
+        """Raise the exception of a deferred signal, if any; do nothing while signals are being deferred."""
         if self._deferring:
             return
         number, self._waiting = self._waiting, None
@@ -252,7 +255,7 @@ class SignalHandlers:
             _end(number)
 
     def _restore(self) -> None:
-        """Restore all previous handlers, while signals are blocked if the system supports it."""
+        """Restore all previous handlers; the signals are blocked during this if the system supports it."""
         if self._board is not None and self._watched:
             self._watched = False
             INTERRUPT_WATCH.remove(self._board)
@@ -294,60 +297,62 @@ def _end(number: int) -> None:
     raise SystemExit(128 + number)
 
 
-#: Deflection per volt of strain gauge [rad/V]; the sign is reversed.
+#: Deflection per volt of strain-gauge voltage above its bias [rad/V], for links 1 and 2; the sign is reversed.
 STRAIN_SCALE = (0.013636, 0.018694)
-#: Current per volt of the sense [A/V]; the sign is reversed.
+#: Motor current per volt at the current-sense input [A/V]; the sign is reversed.
 SENSE_SCALE = 2.0
-#: Current per volt of the command [A/V]; the sign is reversed.
+#: Motor current per volt at the command output [A/V]; the sign is reversed.
 COMMAND_SCALE = 0.5
-#: Hub angle per count [rad]: 1024 lines read fourfold, behind gears of 100:1 and 50:1.
+#: Hub angle per encoder count [rad], for joints 1 and 2: 1024 lines with fourfold evaluation, gears of 100:1 and 50:1.
 ENCODER_SCALE = (2.0 * math.pi / 4096.0 / 100.0, 2.0 * math.pi / 4096.0 / 50.0)
-#: Maximum currents for which the amplifiers are configured [A].
+#: Maximum motor currents for which the amplifiers are configured [A], for joints 1 and 2.
 CURRENT_LIMIT = (0.94, 1.2)
-#: Rest before every run, over which the bias of the gauges is averaged [s].
+#: Time at 0 V before every run, over which the bias of the strain gauges is averaged [s].
 REST_DURATION_S = 0.2
-#: Longest permitted run [s].
+#: Maximum permitted duration of a run [s].
 MAX_RUN_DURATION_S = 600.0
-#: Permitted watchdog timeouts [s]; 0 would disable the watchdog, longer ones let a motor run too long.
+#: Range of permitted watchdog timeouts [s]. 0 would disable the watchdog, and with a longer one a motor would run too
+#: long after a failure.
 WATCHDOG_RANGE_S = (0.01, 1.0)
-#: Message if no shutdown step is confirmed to have stopped the motors.
+#: Error message if no step of the shutdown has confirmed that the motors are stopped.
 MOTORS_LIVE_MESSAGE = (
     "the motors may still be under current: neither 0 V nor switched-off amplifiers nor the watchdog's expiry could be "
     "confirmed; cut the arm's power by hand (emergency stop). The watchdog was left running and the board open"
 )
-#: Columns of a recorded row.
+#: Columns of a recorded row: commanded currents [A], angles [rad], measured currents [A].
 RIG_COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
 
 
 @check_arguments
 @dataclass(frozen=True)
 class Limits:
-    """Safety limits that are applied to every command and sample; pairs are for joints 1 and 2.
+    """Safety limits for every command and sample of a rig; pairs are for joints 1 and 2.
 
     Parameters
     ----------
     current
-        Maximum command [A].
+        Maximum magnitude of a motor current command [A].
     slew
-        Maximum rate of change of a command [A/s]; a full reversal takes two samples of 2 ms.
+        Maximum rate of change of a command [A/s]. With the default, a full reversal takes two samples of 2 ms.
     continuous
-        Continuous current rating [A]: bound on the RMS current over `thermal_time`.
+        Maximum RMS current of a motor, averaged over `thermal_time` [A].
     thermal_time
         Thermal time constant of the motors [s].
     deflection
-        Maximum link deflection [rad].
+        Maximum magnitude of a link deflection [rad].
     saturation
-        Gauge voltage [V] from which a gauge counts as saturated.
+        Magnitude of a strain-gauge voltage [V] from which the gauge counts as saturated.
     moving_current
-        Current at which a hub must move [A]; at smaller currents it may stick.
+        Current above which a hub must move [A]. At a smaller current it may stick.
     standstill
-        Longest standstill at that current [s].
+        Maximum duration [s] for which a hub may stand still while its current exceeds `moving_current`. It is also that
+        for which a strain gauge may show no change after the current has changed by `moving_current`.
     fastest
-        Maximum hub speed [rad/s]; a faster count is regarded as an encoder fault.
+        Maximum plausible hub speed [rad/s]. A faster change of the encoder count is an encoder fault.
     max_write_delay
-        Longest delay of a write [s].
+        Maximum permitted delay of a command after its deadline [s].
     max_missed_deadlines
-        Tolerated number of consecutive missed deadlines.
+        Maximum permitted number of consecutive missed deadlines.
     """
 
     current: tuple[float, float] = CURRENT_LIMIT
@@ -364,7 +369,10 @@ class Limits:
 
     @check_arguments
     def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
-        """Return the guard object of the core that enforces the limits at a sampling interval `step` [s]."""
+        """Return the core object that enforces the limits at a sampling interval `step` [s].
+
+        `sensor_filter` is (natural frequency [rad/s], damping ratio) of a low-pass on both deflections, or None.
+        """
         return _core.Guard(
             {
                 "step": step,
@@ -389,7 +397,7 @@ class Limits:
 
 
 class Board(Protocol):
-    """Protocol of a board, with methods in the order in which :class:`Rig` calls them."""
+    """Protocol of the interface board of a rig. :class:`Rig` calls the methods in the order of their definition."""
 
     name: str
     hardware: bool
@@ -397,59 +405,66 @@ class Board(Protocol):
     gate: OutputGate
 
     def open(self) -> None:
-        """Open the board."""
+        """Open the connection to the board."""
 
     def configure(self, rate: float) -> None:
-        """Set ranges, directions and encoders, set outputs to zero, and create a sampling task at a rate [Hz]."""
+        """Configure channel ranges, directions and encoders, set outputs to zero, and create the sampling task.
+
+        `rate` is the sampling rate [Hz].
+        """
 
     def set_expiration(self) -> None:
-        """Set the outputs that the watchdog applies when it expires: 0 V and safe digital lines."""
+        """Set the outputs that the board applies when its watchdog expires: 0 V, and disabled amplifiers."""
 
     def unsafe(self) -> str | None:
-        """Return a message if the watchdog would not stop the motors; None if it would."""
+        """Return an error message if an expired watchdog would not stop the motors; None if it would."""
 
     def start_watchdog(self, seconds: float) -> None:
-        """Start the watchdog with a timeout [s]."""
+        """Start the watchdog with a timeout of `seconds`."""
 
     def start(self, rate: float) -> None:
-        """Start sampling."""
+        """Start sampling at a rate [Hz]."""
 
     def enable(self, on: bool) -> None:
-        """Enable or disable the amplifiers."""
+        """Enable (`on`) or disable the amplifiers of both motors."""
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Write output voltages [V]."""
+        """Write the command voltages of both motors [V]."""
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Record a number of samples with outputs at 0 V."""
+        """Read a number of samples with outputs at 0 V, over which `guard` averages the bias of the strain gauges."""
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Apply commands [A], shape (n, 2), and record a sample for each, until they end or a fault is latched."""
+        """Apply current commands [A], shape (n, 2), and record one sample per command.
+
+        The method returns early if `guard`, which enforces the safety limits, latches a fault.
+        """
 
     def take(self) -> Floats:
-        """Return the rows recorded since the last call; columns are RIG_COLUMNS and the delay [s]."""
+        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
 
     def stop(self) -> None:
         """Stop sampling."""
 
     def let_expire(self) -> bool:
-        """Wait without heartbeat until the watchdog writes 0 V; return whether this is confirmed."""
+        """Wait until the watchdog expires and its outputs of 0 V are set; return whether this is confirmed."""
 
     def stop_watchdog(self) -> None:
         """Stop the watchdog."""
 
     def close(self) -> None:
-        """Close the board."""
+        """Close the connection to the board."""
 
 
 def shut_down(board: Board) -> list[str]:
     """Run the shutdown sequence of a board, and return the error messages of its steps.
 
-    The output gate is closed first, after which no other thread can write anything but 0 V. Each step is tried even if
-    an earlier one failed, and is repeated once if it is interrupted (by a second Ctrl-C). If 0 V cannot be written or
-    the amplifiers cannot be disabled, the sequence waits until the watchdog expires, which does both. If none of these
-    is confirmed, the watchdog keeps running and the board stays open, because the motors might have current after they
-    are stopped or closed.
+    The output gate is closed first, after which no thread can write anything but 0 V. Each step is tried even if an
+    earlier one failed, and is repeated once if it is interrupted, as by a second Ctrl-C. If 0 V cannot be written or
+    the amplifiers cannot be disabled, the function waits until the watchdog expires, which does both.
+
+    If neither 0 V nor disabled amplifiers nor the expiry is confirmed, the motors may still have current. The watchdog
+    is then not stopped and the board not closed, so that the watchdog can still act.
     """
     troubles: list[str] = []
     _try_step("closing the output gate", lambda: board.gate.close("the rig was shut down"), troubles)
@@ -474,9 +489,9 @@ def shut_down(board: Board) -> list[str]:
 
 
 def _try_step(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
-    """Try a shutdown step, again if it is interrupted, and return whether it succeeded.
+    """Run a shutdown step, once more if it is interrupted, and return whether it succeeded.
 
-    The message of a failure is appended to `troubles`.
+    If it failed, an error message is appended to `troubles`.
     """
     for _ in (1, 2):
         try:
@@ -493,9 +508,9 @@ def _try_step(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
 
 
 def _shut_down_and_restore(board: Board, signals: SignalHandlers) -> list[str]:
-    """Shut down a board, restore the signal handlers, and return the error messages.
+    """Shut down a board, restore the signal handlers, and return the error messages of the shutdown.
 
-    The function has no reference to the rig, so that it can run at garbage collection.
+    The function has no reference to the rig, so that it can be called when the rig is garbage-collected.
     """
     try:
         return shut_down(board)
@@ -506,9 +521,9 @@ def _shut_down_and_restore(board: Board, signals: SignalHandlers) -> list[str]:
 class Rig:
     """Session on a rig, from start-up to shutdown; use it in a ``with`` statement.
 
-    However the block is left (end, exception, Ctrl-C, SIGTERM, SIGHUP, garbage collection), 0 V is written, the
-    amplifiers are disabled, task and watchdog are stopped and the board is closed. Each step is tried even if an
-    earlier one fails. If the program terminates or freezes, the watchdog writes 0 V.
+    The shutdown writes 0 V, disables the amplifiers, stops task and watchdog, and closes the board. It is run whenever
+    the ``with`` block is left (end, exception, Ctrl-C, SIGTERM, SIGHUP), and at garbage collection. Each step is tried
+    even if an earlier one fails. If the program terminates or freezes, the watchdog writes 0 V.
 
     Parameters
     ----------
@@ -519,11 +534,11 @@ class Rig:
     watchdog
         Watchdog timeout [s], 0.01 to 1.
     limit
-        Maximum duration of a run [s], after which no command is written.
+        Maximum total duration of all commands of the session [s]. Longer runs raise RigFault.
     limits
-        Safety limits of every command and sample.
+        Safety limits for every command and sample.
     sensor_filter
-        Natural frequency [rad/s] and damping ratio of a low-pass filter on both recorded deflections.
+        (natural frequency [rad/s], damping ratio) of a low-pass filter on both recorded deflections; None for none.
     """
 
     def __init__(
@@ -557,7 +572,7 @@ class Rig:
         self.shutdown_errors: list[str] = []
         self._samples = 0
         self._gate = OutputGate()
-        #: Handlers of termination signals of the session.
+        #: Handlers of termination signals during the session.
         self.signals = SignalHandlers(UNINTERRUPTIBLE_CODE, board)
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
@@ -606,14 +621,14 @@ class Rig:
             raise RigFault(fault if fault.startswith(self.board.name) else f"{self.board.name}: {fault}")
 
     def run(self, commands: Floats) -> None:
-        """Apply commands [A], shape (n, 2), and record a sample for each; :meth:`take` returns the rows.
+        """Apply current commands [A], shape (n, 2), and record one sample per command for :meth:`take`.
 
         Raises
         ------
         DataError
             If the commands have another shape or are not numbers.
         RigFault
-            If a fault is latched. The motors stay at 0 V.
+            If a fault occurs or has occurred, or the time limit is exceeded. The motors remain at 0 V.
         """
         self._check()
         commands = as_floats("commands", commands)
@@ -641,12 +656,12 @@ class Rig:
         self._check()
 
     def fail(self, why: str, cause: BaseException | None = None) -> NoReturn:
-        """Latch a fault of the program, write 0 V immediately, and raise RigFault.
+        """Latch a fault with the message `why`, write 0 V immediately, and raise RigFault.
 
         Raises
         ------
         RigFault
-            Always, with the first fault of the run and its cause.
+            Always, with the message of the first fault of the session and with `cause` as its cause.
         """
         self.guard.fail(why)
         with contextlib.suppress(Exception):
@@ -658,28 +673,31 @@ class Rig:
         raise RigFault(why) from cause
 
     def take(self) -> Floats:
-        """Return the rows recorded since the last call, shape (n, 9): RIG_COLUMNS and the delay [s]."""
+        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
         return self.board.take()
 
 
-#: Code of the shutdown functions; signals that arrive while it runs are deferred.
+#: Code objects of the shutdown functions; signals that arrive while one of them runs are deferred.
 UNINTERRUPTIBLE_CODE = frozenset(f.__code__ for f in (Rig.__exit__, Rig._leave, _shut_down_and_restore, shut_down))
 
 
-#: Sampling rates of the board's clock [Hz]: lowest, and highest with fast update.
+#: Minimum and maximum sampling rate of the Q8-USB clock [Hz]; the maximum requires the fast update mode.
 SAMPLE_RATE_RANGE_HZ = (1.0, 8000.0)
 WATCHDOG_EXPIRED_MESSAGE = "the watchdog expired: the program did not answer in time, and the board put 0 V out"
 
 
 def check_rate(rate: float) -> None:
-    """Raise ModelError if the board does not support a sampling rate [Hz]."""
+    """Raise ModelError if a sampling rate is outside the range of the Q8-USB board, 1 to 8000 Hz."""
     low, high = SAMPLE_RATE_RANGE_HZ
     if not low <= rate <= high:
         raise ModelError(f"{setting('rate')} {rate!r} Hz is not possible with this board; use {low:g} to {high:g} Hz")
 
 
 def check_watchdog(rate: float, seconds: float) -> None:
-    """Raise ModelError if the watchdog timeout [s] is shorter than two samples, so that it would always expire."""
+    """Raise ModelError if a watchdog timeout (`seconds`) is shorter than two samples at a rate [Hz].
+
+    Such a watchdog would expire between samples.
+    """
     if seconds * rate < 2.0:
         raise ModelError(
             f"{setting('watchdog')} {seconds:g} s is shorter than two samples at {rate:g} Hz and would expire "
@@ -688,7 +706,10 @@ def check_watchdog(rate: float, seconds: float) -> None:
 
 
 def missing_expiration_state(*, analog: bool, digital: bool) -> str | None:
-    """Return a message on outputs that are not set for a watchdog expiration; None if all are set."""
+    """Return an error message if analog or digital outputs have no safe state for a watchdog expiration, else None.
+
+    `analog` and `digital` state whether these outputs have such a state.
+    """
     if not analog:
         return "the watchdog's expiration state of the analog outputs is not 0 V"
     if not digital:

@@ -1,4 +1,4 @@
-"""Virtual board: the simulated arm with the access and watchdog rules of the real board."""
+"""Virtual board: a simulated arm behind an interface with the rules of the real board on access and watchdog."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ftlm.rig.rig import (
 from ftlm.utils.resources import python_child
 from ftlm.utils.validation import Floats, check_choice, check_seed, short_repr, whole_number
 
-#: Faults that can be injected: name, and meaning of its number.
+#: Faults that can be injected, by name, with the meaning of the number that is given with the fault; "" if it has none.
 FAULT_INJECTIONS = {
     "dead encoder": "",
     "saturated gauge": "",
@@ -37,17 +37,18 @@ FAULT_INJECTIONS = {
     "late": "delay of that sample [s]",
     "lost samples": "",
 }
-#: Number of channels of a fault; of any other it is one.
+#: Number of channels on which a fault can be injected; 1 for faults that are not listed.
 _FAULT_CHANNELS = {"dead encoder": 2, "saturated gauge": 2, "limit switch": 4, "deflection": 2}
-#: Shortest watchdog timeout of runs without real time [s]; they cannot be late, only the program can terminate.
+#: Minimum watchdog timeout of runs that are not in real time [s]. In them no write can be late, so the watchdog acts
+#: only if the program terminates or freezes.
 _MIN_FAST_WATCHDOG_S = 2.0
-#: Longest start of the watchdog process [s].
+#: Maximum time until the watchdog process has started [s].
 _WATCHDOG_START_TIMEOUT_S = 10.0
 
 
 @dataclass
 class VirtualBoard:
-    """Board of the simulated arm, with the same access rules as the real board.
+    """Interface board of the simulated arm, with the same rules on access and watchdog as the real board.
 
     Parameters
     ----------
@@ -58,11 +59,12 @@ class VirtualBoard:
     real_time
         Whether to run in real time instead of as fast as possible.
     horizon
-        Maximum duration of a run [s], which determines the memory of the simulation.
+        Maximum duration of a run [s], which determines how much memory the simulation allocates.
     page
-        File of the output registers; by default a temporary file.
+        File of the output registers, which the watchdog process shares; by default a temporary file.
     inject
-        Faults to inject for tests, each as (name in FAULT_INJECTIONS, channel from 0, time [s], number).
+        Faults to inject for tests, each as (name in FAULT_INJECTIONS, channel from 0, time [s], number). The number has
+        the meaning given in FAULT_INJECTIONS.
 
     Raises
     ------
@@ -99,13 +101,13 @@ class VirtualBoard:
             _checked_injection(fault)
 
     def open(self) -> None:
-        """Open the board by creating the file of the output registers."""
+        """Open the board by creating the file of the output registers; raise RigFault if it is already open."""
         if self._page is not None:
             raise RigFault("virtual rig: the board is open already; close it first")
         self._page = watchdog.RegisterPage(self.page or watchdog.create_page_file(), create=True)
 
     def configure(self, rate: float) -> None:
-        """Create the simulated arm; its converters and encoders need no configuration."""
+        """Create the simulated arm with a sampling rate [Hz], and set the outputs to 0 V."""
         self._access()
         check_rate(rate)
         self._rate = rate
@@ -115,25 +117,25 @@ class VirtualBoard:
         self.write((0.0, 0.0))
 
     def set_expiration(self) -> None:
-        """Set the outputs that the watchdog applies when it expires: 0 V and tristate."""
+        """Set the outputs that the watchdog applies when it expires: 0 V, and tristate digital lines."""
         page = self._access()
         page.set("state1", 0.0)
         page.set("state2", 0.0)
         page.set("tristate", 1)
 
     def unsafe(self) -> str | None:
-        """Return a message if the outputs after a watchdog expiration are not set; None if all are set."""
+        """Return an error message if an output has no safe state for a watchdog expiration; None if all have one."""
         page = self._access()
         zero = all(page.get(f"state{k}") == 0.0 for k in (1, 2))
         return missing_expiration_state(analog=zero, digital=bool(page.get("tristate")))
 
     def start_watchdog(self, seconds: float) -> None:
-        """Start the watchdog process."""
+        """Start the watchdog process with a timeout of `seconds`; raise RigFault if it does not start."""
         page = self._access()
         if self.real_time:
             check_watchdog(self._rate, seconds)
         try:
-            # The process is kept before it is ready: an interruption in between leaves none behind.
+            # The process is stored before it is ready, so that it can be ended after an interruption.
             self._process = spawn_watchdog(page, keep=self.page is not None)
             wait_for_watchdog(self._process, page)
         except OSError as error:
@@ -142,12 +144,12 @@ class VirtualBoard:
         page.set("timeout", seconds if self.real_time else max(seconds, _MIN_FAST_WATCHDOG_S))
 
     def start(self, rate: float) -> None:
-        """Start the clock of the samples."""
+        """Start sampling at the rate that was given to :meth:`configure`."""
         self._require_arm().start(self.real_time)
         self._started = True
 
     def enable(self, on: bool) -> None:
-        """Enable or disable the amplifiers."""
+        """Enable (`on`) or disable the simulated amplifiers."""
         with self.gate.lock:
             if on:
                 page = self._access()
@@ -158,7 +160,7 @@ class VirtualBoard:
                 self._page.set("enabled", 0)
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Write output voltages [V]; 0 V can always be written, also after a fault."""
+        """Write the command voltages of both motors [V]; 0 V can always be written, also after a fault."""
         with self.gate.lock:
             page, closed = self._page, self.gate.reason is not None
             if volts == (0.0, 0.0) and page is not None and (closed or page.has_expired or self._has_lost_watchdog()):
@@ -167,17 +169,17 @@ class VirtualBoard:
                 self._output_volts(*volts)
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
-        """Record a number of samples with outputs at 0 V."""
+        """Simulate a number of samples with outputs at 0 V, over which `guard` averages the bias of the gauges."""
         self._require_arm().rest(guard, self._random.standard_normal((samples, 4)), self._output_volts)
 
     def run(self, guard: _core.Guard, commands: Floats) -> None:
-        """Apply commands [A], shape (n, 2), and record a sample for each."""
+        """Apply current commands [A], shape (n, 2), to the simulated arm, and record one sample per command."""
         if not self._started:
             raise RigFault("virtual rig: the task is not started; call start() first")
         self._require_arm().run(guard, commands, self._random.standard_normal((len(commands), 4)), self._output_volts)
 
     def take(self) -> Floats:
-        """Return the rows recorded since the last call."""
+        """Return the samples recorded since the last call, shape (n, 9): RIG_COLUMNS, then the delay [s]."""
         return np.empty((0, 9)) if self._arm is None else self._arm.take()
 
     def stop(self) -> None:
@@ -185,7 +187,7 @@ class VirtualBoard:
         self._started = False
 
     def let_expire(self) -> bool:
-        """Wait for the timeout of the watchdog; return whether it has expired with outputs at 0 V."""
+        """Wait until the watchdog has expired; return whether it has, with outputs at 0 V."""
         page, process = self._page, self._process
         if page is None:
             return True
@@ -213,7 +215,7 @@ class VirtualBoard:
             self._process = None
 
     def close(self) -> None:
-        """Close the board by removing the output registers."""
+        """Close the board, and remove its temporary file of output registers."""
         with self.gate.lock:
             page, self._page = self._page, None
         if page is not None:
@@ -230,7 +232,7 @@ class VirtualBoard:
         return self._page
 
     def _has_lost_watchdog(self) -> bool:
-        """Whether the watchdog process was started and has terminated."""
+        """Whether the watchdog process was started and has terminated unexpectedly."""
         return self._process is not None and self._process.poll() is not None
 
     def _require_arm(self) -> _core.VirtualArm:
@@ -239,7 +241,11 @@ class VirtualBoard:
         return self._arm
 
     def _output_volts(self, volts1: float, volts2: float) -> tuple[tuple[float, float], bool]:
-        """Write output voltages [V]; return the applied ones, and whether the amplifiers are enabled."""
+        """Write the command voltages of both motors [V] with a heartbeat for the watchdog.
+
+        Return (applied voltages, whether the amplifiers are enabled). Raise RigFault if the output gate is closed, the
+        board is not open, or the watchdog has expired or terminated.
+        """
         with self.gate.lock:
             page = self._access()
             self.gate.check()
@@ -254,14 +260,14 @@ class VirtualBoard:
 
 
 def spawn_watchdog(page: watchdog.RegisterPage, *, keep: bool) -> subprocess.Popen[bytes]:
-    """Start the watchdog process, and return it before it is ready.
+    """Start the watchdog process, and return it without waiting until it is ready.
 
     Parameters
     ----------
     page
-        Registers of the output stage.
+        Output registers, which the process shares through their file.
     keep
-        Whether to keep the file when the process ends.
+        Whether the process keeps this file when it ends, instead of removing it.
 
     Raises
     ------
@@ -287,12 +293,12 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
     process
         Process from `spawn_watchdog`.
     page
-        Registers of the output stage.
+        Output registers that the process shares.
 
     Raises
     ------
     OSError
-        If the process ended, or was not ready in time.
+        If the process ended, or was not ready within 10 s.
     """
     until = time.monotonic() + _WATCHDOG_START_TIMEOUT_S
     try:
@@ -309,7 +315,7 @@ def wait_for_watchdog(process: subprocess.Popen[bytes], page: watchdog.RegisterP
 
 
 def _checked_injection(fault: object) -> tuple[str, int, float, float]:
-    """Return an injected fault as (name, channel, time [s], value); raise ModelError if it is invalid."""
+    """Return an injected fault as (name, channel, time [s], number); raise ModelError if it is invalid."""
     if not isinstance(fault, (tuple, list)) or len(fault) != 4:
         raise ModelError(f"inject has {short_repr(fault)}; give (name, channel, time [s], value)")
     name, channel, time_s, number = fault

@@ -1,9 +1,9 @@
-"""Output registers and watchdog process of the virtual rig, which stops the motors if the program ends.
+"""Output registers and watchdog process of the virtual rig. The process stops the motors if the program ends.
 
-As a script with the path of a register file, the module watches the heartbeat. It imports nothing from ftlm and no slow
-module. Its rules are those of the board: on expiry, the analog outputs take their expiration states only if these are
-set and the digital lines are set to tristate. Otherwise they keep their values. After an expiry, the outputs stay
-locked until the watchdog is cleared.
+As a script with the path of a register file, the module monitors the heartbeat of the program. It imports nothing from
+ftlm and no slow module. Its rules are those of the real board. On expiry, the analog outputs take their expiration
+states only if these are set and the digital lines are set to tristate. Otherwise they keep their values. After an
+expiry, the outputs remain locked until the watchdog is cleared.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 
 PAGE_SIGNATURE = b"FTLMPAG1"
-#: Offset [byte] and struct format of every register.
+#: Offset [bytes] in the file and format (of the module `struct`) of every register, by name.
 PAGE_FIELDS = {
     "beat": (8, "Q"),
     "volts1": (16, "d"),
@@ -38,12 +38,12 @@ PAGE_FIELDS = {
 }
 PAGE_SIZE_BYTES = 4096
 _HEARTBEAT_FORMAT = struct.Struct("<Qdd")
-#: Longest lifetime of an orphaned watchdog process after the last heartbeat, or without a first one [s].
+#: Time after the last heartbeat, or after the start without a heartbeat, at which the watchdog process ends [s].
 _ORPHAN_TIMEOUT_S = 30.0
 
 
 class RegisterPage:
-    """Registers of the output stage, in a file that two processes map into memory.
+    """Registers of the analog and digital outputs, in a file that the program and the watchdog map into memory.
 
     Parameters
     ----------
@@ -51,6 +51,11 @@ class RegisterPage:
         Path of the file.
     create
         Whether to create the file instead of mapping an existing one.
+
+    Raises
+    ------
+    ValueError
+        If an existing file is not a register file.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, create: bool = False) -> None:
@@ -69,12 +74,12 @@ class RegisterPage:
             self.set("state2", math.nan)
 
     def get(self, name: str) -> float:
-        """Return the value of a register."""
+        """Return the value of the register with this name."""
         offset, kind = PAGE_FIELDS[name]
         return float(struct.unpack_from("<" + kind, self._map, offset)[0])
 
     def set(self, name: str, value: float) -> None:
-        """Set the value of a register."""
+        """Set the value of the register with this name."""
         offset, kind = PAGE_FIELDS[name]
         struct.pack_into("<" + kind, self._map, offset, int(value) if kind == "Q" else float(value))
 
@@ -84,21 +89,21 @@ class RegisterPage:
         return self._map[PAGE_FIELDS["expired"][0]] != 0
 
     def write_heartbeat(self, beat: int, volts1: float, volts2: float) -> None:
-        """Write the heartbeat counter and the output voltages [V] together."""
+        """Write the heartbeat counter and the output voltages of motors 1 and 2 [V] together."""
         _HEARTBEAT_FORMAT.pack_into(self._map, PAGE_FIELDS["beat"][0], beat, volts1, volts2)
 
     @property
     def volts(self) -> tuple[float, float]:
-        """Output voltages [V]."""
+        """Output voltages of motors 1 and 2 [V]."""
         return self.get("volts1"), self.get("volts2")
 
     def close(self) -> None:
-        """Unmap the file."""
+        """Unmap the file from memory."""
         self._map.close()
 
 
 def create_page_file() -> Path:
-    """Create a new file for registers, in shared memory if the system has it, and return its path."""
+    """Create a new, empty file for registers, in shared memory if the system provides it, and return its path."""
     folder = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     descriptor, name = tempfile.mkstemp(prefix="ftlm-rig-", suffix=".page", dir=folder)
     os.close(descriptor)
@@ -106,7 +111,11 @@ def create_page_file() -> Path:
 
 
 def watch(path: str, *, keep: bool) -> None:
-    """Watch the heartbeat until the registers are closed, or until the program has ended and the outputs are safe."""
+    """Monitor the heartbeat in a register file, and apply the expiration states if it stops for the timeout.
+
+    The function returns when the program closes the registers, or when the program has ended and, if the watchdog was
+    started, has expired. With `keep` False the file is then removed.
+    """
     page = RegisterPage(path)
     parent = os.getppid()
     began = time.monotonic()
@@ -137,7 +146,10 @@ def watch(path: str, *, keep: bool) -> None:
 
 
 def trip(page: RegisterPage, now: float) -> None:
-    """Apply the expiration states by the rules of the board; repeated calls override concurrent writes."""
+    """Mark the watchdog as expired, and apply the expiration states to the outputs by the rules of the real board.
+
+    `now` is the time [s] that is recorded as the time of expiry. Repeated calls override concurrent writes.
+    """
     if not page.has_expired:
         page.set("tripped", now)
         page.set("expired", 1)
